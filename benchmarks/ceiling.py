@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
-from merge_runner_analysis.data.reference_data import (
+from merge_runner_analysis.published import (
     DATA,
     HUMAN_GAP_SD_M,
     human_outcomes,

@@ -37,8 +37,8 @@ from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS, Condition
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
-from merge_runner_analysis.data.reference_data import PAIRS
-from merge_runner_analysis.human.record import SPEC, SPEC_HASH
+from merge_runner_analysis.humans.record import SPEC, SPEC_HASH
+from merge_runner_analysis.published import PAIRS
 
 SEED = 1
 BATCH = 500

@@ -13,15 +13,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from merge_runner_analysis.data.load import load, load_trials
-    from merge_runner_analysis.data.study import Study
+    from merge_runner_analysis.frames import load, load_trials
+    from merge_runner_analysis.study import Study
     from merge_runner_analysis.tables import TABLES, table
 
 # Names are loaded when they are used: the command line must not wait for pandas.
 _PLACES = {
-    "Study": "merge_runner_analysis.data.study",
-    "load": "merge_runner_analysis.data.load",
-    "load_trials": "merge_runner_analysis.data.load",
+    "Study": "merge_runner_analysis.study",
+    "load": "merge_runner_analysis.frames",
+    "load_trials": "merge_runner_analysis.frames",
     "table": "merge_runner_analysis.tables",
     "TABLES": "merge_runner_analysis.tables",
 }

@@ -31,11 +31,11 @@ from merge_runner.cli.options import (
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, refuse_another_kind
 from merge_runner.text_safety import say
-from merge_runner_analysis.human.commands import human_app
+from merge_runner_analysis.humans.commands import human_app
 from merge_runner_analysis.names import TableFormat
 
 if TYPE_CHECKING:
-    from merge_runner_analysis.data.study import Study
+    from merge_runner_analysis.study import Study
 
 __all__ = ["app", "main"]
 
@@ -116,7 +116,7 @@ def tables(
         "without_fallbacks": without_fallbacks,
     }
     if against is not None:
-        from merge_runner_analysis.data.study import Study
+        from merge_runner_analysis.study import Study
         from merge_runner_analysis.tables.against import PAPER
         from merge_runner_analysis.tables.against import against as beside
 
@@ -180,8 +180,8 @@ def power(
     from merge_runner.registry import use
     from merge_runner.run.plan import Options, make_plan
     from merge_runner.run.sweep import unsent
-    from merge_runner_analysis.data.study import Study
     from merge_runner_analysis.power import chances, power_table
+    from merge_runner_analysis.study import Study
     from merge_runner_analysis.tables.formats import render
 
     parts, wanted = (listed(conditions), listed(variants)), cli.levels(only or (), "--only")
@@ -251,7 +251,7 @@ def report(
     """Write conclusions, tables and figures as one HTML file."""
     refuse_another_kind(out, HTML, "page of HTML")
     study = _study(db, models, where, study_file, trust=trust)
-    from merge_runner_analysis.report.page import write_report
+    from merge_runner_analysis.web.report import write_report
 
     deque(write_report(study, out, files), maxlen=0)
     also = "" if files is None else f", and its tables and figures into {files}"
@@ -268,7 +268,7 @@ def _study(
     trust: bool,
 ) -> Study:
     use_study(file, trust=trust)
-    from merge_runner_analysis.data.study import Study
+    from merge_runner_analysis.study import Study
 
     return Study(db, drivers(models), cli.levels(where or (), "--where") or None, file, by)
 
@@ -315,9 +315,9 @@ def view(
         raise UsageError("--trials goes with --export DIR or --single FILE.html")
     if trials is None and single is not None:
         raise UsageError("--single FILE.html needs --trials: name some, or all with '*'")
-    from merge_runner_analysis.explorer.app import serve
-    from merge_runner_analysis.explorer.export import export_folder, export_page
-    from merge_runner_analysis.explorer.notes import reader_of
+    from merge_runner_analysis.web.app import serve
+    from merge_runner_analysis.web.export import export_folder, export_page
+    from merge_runner_analysis.web.notes import reader_of
 
     def announce(address: str) -> None:
         print_out(address)

@@ -19,9 +19,9 @@ from merge_runner.run.plan import Plan
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.study.crossing import PROMPT, Arm
 from merge_runner.study.file import Effect
-from merge_runner_analysis.data.reference_data import HUMAN_GAP_SD_M, human_outcomes, published
-from merge_runner_analysis.data.study import Group
+from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.names import BASELINE
+from merge_runner_analysis.published import HUMAN_GAP_SD_M, human_outcomes, published
 from merge_runner_analysis.stats import regressions
 from merge_runner_analysis.stats.contrasts import contrast_means, shared_cells
 from merge_runner_analysis.stats.indicators import ALPHA, TESTED, fits, verdicts

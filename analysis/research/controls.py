@@ -11,7 +11,7 @@ from functools import cache
 import numpy as np
 from scipy import stats
 
-from merge_runner_analysis.data.intermittency import (
+from merge_runner_analysis.stats.held import (
     SAMPLE_S,
     at_5_hz,
     gains,

@@ -431,7 +431,7 @@ def _first_decision(arm: Arm) -> Arm:
     Such a trial is planned, played, kept and checked as any other; its calls have the texts and the
     slots, and so the keys, of the first decisions of the study's sweep. Its source is ``seat``,
     which tables of trials that were driven to their end leave out
-    (``merge_runner_analysis.data.load.TRIALS``).
+    (``merge_runner_analysis.frames.TRIALS``).
     """
     given = arm.scenario.model_dump(exclude_unset=True)
     given["timeout_s"] = 1 / arm.scenario.prompt_rate_hz

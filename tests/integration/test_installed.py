@@ -108,7 +108,7 @@ def test_the_wheel_holds_sweeps_registry_and_recordings_also_when_built_from_the
         for name in (
             "/py.typed",
             "_analysis/py.typed",
-            "_analysis/explorer/glossary.md",
+            "_analysis/web/glossary.md",
             "_cei/driver.py",
         )
     }

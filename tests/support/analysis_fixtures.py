@@ -6,9 +6,9 @@ import pytest
 
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner_analysis.data.study import Study
-from merge_runner_analysis.human.archive import open_files
-from merge_runner_analysis.human.load import import_trials, sort_files
+from merge_runner_analysis.humans.archive import open_files
+from merge_runner_analysis.humans.load import import_trials, sort_files
+from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables import make_tables
 from tests.support.recordings import drive, write_folder
 from tests.support.studies import ANSWERS, Said, write_study, yielding

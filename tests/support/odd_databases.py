@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from merge_runner_analysis.data.reference_data import PAIRS, published
+from merge_runner_analysis.published import PAIRS, published
 from tests.support import program
 from tests.support.harness import PROJECT, environment
 from tests.support.studies import Drive, as_humans, write_study, yielding

@@ -17,8 +17,8 @@ from pathlib import Path
 from unittest.mock import patch
 
 from merge_runner.results import database
+from merge_runner_analysis import cache
 from merge_runner_analysis.commands import main
-from merge_runner_analysis.data import derived_cache
 from tests.support.harness import PROGRAM, Run
 
 # A folder, an environment and streams are those of the whole process.
@@ -43,7 +43,7 @@ def invoke(arguments, *, cwd: Path, env: dict[str, str]) -> Run:
         changed.enter_context(redirect_stdout(out))
         changed.enter_context(redirect_stderr(err))
         changed.enter_context(_as_a_process_tells_them(err))
-        for told_once in (database._warn_of_other_measures, derived_cache._say_once):
+        for told_once in (database._warn_of_other_measures, cache._say_once):
             told_once.cache_clear()
         os.chdir(cwd)
         code = contextvars.Context().run(_to_its_end)

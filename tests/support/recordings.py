@@ -10,7 +10,7 @@ from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.vehicle import advance
-from merge_runner_analysis.human.archive import File
+from merge_runner_analysis.humans.archive import File
 
 STEP_S = 0.05
 HEADER = (

@@ -15,10 +15,10 @@ import uvicorn
 from starlette.testclient import TestClient
 
 from merge_runner.errors import UsageError
-from merge_runner_analysis.explorer.app import explorer, listen
-from merge_runner_analysis.explorer.computing import Computing, Numbers, Worker
-from merge_runner_analysis.explorer.export import export_folder
-from merge_runner_analysis.explorer.site import Site
+from merge_runner_analysis.web.app import explorer, listen
+from merge_runner_analysis.web.computing import Computing, Numbers, Worker
+from merge_runner_analysis.web.export import export_folder
+from merge_runner_analysis.web.site import Site
 from tests.support.gate import HANGS_S
 
 HOST = "127.0.0.1:8700"

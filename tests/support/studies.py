@@ -28,7 +28,7 @@ from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
-from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.study import Study
 
 SCENARIO = ScenarioConfig()
 ANSWERS = ("ok", "refusal", "truncated", "empty")

@@ -6,7 +6,7 @@ from pathlib import Path
 import typer.main
 
 from merge_runner_analysis.commands import app
-from merge_runner_analysis.data.reference_data import published
+from merge_runner_analysis.published import published
 from tests.support.harness import PROJECT
 
 DOCS = PROJECT / "docs"

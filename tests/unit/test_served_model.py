@@ -8,12 +8,12 @@ import pytest
 from merge_runner.audit.checks import audit_sweep
 from merge_runner.results.store import sweep_facts
 from merge_runner.served_model import others_among
-from merge_runner_analysis.data.provenance import provenance, tally
-from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import explain
-from merge_runner_analysis.explorer.catalogue import Catalogue
-from merge_runner_analysis.explorer.pages.sweep import list_runs
+from merge_runner_analysis.provenance import provenance, tally
+from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.attempts import attempts
+from merge_runner_analysis.web.catalogue import Catalogue
+from merge_runner_analysis.web.pages.sweep import list_runs
 from tests.support.studies import Drive, Said, write_study
 
 SERVED = ("another", "o3", "o3-2025", "o3-2026", "it's")

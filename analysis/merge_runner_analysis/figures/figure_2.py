@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 
 from merge_runner.prompts.blocks import title_of
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
-from merge_runner_analysis.data.reference_data import published
-from merge_runner_analysis.data.study import Group, Study, of_trials
+from merge_runner_analysis.grouping import Group, of_trials
 from merge_runner_analysis.metrics import Bounded
 from merge_runner_analysis.names import HUMAN
+from merge_runner_analysis.published import published
 from merge_runner_analysis.stats.intervals import Estimate, mean, proportion
 from merge_runner_analysis.stats.regressions import gap_design
+from merge_runner_analysis.study import Study
 
 # IEEE transactions: one column and the whole page, in inches.
 COLUMN_IN, PAGE_IN = 3.5, 7.16

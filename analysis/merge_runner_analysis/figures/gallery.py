@@ -11,8 +11,6 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from merge_runner.errors import UsageError
-from merge_runner_analysis.data.reference_data import published
-from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.figures.figure_2 import (
     COLUMN_IN,
     LINE_IN,
@@ -26,8 +24,10 @@ from merge_runner_analysis.figures.figure_2 import (
     wrapped,
 )
 from merge_runner_analysis.names import BASELINE
+from merge_runner_analysis.published import published
 from merge_runner_analysis.stats.first_action import Seat, first_actions, mean, seats
 from merge_runner_analysis.stats.intervals import Estimate, interval
+from merge_runner_analysis.study import Study
 
 # These settings are fixed, so that equal input gives equal files.
 SETTINGS: Any = {

@@ -12,7 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy import optimize, stats
 
-from merge_runner_analysis.data.study import Group, Study, in_one_study
+from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.metrics import Metric
 from merge_runner_analysis.stats.intervals import (
     LEVEL,
@@ -26,6 +26,7 @@ from merge_runner_analysis.stats.intervals import (
     two_sided_p,
 )
 from merge_runner_analysis.stats.measures import trials_of, undecided
+from merge_runner_analysis.study import Study, in_one_study
 
 # Where less of a trial's deviation is left over than this, it alone decides the difference.
 LEVERAGE = 1e-9

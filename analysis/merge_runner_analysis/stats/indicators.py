@@ -29,10 +29,12 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from merge_runner_analysis.data.load import KEYS
-from merge_runner_analysis.data.reference_data import published
-from merge_runner_analysis.data.remember import remembered
-from merge_runner_analysis.data.study import Group, Study
+from merge_runner.text_safety import quoted
+from merge_runner_analysis.frames import KEYS, SPEEDS, load
+from merge_runner_analysis.grouping import Group, of_trials
+from merge_runner_analysis.published import published
+from merge_runner_analysis.remember import remembered
+from merge_runner_analysis.stats.held import measure_profiles
 from merge_runner_analysis.stats.intervals import Estimate, difference, mean
 from merge_runner_analysis.stats.regressions import (
     Regression,
@@ -40,6 +42,7 @@ from merge_runner_analysis.stats.regressions import (
     who_first_firth,
     who_first_logit,
 )
+from merge_runner_analysis.study import Study
 
 ALPHA = 0.05
 NO_ACTION = "no finished trial with control action"
@@ -96,11 +99,18 @@ def _judged(fit: Regression, name: str, *, robust: bool) -> Verdict:
     return Verdict(fit.equivalence_p < ALPHA)
 
 
+def profiles(study: Study, group: Group) -> pd.DataFrame:
+    """One row a vehicle of a group: whether it acted, and how far its acceleration is held."""
+    specs = ", ".join(quoted(name) for name in group.trials["spec_hash"].unique())
+    speeds = load(f"FROM ({SPEEDS}) WHERE list_contains([{specs}], spec_hash)", study.db)
+    return measure_profiles(of_trials(speeds, group.trials))
+
+
 @remembered
 def gains(study: Study, group: Group) -> pd.DataFrame:
     """One row a finished trial: condition, pair, ``steady`` (nobody acted), and ``gain`` or NaN."""
     trials = group.finished[[*KEYS, "condition", "pair"]]
-    by_trial = study.profiles_of(group).groupby(KEYS, as_index=False)
+    by_trial = profiles(study, group).groupby(KEYS, as_index=False)
     found = by_trial.agg(steady=("steady", "all"), gain=("gain", "mean"))
     return trials.merge(found, on=KEYS)
 

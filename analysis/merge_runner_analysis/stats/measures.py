@@ -6,9 +6,9 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from merge_runner_analysis.data.reference_data import citation, published
-from merge_runner_analysis.data.study import Group
+from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.metrics import BOXES, JUDGED, HumanReference, Metric
+from merge_runner_analysis.published import citation, published
 from merge_runner_analysis.stats.intervals import LEVEL, NOTHING, Estimate, mean, wilson
 from merge_runner_analysis.stats.intervals import estimate as interval_of
 

@@ -25,15 +25,15 @@ import numpy as np
 import pandas as pd
 
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
-from merge_runner_analysis.data.reference_data import (
+from merge_runner_analysis.grouping import Group
+from merge_runner_analysis.metrics import BOXES, GAP
+from merge_runner_analysis.published import (
     HUMAN_GAP_SD_M,
     PAIRS,
     human_outcomes,
     published,
 )
-from merge_runner_analysis.data.remember import remembered
-from merge_runner_analysis.data.study import Group, Study
-from merge_runner_analysis.metrics import BOXES, GAP
+from merge_runner_analysis.remember import remembered
 from merge_runner_analysis.stats import intervals
 from merge_runner_analysis.stats.contrasts import (
     corrected,
@@ -69,7 +69,8 @@ from merge_runner_analysis.stats.regressions import (
     gap_ols,
     who_first_firth,
 )
-from merge_runner_analysis.verdict_words import (
+from merge_runner_analysis.study import Study
+from merge_runner_analysis.wording import (
     MEASURES,
     OPEN,
     SHOWN,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from merge_runner.errors import unknown_name
 from merge_runner.registry import in_use_for, using
-from merge_runner_analysis.data.derived_cache import (
+from merge_runner_analysis.cache import (
     finished,
     keep_finished,
     options_text,
@@ -21,7 +21,7 @@ from merge_runner_analysis.tables.model import Row, Table, from_text, to_text
 if TYPE_CHECKING:
     import pandas as pd
 
-    from merge_runner_analysis.data.study import Study
+    from merge_runner_analysis.study import Study
 
 
 class Listed(NamedTuple):
@@ -113,7 +113,7 @@ def finished_tables(
     # A name may be given twice; the table is computed once.
     missing = [name for name in dict.fromkeys(wanted) if name not in found]
     if missing:
-        from merge_runner_analysis.data.study import Study
+        from merge_runner_analysis.study import Study
 
         study = study or Study(db, **options)
         made = dict(zip(missing, make_tables(study, missing), strict=True))
@@ -131,7 +131,7 @@ def table(study: Study | Path | str, name: str) -> pd.DataFrame:
     """
     import pandas as pd
 
-    from merge_runner_analysis.data.study import Study
+    from merge_runner_analysis.study import Study
 
     with using(in_use_for(study.db if isinstance(study, Study) else Path(study))):
         read = study if isinstance(study, Study) else Study(study)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.stats.indicators import INDICATORS, score
 from merge_runner_analysis.stats.measures import outcomes_note
+from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.indicators import (
     NOTES,
     SCORE,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.metrics import (
     INTERVALS,
     RULES_NOTE,
@@ -18,6 +18,7 @@ from merge_runner_analysis.stats.measures import (
     outcomes_note,
     undecided_note,
 )
+from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.model import (
     ENDED,
     GROUP_COLUMNS,

@@ -6,8 +6,8 @@ from collections import Counter
 
 from merge_runner.records import NO_DECISION
 from merge_runner.text_safety import quoted
-from merge_runner_analysis.data.provenance import tally
-from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.provenance import tally
+from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.model import GROUP_COLUMNS, Column, Table, row_of
 
 NO_CALLS = "no call: this driver asks no model, or its calls are not in the database"

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import astuple
 
-from merge_runner_analysis.data.reference_data import published
-from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.grouping import Group
+from merge_runner_analysis.published import published
 from merge_runner_analysis.stats.regressions import Regression
+from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.model import GROUP_COLUMNS, Column, Row, Value, row_of
 
 TERM_NAMES = {

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from math import isinf
 
 from merge_runner.text_safety import quoted
-from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.metrics import RULES_NOTE, Metric, shown_in
 from merge_runner_analysis.stats.contrasts import (
     contrast,
@@ -14,6 +13,7 @@ from merge_runner_analysis.stats.contrasts import (
     corrected,
     trials_by_cell,
 )
+from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Value, interval
 
 WITHIN = (

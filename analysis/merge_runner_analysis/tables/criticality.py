@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from merge_runner.scenarios.merge.measures import NO_CONFLICT_MPS
-from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.metrics import shown_in
+from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.ablation_quantitative import metric_table
 from merge_runner_analysis.tables.model import Table
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 from itertools import product
 
 from merge_runner.registry import require
-from merge_runner_analysis.data.study import Study, levels_of
+from merge_runner_analysis.grouping import levels_of
 from merge_runner_analysis.metrics import INTERVALS, METRICS, RULES_NOTE, Metric
 from merge_runner_analysis.stats.contrasts import contrast, copied_of_shared, corrected
 from merge_runner_analysis.stats.factors import (
@@ -17,6 +17,7 @@ from merge_runner_analysis.stats.factors import (
     levels_by_factor,
 )
 from merge_runner_analysis.stats.measures import estimate, undecided_note
+from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.contrasts import FAMILY, SAME_TRIALS, WITHIN
 from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Value, interval
 

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 import pandas as pd
 
-from merge_runner_analysis.data.reference_data import citation, published
-from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.grouping import Group
+from merge_runner_analysis.published import citation, published
 from merge_runner_analysis.stats.first_action import (
     HOLD_MPS2,
     exchange_rate,
@@ -19,6 +19,7 @@ from merge_runner_analysis.stats.first_action import (
     slope,
 )
 from merge_runner_analysis.stats.intervals import Estimate
+from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.model import (
     ENDED,
     GROUP_COLUMNS,

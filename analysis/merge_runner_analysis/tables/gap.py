@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from merge_runner_analysis.data.reference_data import citation, printed_value, published
-from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.grouping import Group
+from merge_runner_analysis.published import citation, printed_value, published
 from merge_runner_analysis.stats.indicators import fits
 from merge_runner_analysis.stats.regressions import GAP_MARGIN_M, GAP_TERMS, by_pairs, gap_ols
+from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.coefficients import (
     BY_PAIR,
     KEYS,

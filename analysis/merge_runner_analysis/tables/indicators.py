@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from merge_runner_analysis.data.reference_data import HUMAN_GAP_SD_M
-from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.metrics import RULES_NOTE, Metric, shown_in
+from merge_runner_analysis.published import HUMAN_GAP_SD_M
 from merge_runner_analysis.stats.indicators import (
     INDICATORS,
     Score,
@@ -17,6 +17,7 @@ from merge_runner_analysis.stats.indicators import (
 from merge_runner_analysis.stats.intervals import Estimate
 from merge_runner_analysis.stats.measures import outcomes_note
 from merge_runner_analysis.stats.regressions import GAP_MARGIN_M
+from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.ablation_quantitative import measured
 from merge_runner_analysis.tables.model import (
     FINISHED,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.ablation_qualitative import ablation_qualitative
 from merge_runner_analysis.tables.ablation_quantitative import ablation_quantitative
 from merge_runner_analysis.tables.attempts import attempts

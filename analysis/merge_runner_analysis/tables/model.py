@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import TypeAdapter
 
 if TYPE_CHECKING:
-    from merge_runner_analysis.data.study import Group
+    from merge_runner_analysis.grouping import Group
 
 Kind = Literal["text", "count", "number", "percent", "p", "verdict", "interval"]
 Value = str | int | float | bool | tuple[float, float] | None

@@ -8,8 +8,9 @@ from dataclasses import replace
 import pandas as pd
 
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
-from merge_runner_analysis.data.reference_data import HUMAN_DOI, HUMAN_TRIALS
-from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.grouping import Group
+from merge_runner_analysis.published import HUMAN_DOI, HUMAN_TRIALS
+from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.model import Table
 
 

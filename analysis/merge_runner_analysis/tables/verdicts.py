@@ -8,13 +8,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from merge_runner.records import SIDES
-from merge_runner_analysis.data.driver_words import language_models
-from merge_runner_analysis.data.reference_data import HUMAN_TRIALS
-from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.drivers import language_models
+from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.names import HUMAN
+from merge_runner_analysis.published import HUMAN_TRIALS
 from merge_runner_analysis.stats.verdicts import Comparison, Known, compared, of_humans
+from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Value, interval
-from merge_runner_analysis.verdict_words import (
+from merge_runner_analysis.wording import (
     HUMANS,
     LANGUAGE_MODEL,
     MEASURES,

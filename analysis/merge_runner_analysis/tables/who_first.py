@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.stats.indicators import fits
 from merge_runner_analysis.stats.measures import outcomes_note
 from merge_runner_analysis.stats.regressions import WHO_FIRST_TERMS, by_pairs, who_first_logit
+from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.coefficients import (
     BY_PAIR,
     KEYS,

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from merge_runner.errors import UsageError
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS, Condition
 from merge_runner.scenarios.merge.geometry import TRACK
-from merge_runner_analysis.data.load import load
+from merge_runner_analysis.frames import load
 from merge_runner_cei.agents import Model
 from merge_runner_cei.batch import Trial, simulate
 from merge_runner_cei.calibration.design import experiment

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from merge_runner.config import ScenarioConfig
-from merge_runner_analysis.data.reference_data import published
+from merge_runner_analysis.published import published
 from merge_runner_cei.batch import simulate
 from merge_runner_cei.calibration.design import TRIALS_OF_A_PAIR, design, model_of
 from merge_runner_cei.calibration.outcomes import measured, summary

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import pytest
 
-from merge_runner_analysis.data.intermittency import measure_profiles
-from merge_runner_analysis.data.load import SPEEDS
-from merge_runner_analysis.data.study import of_trials
 from merge_runner_analysis.explain import explain
+from merge_runner_analysis.frames import SPEEDS
+from merge_runner_analysis.grouping import of_trials
 from merge_runner_analysis.metrics import GAP
-from merge_runner_analysis.stats.indicators import Verdict, less_humans, mean_gain, score
+from merge_runner_analysis.stats.held import measure_profiles
+from merge_runner_analysis.stats.indicators import Verdict, less_humans, mean_gain, profiles, score
 from merge_runner_analysis.stats.measures import estimate
 from merge_runner_analysis.stats.verdicts import human_gap
 from merge_runner_analysis.tables import make_tables
@@ -106,4 +106,4 @@ def test_the_speeds_of_humans_are_judged_without_the_simulators_resistance(impor
     for group in imported.groups:
         resisted = measure_profiles(of_trials(speeds, group.trials))
         assert len(resisted) == 2 * len(group.trials)
-        assert resisted.equals(imported.profiles_of(group)) == (group is imported.human)
+        assert resisted.equals(profiles(imported, group)) == (group is imported.human)

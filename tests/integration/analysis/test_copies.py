@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pytest
 
-from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import explain
+from merge_runner_analysis.study import Study
 from tests.support.studies import changed, write_study, yielding
 from tests.support.tables import by_id, made, notes_with
 

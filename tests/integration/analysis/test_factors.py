@@ -9,9 +9,9 @@ from statsmodels.stats.multitest import multipletests
 
 from merge_runner.errors import UsageError
 from merge_runner_analysis.commands import drivers
-from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.stats.factors import levels_by_factor
+from merge_runner_analysis.study import Study
 from tests.support.crossed_study import PLUGIN
 from tests.support.studies import changed, write_study, yielding
 from tests.support.tables import by_id, made, notes_with, values_of

@@ -9,10 +9,10 @@ import re
 import pytest
 
 from merge_runner.errors import UsageError
-from merge_runner_analysis.data.load import load
-from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import explain
-from merge_runner_analysis.report.page import design
+from merge_runner_analysis.frames import load
+from merge_runner_analysis.study import Study
+from merge_runner_analysis.web.report import design
 from tests.support.studies import changed
 from tests.support.tables import by_id, made, notes_with, values_of
 

@@ -6,11 +6,11 @@ import pytest
 
 from merge_runner.audit.checks import not_judged
 from merge_runner.run.stored_replay import audit_database
-from merge_runner_analysis.data.provenance import provenance
-from merge_runner_analysis.data.study import Study
-from merge_runner_analysis.explorer.pages.prompts import differences
-from merge_runner_analysis.report.page import alarms
+from merge_runner_analysis.provenance import provenance
+from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables import make_tables
+from merge_runner_analysis.web.pages.prompts import differences
+from merge_runner_analysis.web.report import alarms
 from tests.support.studies import Said, changed, write_study, yielding
 from tests.support.tables import QUICK, made, notes_with
 

@@ -14,7 +14,7 @@ from merge_runner.errors import UsageError
 from merge_runner.records import FAR_BEHIND_M, SIDES, Observation
 from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.vehicle import advance
-from merge_runner_analysis.data.reference_data import HUMAN_GAP_SD_M, published
+from merge_runner_analysis.published import HUMAN_GAP_SD_M, published
 from tests.support.cases import table
 from tests.support.driven_trials import OTHER, both, play, spec
 

@@ -9,7 +9,7 @@ from contextlib import suppress
 import pytest
 
 from merge_runner.results.store import query
-from merge_runner_analysis.human.archive import Unreadable, open_files
+from merge_runner_analysis.humans.archive import Unreadable, open_files
 from tests.support import program
 from tests.support.harness import environment
 from tests.support.recordings import drive, write_folder, write_zip

@@ -9,8 +9,8 @@ import pytest
 from starlette.testclient import TestClient
 
 from merge_runner.results.store import query, results_digest
-from merge_runner_analysis.explorer.app import explorer
-from merge_runner_analysis.explorer.site import Site
+from merge_runner_analysis.web.app import explorer
+from merge_runner_analysis.web.site import Site
 from tests.support.harness import FAST
 
 STUDY = """

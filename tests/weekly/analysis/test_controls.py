@@ -4,7 +4,7 @@ import pytest
 
 from analysis.research import controls
 from analysis.research.controls import CELLS, HELD, MOVING, separation
-from merge_runner_analysis.data.intermittency import gains
+from merge_runner_analysis.stats.held import gains
 from tests.support.harness import PROJECT
 
 

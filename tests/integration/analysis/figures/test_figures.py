@@ -9,8 +9,6 @@ from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 
 from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
-from merge_runner_analysis.data.load import load
-from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.figures.figure_2 import (
     HUMAN_VELOCITIES_MPS,
     deviation,
@@ -21,7 +19,9 @@ from merge_runner_analysis.figures.figure_2 import (
     published_gap_line,
 )
 from merge_runner_analysis.figures.gallery import MAKERS, SETTINGS, rendered
+from merge_runner_analysis.frames import load
 from merge_runner_analysis.stats.intervals import mean, proportion
+from merge_runner_analysis.study import Study
 from tests.support.studies import Drive, changed, write_study, yielding
 
 

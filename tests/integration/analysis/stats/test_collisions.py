@@ -8,14 +8,14 @@ import pytest
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner_analysis.data.load import load_trials
-from merge_runner_analysis.data.reference_data import human_counts
-from merge_runner_analysis.data.study import Study
-from merge_runner_analysis.data.trials import judged
+from merge_runner_analysis.frames import load_trials
 from merge_runner_analysis.metrics import BOXES, COLLISIONS
+from merge_runner_analysis.published import human_counts
 from merge_runner_analysis.stats.intervals import wilson
 from merge_runner_analysis.stats.measures import counts
+from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables import make_tables
+from merge_runner_analysis.trials import judged
 from tests.support.studies import Drive, changed, write_study
 
 # So strong vehicles reach the end of the track within one plan.

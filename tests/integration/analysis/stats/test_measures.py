@@ -9,11 +9,11 @@ import pytest
 from analysis.research.independent import recompute_trials
 from merge_runner.config import ScenarioConfig
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner_analysis.data.load import load, load_trials
-from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import explain
+from merge_runner_analysis.frames import load, load_trials
 from merge_runner_analysis.metrics import BOXES, RMSE, SURROGATES, register
 from merge_runner_analysis.stats.measures import counts, estimate
+from merge_runner_analysis.study import Study
 from tests.support.studies import Drive, played, write_study, yielding
 from tests.support.tables import made, notes_with
 

@@ -7,10 +7,10 @@ import pytest
 from scipy import stats
 
 from merge_runner.config import ScenarioConfig
-from merge_runner_analysis.data.reference_data import human_counts
-from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.published import human_counts
 from merge_runner_analysis.stats.verdicts import compared, human_fit, human_gap
-from merge_runner_analysis.verdict_words import DIFFERS, MEASURES
+from merge_runner_analysis.study import Study
+from merge_runner_analysis.wording import DIFFERS, MEASURES
 from tests.support.studies import Drive, write_study, yielding
 from tests.support.tables import by_id, made, notes_with, values_of
 

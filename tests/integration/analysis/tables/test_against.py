@@ -2,7 +2,7 @@
 
 import pytest
 
-from merge_runner_analysis.data.reference_data import published
+from merge_runner_analysis.published import published
 from merge_runner_analysis.tables.against import FILES, against
 from tests.support.studies import changed, write_study, yielding
 from tests.support.tables import by_id, cell, made

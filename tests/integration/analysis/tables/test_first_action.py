@@ -9,11 +9,11 @@ import pytest
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner_analysis.data.load import load
-from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import explain
-from merge_runner_analysis.explorer.catalogue import Catalogue
 from merge_runner_analysis.figures.gallery import figure_of_first_actions
+from merge_runner_analysis.frames import load
+from merge_runner_analysis.study import Study
+from merge_runner_analysis.web.catalogue import Catalogue
 from tests.support.studies import Drive, changed, write_study
 from tests.support.tables import by_id, made, values_of
 

@@ -11,12 +11,12 @@ import pytest
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.metrics import METRICS
 from merge_runner_analysis.names import TableFormat
 from merge_runner_analysis.stats.indicators import score
+from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables import TABLES, make_tables
 from merge_runner_analysis.tables import table as table_of
 from merge_runner_analysis.tables.against import against

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import pytest
 
-from merge_runner_analysis.data.load import load
-from merge_runner_analysis.data.provenance import tally
-from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import explain
+from merge_runner_analysis.frames import load
+from merge_runner_analysis.provenance import tally
+from merge_runner_analysis.study import Study
 from tests.support.studies import Drive, Said, changed, write_study, yielding
 from tests.support.tables import by_id, made, notes_with, values_of
 

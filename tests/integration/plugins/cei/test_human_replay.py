@@ -15,9 +15,9 @@ from merge_runner.results.store import Store, query
 from merge_runner.run.plan import make_plan
 from merge_runner.run.stored_replay import audit_database
 from merge_runner.trial import play_trial
-from merge_runner_analysis.explorer.app import explorer
-from merge_runner_analysis.explorer.site import Site
-from merge_runner_analysis.human.load import import_trials, sort_files
+from merge_runner_analysis.humans.load import import_trials, sort_files
+from merge_runner_analysis.web.app import explorer
+from merge_runner_analysis.web.site import Site
 from merge_runner_cei.human_replay import HUMAN_REPLAY
 from tests.support.recordings import drive, file
 

@@ -17,9 +17,9 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 from merge_runner.study.file import Effect
-from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.power import Case, human, played, simulate
 from merge_runner_analysis.stats.regressions import gap_ols, who_first_firth
+from merge_runner_analysis.study import Study
 
 REPS, STUDIES = 10, 20
 

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from benchmarks.ceiling import shares
-from merge_runner_analysis.data.reference_data import published
+from merge_runner_analysis.published import published
 from merge_runner_analysis.stats.first_action import exchange_rate, mean, slope
 from merge_runner_analysis.stats.intervals import melded
 from merge_runner_analysis.stats.regressions import who_first_firth

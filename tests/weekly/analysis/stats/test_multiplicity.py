@@ -8,11 +8,12 @@ import pytest
 from scipy.special import expit
 
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
-from merge_runner_analysis.data.reference_data import HUMAN_GAP_SD_M, human_counts, published
-from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.grouping import Group
+from merge_runner_analysis.published import HUMAN_GAP_SD_M, human_counts, published
 from merge_runner_analysis.stats import verdicts
 from merge_runner_analysis.stats.regressions import gap_design
-from merge_runner_analysis.verdict_words import DIFFERS
+from merge_runner_analysis.study import Study
+from merge_runner_analysis.wording import DIFFERS
 from tests.support.studies import write_study
 
 COPIES = 200

@@ -11,9 +11,9 @@ from scipy.stats import spearmanr
 from merge_runner.errors import UsageError
 from merge_runner.records import SIDES
 from merge_runner.results.store import Store
-from merge_runner_analysis.data.load import load
-from merge_runner_analysis.data.reference_data import PAIRS
-from merge_runner_analysis.human.record import SPEC, SPEC_HASH, Trace, trial_record
+from merge_runner_analysis.frames import load
+from merge_runner_analysis.humans.record import SPEC, SPEC_HASH, Trace, trial_record
+from merge_runner_analysis.published import PAIRS
 from merge_runner_cei.batch import simulate
 from merge_runner_cei.calibration import __main__ as calibration
 from merge_runner_cei.calibration.authors_fit import REACTIONS, estimated

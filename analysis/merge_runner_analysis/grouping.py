@@ -1,0 +1,313 @@
+"""The groups of a database: trials of equal drivers, prompts and parameters, and the humans."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
+from math import inf
+from typing import Any
+
+import pandas as pd
+
+from merge_runner.audit.checks import not_judged
+from merge_runner.records import SIDES, Side, canonical_json, spec_hash
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner.study.crossing import DEFAULT, MODEL, PROMPT, SELF
+from merge_runner_analysis.drivers import (
+    has_chance,
+    language_models,
+    programs_alone,
+    stand_in,
+    unresponsive,
+)
+from merge_runner_analysis.frames import (
+    KEYS,
+    Order,
+)
+from merge_runner_analysis.names import BASELINE, HUMAN
+from merge_runner_analysis.published import HUMAN_TRIALS
+from merge_runner_analysis.trials import outcomes_with_metrics
+
+MEAN_SPEED = "mean_speed_mps"
+# Factors that every study has, and levels that others are compared with.
+FIRST = (MODEL, PROMPT)
+USUAL = (BASELINE, DEFAULT, SELF)
+NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?")
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Trials of equal drivers, prompts and parameters.
+
+    ``trials`` are rows of ``load_trials``; for humans before an import only the outcomes that are
+    published, and ``measured`` is False. ``setting`` is the prompt variant, empty for humans.
+    ``spec_hash`` is that of its trials, or of those at the usual mean speed where a condition has
+    another. ``levels`` are those of its study's factors, and its model and prompt, by factor.
+    ``driver`` is its ``name`` with the ``mark`` that tells it from itself under other settings, and
+    with ``[scripted]`` where a stand-in answered only some of its trials. ``label`` is how tables
+    name the driver, ``models`` are the names that were asked for, the ego's first, an equal one
+    once, ``seats`` are how many of the trials have the ego on the left and on the right, ``posing``
+    is what is said of a scripted stand-in, and ``caution`` of a human who is replayed: such trials
+    are not judged. The ``trials`` of programs are distinct, and ``whole`` is the group with their
+    copies; ``equal`` counts the trials of a language model that went as an earlier one. The column
+    ``way`` is equal in copies: trials of programs that are equal state by state.
+    ``unjudged`` says why nothing is concluded from them, and is empty where something is.
+    ``published_outcomes`` are those of humans, which imported trials do not replace.
+    """
+
+    driver: str
+    setting: str
+    spec_hash: str | None
+    trials: pd.DataFrame
+    label: str
+    models: tuple[str, ...]
+    name: str
+    mark: str = ""
+    seats: tuple[int, int] = (0, 0)
+    measured: bool = True
+    posing: str = ""
+    caution: str = ""
+    whole: Group | None = None
+    equal: int = 0
+    unjudged: str = ""
+    published_outcomes: pd.DataFrame | None = None
+    levels: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def id(self) -> str:
+        """``o3/A2``, or ``human``."""
+        return f"{self.driver}/{self.setting}" if self.setting else self.driver
+
+    @property
+    def said(self) -> str:
+        """What is said of a scripted stand-in and of a human who is replayed."""
+        return "; ".join(filter(None, (self.posing, self.caution)))
+
+    @property
+    def scripted(self) -> bool:
+        """Whether a scripted stand-in answered."""
+        return bool(self.posing)
+
+    @property
+    def repeated(self) -> int:
+        """How many trials of programs are left out as copies of an earlier one."""
+        return len(self.stored.trials) - len(self.trials)
+
+    @property
+    def stored(self) -> Group:
+        """The group with all its trials, as accounts of calls and money count them."""
+        return self.whole or self
+
+    @property
+    def outcomes(self) -> pd.DataFrame:
+        """The trials that count for collisions and for who merged first."""
+        return self.trials if self.published_outcomes is None else self.published_outcomes
+
+    @property
+    def traced(self) -> bool:
+        """Whether the speeds behind all outcomes are known."""
+        return self.measured and len(self.trials) >= len(self.outcomes)
+
+    def part(self, wanted: Callable[[pd.DataFrame], pd.Series]) -> Group:
+        """The group with only those trials, and outcomes, of which ``wanted`` holds."""
+        outcomes = self.published_outcomes
+        return replace(
+            self,
+            trials=self.trials[wanted(self.trials)],
+            published_outcomes=None if outcomes is None else outcomes[wanted(outcomes)],
+        )
+
+    @cached_property
+    def ended(self) -> pd.DataFrame:
+        """The trials that did not fail."""
+        return self.trials[self.trials["status"] != "failed"]
+
+    @cached_property
+    def finished(self) -> pd.DataFrame:
+        """The trials that a vehicle finished without a collision."""
+        return self.trials[self.trials["status"] == "finished"]
+
+    @property
+    def ended_outcomes(self) -> pd.DataFrame:
+        """The outcomes of trials that did not fail."""
+        return self.outcomes[self.outcomes["status"] != "failed"]
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """How many outcomes there are in each condition of humans, in their order."""
+        return in_human_conditions(self.ended_outcomes)
+
+    @property
+    def left_out(self) -> str:
+        """Which trials are not among the finished ones, in words."""
+        counts = self.trials["status"].value_counts()
+        statuses = [name for name in ("collided", "timeout", "failed") if name in counts]
+        return ", ".join(f"{counts[name]} {name}" for name in statuses) or "none"
+
+
+def in_human_conditions(trials: pd.DataFrame) -> tuple[int, ...]:
+    """How many trials there are in each condition of humans, in their order."""
+    return tuple(trials["condition"].value_counts().reindex(HUMAN_CONDITIONS, fill_value=0))
+
+
+def of_trials(frame: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
+    """The rows of a per-trial frame that belong to these trials."""
+    # To join all rows takes longer than to leave out those of other groups first.
+    near = frame["spec_hash"].isin(trials["spec_hash"].unique())
+    return frame[near].merge(trials[KEYS], on=KEYS)
+
+
+@cache
+def _published_humans() -> Group:
+    """One object for all studies: what is computed from it is computed once."""
+    outcomes = outcomes_with_metrics()
+    return Group(
+        HUMAN, "", None, outcomes, HUMAN, models=(HUMAN,), name=HUMAN, measured=False,
+        published_outcomes=outcomes,
+    )  # fmt: skip
+
+
+def humans_of(trials: pd.DataFrame) -> Group:
+    """The humans, with the trials that are imported."""
+    if trials.empty:
+        return _published_humans()
+    n = len(trials)
+    label = HUMAN if n >= HUMAN_TRIALS else f"humans ({n} of {HUMAN_TRIALS} imported)"
+    return replace(_published_humans(), trials=trials, label=label, measured=True)
+
+
+def levels_of_group(levels: pd.DataFrame, group: Group) -> dict[str, str]:
+    """The levels of a group, model and prompt first."""
+    found = of_trials(levels, group.trials).drop_duplicates("factor")
+    named = found.set_index("factor")["value"].to_dict()
+    return {name: named[name] for name in sorted(named, key=lambda n: (n not in FIRST, n))}
+
+
+def levels_of(groups: Iterable[Group], order: Order) -> dict[str, list[str]]:
+    """The levels of each factor that these groups have, those in ``order`` first.
+
+    Then come usual ones, then numbers by size, then the rest by name.
+    """
+    found: dict[str, set[str]] = {}
+    for group in groups:
+        for factor, level in group.levels.items():
+            found.setdefault(factor, set()).add(level)
+    return {
+        factor: sorted(levels, key=lambda level: _place(level, order.get(factor, ())))
+        for factor, levels in found.items()
+    }
+
+
+def _place(level: str, listed: Sequence[str]) -> tuple[int, bool, float, str]:
+    place = listed.index(level) if level in listed else len(listed)
+    number = float(level) if NUMBER.fullmatch(level) else inf
+    return place, level not in USUAL, number, level
+
+
+def _as_seen(stored: Mapping[str, Any] | None, name: str, ego: str) -> dict[str, Any]:
+    """A spec as the ego sees it: with the ego's driver on the left.
+
+    ``image`` is its hash, ``usual`` its hash at the usual mean speed. ``task`` is a hash of what
+    it covers beside the prompt and the mean speed: equal for all prompts and conditions of a study.
+    """
+    spec, image = stored or {}, name
+    if ego == "right" and {*SIDES} <= spec.keys():
+        spec = {**spec, "left": spec["right"], "right": spec["left"]}
+        image = spec_hash(canonical_json(spec))
+    at_usual = {name: value for name, value in spec.items() if name != MEAN_SPEED}
+    usual = spec_hash(canonical_json(at_usual)) if MEAN_SPEED in spec else image
+    task = {name: value for name, value in at_usual.items() if name != "prompt_blocks"}
+    hashed = hashlib.sha256(json.dumps(task, sort_keys=True).encode()).hexdigest()
+    return {
+        "spec": spec,
+        "image": image,
+        "usual": usual,
+        "task": name if stored is None else hashed,
+    }
+
+
+def groups_of(
+    trials: pd.DataFrame,
+    specs: Mapping[str, Mapping[str, Any]],
+    decisions: pd.DataFrame,
+) -> list[Group]:
+    """Groups by driver and variant, scripted stand-ins last; ``decisions`` are ASKED_DECISIONS.
+
+    Where a driver was run under several settings of the task, all but the most frequent carry a
+    mark, the same for a baseline and its variants; likewise where a prompt was changed, and where
+    a stand-in answered some of its trials.
+    """
+    if trials.empty:
+        return []
+    pairs = [*zip(trials["spec_hash"], trials["ego"], strict=True)]
+    seen = {pair: _as_seen(specs.get(pair[0]), *pair) for pair in {*pairs}}
+    keyed = trials.join(pd.DataFrame([seen[pair] for pair in pairs], index=trials.index))
+    # A condition that was driven at several mean speeds must not be mixed.
+    speeds = keyed.groupby(["usual", "condition"])["image"].transform("nunique")
+    mixed = keyed["usual"].isin(keyed.loc[speeds > 1, "usual"])
+    keyed["usual"] = keyed["usual"].mask(mixed, keyed["image"])
+    keyed["mark"] = _marks(keyed, ["driver"], "task")
+    keyed["mark"] += _marks(keyed, ["driver", "mark", "variant"], "usual")
+    keyed["apart"] = keyed.groupby(["driver", "mark"])["scripted"].transform("nunique") > 1
+    keys = ["driver", "mark", "apart", "scripted", "variant", "usual"]
+    groups = []
+    for _, rows in keyed.groupby(keys):
+        counts = of_trials(decisions, rows).groupby("model")[["invalid", "asked"]].sum()
+        reasons = (not_judged(row.Index, row.invalid, row.asked) for row in counts.itertuples())
+        group = _model_group(trials.loc[rows.index], rows.iloc[0])
+        group = replace(group, unjudged="; ".join(filter(None, reasons)))
+        own = [specs.get(name, {}) for name in rows["spec_hash"].unique()]
+        # Of a first decision that was only asked, what follows is not known: draws that differ
+        # later may be equal until then.
+        only_asked = rows["source"].iloc[0] == "seat" and any(map(has_chance, own))
+        programs = all(map(programs_alone, own)) and not only_asked
+        groups.append(_distinct(group, programs=programs))
+    return sorted(groups, key=lambda g: (g.scripted, g.driver, g.setting != BASELINE, g.setting))
+
+
+def _model_group(rows: pd.DataFrame, first: pd.Series) -> Group:
+    """The group of these trials, which have the keys of the ``first`` of them."""
+    scripted = bool(first["scripted"])
+    models: dict[Side, str] = {side: first[f"model_{side}"] for side in SIDES}
+    sides = [side for side in SIDES if rows[f"{side}_scripted"].any()]
+    posing = stand_in(language_models(models, first["spec"]), sides or SIDES) if scripted else ""
+    driver = first["driver"] + first["mark"] + " [scripted]" * (scripted and bool(first["apart"]))
+    group = Group(
+        driver,
+        first["variant"],
+        min(rows["spec_hash"].unique(), key=lambda name: (name != first["usual"], name)),
+        rows,
+        label=driver,
+        models=tuple(dict.fromkeys(models.values())),
+        name=first["driver"],
+        mark=first["mark"],
+        seats=(int((rows["ego"] == "left").sum()), int((rows["ego"] == "right").sum())),
+        posing=posing,
+        caution=unresponsive(first["spec"]),
+    )
+    return replace(group, label=f"{driver} ({group.said})") if group.said else group
+
+
+def _distinct(group: Group, *, programs: bool) -> Group:
+    """The group without copies, if only programs drive; of a language model they are counted."""
+    rows = group.trials
+    ended = rows[rows["trace"].notna()].sort_values(["rep", "ego"], kind="stable")
+    again = ended.index[ended.duplicated(["condition", "trace"])]
+    each = rows["trial_id"] + " " + rows["spec_hash"]
+    rows = rows.assign(way=rows["trace"].fillna(each) if programs else each)
+    if not programs:
+        return replace(group, trials=rows, equal=len(again))
+    whole = replace(group, trials=rows)
+    return replace(whole, trials=rows.drop(index=again), whole=whole) if len(again) else whole
+
+
+def _marks(keyed: pd.DataFrame, within: list[str], what: str) -> pd.Series:
+    """`` [mark]`` for all but the most frequent value of ``what`` within equal names."""
+    sizes = keyed.groupby([*within, what])[what].transform("size")
+    ordered = keyed.assign(rarity=-sizes).sort_values(["rarity", what])
+    usual = ordered.groupby(within)[what].transform("first").reindex(keyed.index)
+    return (" [" + keyed[what].str[:8] + "]").mask(keyed[what] == usual, "")

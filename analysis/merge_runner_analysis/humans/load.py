@@ -1,0 +1,90 @@
+"""Turns the files of a download into trials in the database."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import PurePath
+
+from merge_runner.records import TrialRecord
+from merge_runner.results.store import Store, query
+from merge_runner_analysis.humans.archive import File, Unreadable, refuse_bombs
+from merge_runner_analysis.humans.record import (
+    SPECS,
+    condition_of,
+    parse_csv,
+    trace_of,
+    trial_record,
+    trials_of,
+)
+from merge_runner_analysis.published import PAIRS
+
+CHUNK = 100
+# The recorder wrote a PKL of each trial, too; unpickling it would run code in the file.
+NAME = re.compile(r"experiment_([0-9]{1,6})_iter_([0-9]{1,6})\.csv", re.IGNORECASE)
+IMPORTED = "SELECT trial_id, spec_hash FROM trials WHERE source = 'human'"
+# The condition of a velocity page, or experiment and iteration of a recording; and the file.
+Source = tuple[str, int, int, File]
+
+
+@dataclass(slots=True)
+class Report:
+    """The outcome of an import.
+
+    ``added`` and ``there`` count the trials added and those already stored; ``differing`` are ids
+    of trials already stored with other values. ``unreadable`` holds file and reason.
+    """
+
+    added: int = 0
+    there: int = 0
+    differing: list[str] = field(default_factory=list)
+    unreadable: list[tuple[str, str]] = field(default_factory=list)
+
+
+def sort_files(files: Iterable[File]) -> list[Source]:
+    """The files with trials, recordings first; raises UsageError for a bomb."""
+    sources: list[Source] = []
+    for file in files:
+        if name := NAME.fullmatch(PurePath(file.name).name):
+            sources.append(("", int(name[1]), int(name[2]), file))
+        elif condition := condition_of(file.name):
+            sources.append((condition, 0, 0, file))
+    refuse_bombs(file for *_, file in sources)
+    return sorted(sources, key=lambda source: source[:3])
+
+
+def import_trials(sources: Iterable[Source], store: Store) -> Report:
+    """Store trials, some at a time; an error does not undo earlier ones. Raises StoreError."""
+    report = Report()
+    records = (record for source in sources for record in _records(*source, report))
+    while chunk := list(islice(records, CHUNK)):
+        # A trial that was imported from the other kind of file is there.
+        known = dict(query(store.path, IMPORTED)[1])
+        specs = (known.setdefault(one.spec.trial_id, one.spec.spec_hash) for one in chunk)
+        new = [one for one, spec in zip(chunk, specs, strict=True) if one.spec.spec_hash == spec]
+        used = {name: SPECS[name] for name in {record.spec.spec_hash for record in new}}
+        added, there, differing = store.add_recorded(new, used)
+        report.added += added
+        report.there += there + len(chunk) - len(new)
+        report.differing += differing
+    return report
+
+
+def _records(
+    condition: str, experiment: int, iteration: int, file: File, report: Report
+) -> Iterator[TrialRecord]:
+    """The trials of a file; what cannot be read is reported."""
+    try:
+        if not condition:
+            yield trial_record(parse_csv(file.read()), experiment, iteration)
+            return
+        for experiment, iteration, lines in trials_of(file.read(), condition):  # noqa: PLR1704 # of the page
+            try:
+                yield trial_record(trace_of(lines, condition), experiment, iteration, condition)
+            except Unreadable as exc:
+                trial = f"{file.name}: {PAIRS[experiment]}, trial {iteration}"
+                report.unreadable.append((trial, str(exc)))
+    except Unreadable as exc:
+        report.unreadable.append((file.name, str(exc)))

@@ -1,0 +1,145 @@
+"""Where the results come from: sweeps, specs, what the calls came to, and what they cost."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pandas as pd
+
+from merge_runner.config import ScenarioConfig
+from merge_runner.records import NO_DECISION, SIDES
+from merge_runner.results import frames
+from merge_runner.results.database import read_database
+from merge_runner.served_model import other_models, sql_of
+from merge_runner_analysis.frames import ANSWERED, load_specs
+from merge_runner_analysis.grouping import Group, of_trials
+from merge_runner_analysis.study import Study
+
+SWEEPS = """
+SELECT sweep_id, name, started_at, ended_at, git_commit, git_dirty, versions,
+    count(trial_id) AS trials
+FROM sweeps LEFT JOIN sweep_trials USING (sweep_id)
+GROUP BY ALL ORDER BY started_at, sweep_id
+"""
+# Of each call the last attempt is the answer; those before it are retries.
+CALLS = """
+SELECT provider, model_requested, model_served,
+    count(DISTINCT call_key) AS calls,
+    count(*) FILTER (attempt > 1) AS retries,
+    count(*) FILTER (outcome = 'refusal') AS refusals,
+    count(*) FILTER (outcome = 'truncated') AS truncated,
+    count(*) FILTER (outcome = 'empty') AS empty,
+    sum(input_tokens) AS input_tokens,
+    sum(output_tokens) AS output_tokens,
+    sum(cost_usd) AS cost_usd,
+    count(*) FILTER (cost_usd IS NULL AND http_status = 200) AS unpriced,
+    min(started_at)::DATE AS first_day,
+    max(started_at)::DATE AS last_day
+-- A recorded call that several trials use was made once.
+FROM (
+    SELECT DISTINCT ON (call_key, attempt)
+        * EXCLUDE (request, reply, error)
+        REPLACE (max(model_served) OVER (PARTITION BY call_key) AS model_served)
+    FROM calls
+)
+GROUP BY provider, model_requested, model_served ORDER BY ALL
+"""
+SPECS = """
+SELECT DISTINCT driver, variant, spec_hash
+FROM specs JOIN trials USING (spec_hash) JOIN trial_drivers USING (trial_id, spec_hash)
+WHERE source NOT IN ('human', 'seat') ORDER BY ALL
+"""
+# Answers by each other model than was asked for.
+SERVED = """
+SELECT model_requested AS requested, model_served AS served,
+    count(DISTINCT (trial_id, spec_hash, side, decision)) AS answers,
+    coalesce(string_agg(DISTINCT sweep_id, ', ' ORDER BY sweep_id), 'unknown') AS sweeps
+FROM attempts LEFT JOIN sweep_trials USING (trial_id, spec_hash)
+WHERE fate IN {answered} AND {others}
+GROUP BY ALL ORDER BY ALL
+"""
+MODEL_COSTS = """
+SELECT driver, count(*) AS trials,
+    sum(calls) AS calls, sum(attempts) AS attempts,
+    sum(input_tokens) AS input_tokens, sum(cached_input_tokens) AS cached_input_tokens,
+    sum(output_tokens) AS output_tokens, sum(reasoning_tokens) AS reasoning_tokens,
+    sum(cost_usd) AS cost_usd, sum(paid_usd) AS paid_usd,
+    sum(attempts_of_unknown_cost) AS attempts_of_unknown_cost
+FROM trials JOIN trial_costs USING (trial_id, spec_hash)
+JOIN trial_drivers USING (trial_id, spec_hash)
+WHERE source <> 'human' GROUP BY ALL ORDER BY ALL
+"""
+
+
+class Provenance(NamedTuple):
+    """What the report says about the origin of its numbers: rows of the queries here.
+
+    By driver, variant and spec_hash ``settings`` are those of the driving task that differ from the
+    defaults, and what was sent to the models beside the prompt.
+    """
+
+    sweeps: pd.DataFrame
+    calls: pd.DataFrame
+    model_costs: pd.DataFrame
+    mismatches: pd.DataFrame
+    settings: dict[str, str]
+
+
+def provenance(db: Path) -> Provenance:
+    """Read the origin of a database's results."""
+    with read_database(db) as connection:
+        served = SERVED.format(answered=ANSWERED, others=sql_of(other_models(connection)))
+        sweeps, calls, model_costs, mismatches = (
+            frames.frame(connection.execute(sql)) for sql in (SWEEPS, CALLS, MODEL_COSTS, served)
+        )
+        played = connection.execute(SPECS).fetchall()
+    specs = load_specs(db)
+    settings = {
+        f"{driver}/{variant} ({name})": ", ".join(dict.fromkeys(_settings(specs[name])))
+        for driver, variant, name in played
+    }
+    return Provenance(sweeps, calls, model_costs, mismatches, settings)
+
+
+def tally(study: Study, group: Group) -> Counter[str]:
+    """Count a group's trials, calls, attempts, decisions, and what went wrong with them.
+
+    A call is asked at one decision, in one or more attempts. ``retried`` attempts were followed by
+    another, ``lost`` calls ended without an answer; of the ``answers``, ``invalid`` ones have no
+    valid plan, for a reason that has a count of its own, too; ``no_decision`` ones have one, and
+    lack the tactical decision asked for. ``fallback`` counts the ``decisions`` that were driven
+    from an older plan, or none.
+    """
+    trials = of_trials(study.calls, group.trials)
+    counts = {name: int(trials[name].sum()) for name in trials.select_dtypes("number")}
+    found = Counter("\n".join(trials["failures"].dropna()).splitlines())
+    counts |= {
+        "trials": len(group.trials),
+        "failed": len(group.trials) - len(group.ended),
+        "answers": counts["calls"] - counts["lost"],
+        "invalid": found.total() - found[NO_DECISION],
+    }
+    return Counter({**found, **counts})
+
+
+def _settings(spec: Mapping[str, Any]) -> Iterator[str]:
+    """What is unusual of a driving task, and the parameters of the models on each side of it.
+
+    A spec is made with an empty prompt, by which that is known in any format.
+    """
+    defaults = ScenarioConfig().model_dump()
+    task = spec.get("scenario", {})
+    yield from _leaves({k: v for k, v in task.items() if defaults.get(k) != v})
+    for side in SIDES:
+        body = spec.get(side, {}).get("body", {})
+        sent = {k: v for k, v in body.items() if k != "model" and '""' not in json.dumps(v)}
+        yield from _leaves(sent)
+
+
+def _leaves(values: Mapping[str, Any]) -> Iterator[str]:
+    for name, value in values.items():
+        yield from _leaves(value) if isinstance(value, dict) else [f"{name} = {value}"]

@@ -1,1 +1,0 @@
-"""The report: what the results show, in words, on one HTML page with tables and figures."""

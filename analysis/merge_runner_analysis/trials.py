@@ -1,0 +1,141 @@
+"""The trials of a database with their metrics, and with whether they collided, by two rules.
+
+By the rule that ended them and by that of the human experiment: a trial is judged by its stored
+trace. Where it ended in a collision that the other rule does not see, nobody knows what would have
+followed: it is undecided by that rule.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
+from math import ceil, hypot
+from pathlib import Path
+
+import pandas as pd
+
+from merge_runner.config import ScenarioConfig
+from merge_runner.errors import UsageError
+from merge_runner.scenarios.merge.collision import rectangles_overlap
+from merge_runner.scenarios.merge.geometry import TRACK
+from merge_runner.scenarios.merge.vehicle import advance
+from merge_runner.text_safety import first_line, quoted
+from merge_runner_analysis.frames import TRIALS, load_each, load_specs
+from merge_runner_analysis.metrics import JUDGED, LEFT_FIRST, METRICS, Metric
+from merge_runner_analysis.published import human_outcomes
+
+# The rule of the human experiment is boxes that overlap, looked for so often.
+LOOKS_HZ = 20
+# Samples at or next to which boxes can overlap: with centres closer in the plane than the diagonal
+# of a box and the way that they can come nearer within a step.
+NEAR = """
+SELECT trial_id, spec_hash,
+    list((step, time_s, left_m, left_mps, right_m, right_mps) ORDER BY step) AS near
+FROM (
+    SELECT *, left_m - merge_m AS left_past_m, right_m - merge_m AS right_past_m,
+        sine * (least(left_past_m, 0) + least(right_past_m, 0)) AS across_m,
+        if(left_past_m < 0, cosine * left_past_m, left_past_m)
+            - if(right_past_m < 0, cosine * right_past_m, right_past_m) AS along_m,
+        {step_s} * (abs(left_mps - right_mps) + sine * (left_mps + right_mps)) AS nearer_m
+    FROM (SELECT *, merge_point_m() AS merge_m, branch_sine() AS sine, sqrt(1 - sine ** 2) AS cosine
+        FROM vehicle_pairs WHERE spec_hash IN ({specs}))
+) WHERE across_m ** 2 + along_m ** 2 < ({reach_m} + nearer_m) ** 2 GROUP BY ALL
+"""
+# Step, time, and of the left and the right vehicle the travelled distance and the speed.
+Sample = tuple[int, float, float, float, float, float]
+
+
+def trials_with_metrics(db: Path) -> pd.DataFrame:
+    """The rows of ``load_trials`` with a column for each metric that is not JUDGED.
+
+    Raises UsageError, also where the SQL of a metric fails.
+    """
+    chosen = [metric for metric in METRICS.values() if metric.value not in JUDGED]
+    types = {metric.column: "boolean" if metric.rate else "float" for metric in chosen}
+    try:
+        return _selected(db, chosen).astype(types)
+    except UsageError:
+        for metric in chosen:
+            try:
+                _selected(db, [metric])
+            except UsageError as exc:
+                reason = first_line(exc.__cause__ or exc)
+                raise UsageError(f"the SQL of the metric {metric.name} fails: {reason}") from exc
+        raise
+
+
+def _selected(db: Path, metrics: list[Metric]) -> pd.DataFrame:
+    columns = ", ".join(metric.selected for metric in metrics)
+    # Subqueries of the metrics may have changed the order.
+    sql = f"SELECT *, {columns} FROM ({TRIALS}) AS trials ORDER BY trial_id, spec_hash"  # noqa: S608 # ours
+    return load_each({"trials": sql}, db)["trials"]
+
+
+def outcomes_with_metrics() -> pd.DataFrame:
+    """The published human outcomes with a column for each metric that they determine."""
+    outcomes = human_outcomes()
+    left = outcomes["merged_first"].eq("left").astype("boolean")
+    return outcomes.assign(**{LEFT_FIRST.column: left.where(outcomes["status"] == "finished")})
+
+
+def judged(db: Path, trials: pd.DataFrame) -> pd.DataFrame:
+    """The trials with whether they collided, by two rules; NA where that is undecided.
+
+    ``collided``: by the rule of their scenario, looked for at its steps; not of humans.
+    ``collided_boxes``: by the rule of the human experiment. ``trials`` are rows of ``load_trials``.
+    """
+    ended, human = trials["status"] != "failed", trials["source"] == "human"
+    recorded = trials["status"].eq("collided").astype("boolean").where(ended)
+    specs = load_specs(db)
+    tasks = {
+        name: ScenarioConfig.model_validate(specs.get(name, {}).get("scenario", {}))
+        for name in trials.loc[ended & ~human, "spec_hash"].unique()
+    }
+    overlapped = {
+        (row.trial_id, row.spec_hash)
+        for row in load_each({"near": _near(tasks)}, db)["near"].itertuples()
+        if _overlap(tasks[row.spec_hash], row.near)
+    }
+    keys = pd.MultiIndex.from_frame(trials[["trial_id", "spec_hash"]])
+    boxes = pd.Series(keys.isin(overlapped), trials.index, dtype="boolean")
+    # What a trace does not show of a trial that another rule ended is open.
+    boxes = boxes.mask(recorded & ~boxes).where(ended).mask(human, recorded)
+    return trials.assign(collided=recorded.mask(human), collided_boxes=boxes)
+
+
+def _near(tasks: Mapping[str, ScenarioConfig]) -> str:
+    """The query of the samples at or next to which boxes can overlap."""
+    every = [ScenarioConfig(), *tasks.values()]
+    step_s = max(one.step_s for one in every)
+    # What accelerations against each other, and a resistance, add to the way within a step.
+    added_m = 2 * (max(one.max_acceleration_mps2 for one in every) + 2) * step_s**2
+    reach_m = max(hypot(one.vehicle_length_m, one.vehicle_width_m) for one in every)
+    return NEAR.format(
+        specs=", ".join(map(quoted, tasks)) or "NULL",
+        step_s=step_s,
+        reach_m=reach_m + added_m + 0.01,
+    )
+
+
+def _overlap(config: ScenarioConfig, samples: Sequence[Sample]) -> bool:
+    """Whether boxes overlap at any look: at the samples, and at 20 Hz between those of a step."""
+    size = (config.vehicle_length_m, config.vehicle_width_m)
+    looks = [(left_m, right_m) for _, _, left_m, _, right_m, _ in samples]
+    for before, now in pairwise(samples):
+        if now[0] == before[0] + 1:
+            left = _looks_between(before[2:4], now[2:4], now[1] - before[1])
+            looks += zip(left, _looks_between(before[4:], now[4:], now[1] - before[1]), strict=True)
+    return any(rectangles_overlap(TRACK, *look, *size) for look in looks)
+
+
+def _looks_between(
+    before: tuple[float, ...], now: tuple[float, ...], step_s: float
+) -> Iterator[float]:
+    """A vehicle's positions at the looks within a step, in which its acceleration is constant."""
+    (before_m, before_mps), (now_m, now_mps) = before, now
+    acceleration = (now_mps - before_mps) / step_s
+    if now_mps <= 0 and now_m > before_m:  # it stopped the vehicle before the end of the step
+        acceleration = before_mps**2 / (-2 * (now_m - before_m))
+    looks = ceil(step_s * LOOKS_HZ - 1e-6)
+    for look in range(1, looks):
+        yield advance(before_m, before_mps, acceleration, step_s * look / looks)[0]

@@ -1,0 +1,210 @@
+"""The explorer as an application of Starlette: addresses to pages, and how it is served."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import socket
+import sys
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qsl
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.middleware.gzip import GZipMiddleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import (
+    HTMLResponse,
+    JSONResponse,
+    PlainTextResponse,
+    RedirectResponse,
+    Response,
+)
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+
+from merge_runner.errors import MergeRunnerError, UsageError
+from merge_runner_analysis.web.glossary import sections
+from merge_runner_analysis.web.guard import LOOPBACK, Guard
+from merge_runner_analysis.web.pages import (
+    conditions,
+    drivers,
+    home,
+    notes,
+    prompts,
+    sql,
+    sweep,
+    tables,
+    trial,
+    trials,
+    words,
+)
+from merge_runner_analysis.web.reading import reading
+from merge_runner_analysis.web.site import (
+    STATIC,
+    NothingNew,
+    NotThere,
+    Site,
+    TooMuch,
+    download,
+)
+from merge_runner_analysis.web.urls import whole
+
+LOG = logging.getLogger(__name__)
+FIRST_TIME = (
+    "The trials are read for the first time; ten thousand take about ten seconds. This page comes "
+    "back by itself."
+)
+MOST_NOTED, MOST_FIELDS = 65_536, 10  # bytes and fields of a form with a note
+
+
+def serve(db: Path, port: int, say: Callable[[str], None], reader: str) -> None:
+    """Serve a database to a reader; ``say`` gets the address to open. Raises UsageError."""
+    typed = sys.argv[0]
+    # What to type to run this: its path where the shell does not find it, as under ``make``.
+    plain = Path(typed).name != "merge-runner" or shutil.which("merge-runner") == typed
+    site = Site(db, program="merge-runner" if plain else typed, reader=reader)
+    with reading(db):
+        pass  # what is wrong with it is said at once
+    listener = listen(port)
+    site.begin()
+    say(f"http://{LOOPBACK}:{listener.getsockname()[1]}/")
+    config = uvicorn.Config(explorer(site), log_level="critical", ws="none")
+    uvicorn.Server(config).run(sockets=[listener])
+
+
+def listen(port: int) -> socket.socket:
+    """Return a socket that listens at loopback; port 0 takes any free port. Raises UsageError."""
+    try:
+        listener = socket.create_server((LOOPBACK, port))
+    except OSError as exc:
+        raise UsageError(
+            f"nothing can listen at port {port} of {LOOPBACK} ({exc.strerror}); --port 0 takes a "
+            "free port"
+        ) from exc
+    # asyncio does this for sockets whose protocol is given, and create_server's is not: without it
+    # every page waits 40 ms for the browser's delayed acknowledgement of its head.
+    listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return listener
+
+
+def explorer(site: Site) -> Starlette:
+    """Return the application, which answers to names of loopback alone."""
+
+    @asynccontextmanager
+    async def lifespan(_: Starlette) -> AsyncIterator[None]:
+        yield
+        site.close()  # a server that is told to end is killed after this
+
+    return Starlette(
+        routes=[
+            *(Route(path, partial(_page, site, render)) for path, render in PAGES.items()),
+            Route("/notes", partial(_noted, site), methods=["POST"]),
+            Mount("/static", StaticFiles(directory=STATIC)),
+        ],
+        middleware=[
+            Middleware(Guard),
+            Middleware(TrustedHostMiddleware, allowed_hosts=[LOOPBACK, "localhost"]),
+            Middleware(GZipMiddleware, minimum_size=2_000),
+        ],
+        lifespan=lifespan,
+        exception_handlers=_errors(site),
+    )
+
+
+def _page(site: Site, render: Callable[..., str | Response], asked: Request) -> Response:
+    """A page, of what the database holds now."""
+    if site.beginning:
+        text = site.render("message.html", heading="Reading the trials", text=FIRST_TIME, here="")
+        return HTMLResponse(text, headers={"refresh": "1"})  # in s
+    site.refresh()
+    rendered = render(site, *asked.path_params.values(), asked.query_params)
+    return HTMLResponse(rendered) if isinstance(rendered, str) else rendered
+
+
+def _trials_csv(site: Site, asked: Mapping[str, str]) -> Response:
+    wanted = trials.export_filter(site, asked)
+    return download(site.catalogue.export(wanted, trials.sort_of(asked)), "trials.csv")
+
+
+# What renders each page, of what its address names and asks for.
+PAGES: dict[str, Callable[..., str | Response]] = {
+    "/": home.home_page,
+    "/drivers": drivers.drivers_page,
+    "/drivers/{name:path}": drivers.driver_page,
+    "/conditions/{name:path}": conditions.condition_page,
+    "/sweeps": sweep.sweeps_page,
+    "/sweeps/{name:path}": sweep.sweep_page,
+    "/trials": trials.trials_page,
+    "/trials/": lambda site, asked: RedirectResponse(site.at.to("trials", **asked)),
+    "/trials.csv": _trials_csv,
+    "/trials/{name:path}": trial.trial_page,
+    "/others/{name:path}": lambda *asked: JSONResponse(trial.others(*asked)),
+    "/glossary": lambda site, _: site.render("glossary.html", here="glossary", glossary=sections()),
+    "/tables": tables.tables_page,
+    "/tables/{name}.{suffix}": tables.table_file,
+    "/tables/{name}": tables.table_page,
+    "/figures/{name}.{suffix}": tables.figure_file,
+    "/figures/{name}": tables.figure_page,
+    "/prompts": prompts.prompts_page,
+    "/discordant": prompts.discordant_page,
+    "/words": words.words_page,
+    "/notes": notes.notes_page,
+    "/sql": sql.sql_page,
+    "/sql.csv": sql.sql_csv,
+}
+
+
+async def _noted(site: Site, request: Request) -> Response:
+    """Keep what a reader notes; see ``Guard`` for who may write."""
+    size = whole(request.headers.get("content-length", ""))
+    if size is None or size > MOST_NOTED:
+        return PlainTextResponse("nothing was noted: the form is too large", 413)
+    body = (await request.body()).decode(errors="replace")
+
+    def write() -> Response:
+        site.refresh()
+        try:
+            row = notes.add_note(site, dict(parse_qsl(body, max_num_fields=MOST_FIELDS)))
+        except (UsageError, ValueError) as exc:
+            return PlainTextResponse(str(exc), 400)
+        if "hx-request" in request.headers:
+            return HTMLResponse(site.render("_notes_of.html", row=row))
+        return RedirectResponse(site.at.trial(row), 303)
+
+    return await run_in_threadpool(write)
+
+
+def _errors(site: Site) -> dict[Any, Callable[[Request, Exception], Response]]:
+    """The pages that say why there is no other."""
+
+    def said(heading: str, code: int, request: Request, exc: Exception) -> Response:
+        text = str(exc)
+        if isinstance(exc, HTTPException):
+            text = f"there is no page {request.url.path}"
+        if code == 500:
+            LOG.error("%s: a fault of the explorer: %r", request.url.path, exc)
+            LOG.debug("where it happened", exc_info=exc)
+            text = f"A fault of the explorer: {exc!r}. The other pages go on."
+        page = site.render("message.html", heading=heading, text=text, here="")
+        # A page that waited for what is not there is loaded anew, to say so.
+        return HTMLResponse(page, code, {"hx-refresh": "true"} if code == 404 else None)
+
+    return {
+        NothingNew: lambda *_: Response(status_code=204),
+        NotThere: partial(said, "Not there", 404),
+        TooMuch: partial(said, "Too much", 400),
+        # Nobody reads what is answered to a browser that has left.
+        ClientDisconnect: lambda *_: Response(status_code=400),
+        404: partial(said, "Not there", 404),
+        MergeRunnerError: partial(said, "Not now", 503),
+        Exception: partial(said, "A fault", 500),
+    }

@@ -1,0 +1,71 @@
+"""A copy of the database, for what reads long: the database is open only while it is copied.
+
+So a sweep can write meanwhile. A copy lasts as long as the file stays as it is.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import threading
+import weakref
+from contextlib import suppress
+from pathlib import Path
+
+import duckdb
+
+from merge_runner.errors import StoreLocked, UsageError
+from merge_runner_analysis.web.reading import reading, stamp_of
+
+# The database comes after its logs: a process that closes a file loses all its locks on it.
+FILES = (".wal", ".wal.checkpoint", ".wal.recovery", "")
+
+
+class Copy:
+    """A copy of a database as an open file without a name: it is gone when nobody holds it.
+
+    So nothing is left of it when the program is killed, and no query can say where it lies.
+    ``file`` is its name in SQL.
+    """
+
+    def __init__(self, db: Path, stamp: tuple[int, ...]) -> None:
+        """Make it; raises UsageError."""
+        self.stamp = stamp
+        try:
+            with tempfile.TemporaryDirectory(prefix="merge-runner-view-") as folder:
+                copy = f"{folder}/results.duckdb"
+                with reading(db):  # so that nobody writes
+                    for end in FILES:
+                        with suppress(FileNotFoundError):
+                            shutil.copyfile(f"{db}{end}", f"{copy}{end}")
+                with duckdb.connect(copy) as whole:  # it loses its name, and its log with it
+                    whole.execute("CHECKPOINT")
+                self.fd = os.open(copy, os.O_RDONLY)
+        except OSError as exc:
+            raise UsageError(f"the database cannot be copied: {exc.strerror}") from exc
+        weakref.finalize(self, os.close, self.fd)
+        self.file = f"'/dev/fd/{self.fd}'"
+
+
+class Copies:
+    """The present copy of a database."""
+
+    def __init__(self, db: Path) -> None:
+        self.db = db
+        self._copy: Copy | None = None
+        self._copying = threading.Lock()
+
+    def current(self) -> Copy:
+        """A copy of the database as it is, or was before another program held it.
+
+        Raises UsageError and StoreLocked.
+        """
+        with self._copying:
+            stamp = stamp_of(self.db)
+            if self._copy is None:
+                self._copy = Copy(self.db, stamp)
+            elif self._copy.stamp != stamp:
+                with suppress(StoreLocked):
+                    self._copy = Copy(self.db, stamp)
+            return self._copy

@@ -1,0 +1,254 @@
+"""A study as a folder of pages that open without a server: those of the explorer, crawled."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import re
+import shutil
+import tempfile
+from collections import deque
+from collections.abc import Callable, Collection, Iterator, Sequence
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack, contextmanager, suppress
+from fnmatch import fnmatchcase
+from functools import cache, lru_cache, partial
+from html import unescape
+from itertools import chain, count
+from pathlib import Path, PurePosixPath
+from urllib.parse import parse_qsl, unquote, urlsplit
+
+import httpx
+
+from merge_runner.errors import UsageError
+from merge_runner.paths import refuse_another_kind
+from merge_runner.results.database import read_database
+from merge_runner_analysis.web.app import explorer
+from merge_runner_analysis.web.catalogue import FACETS, FACTOR
+from merge_runner_analysis.web.computing import processes
+from merge_runner_analysis.web.guard import LOOPBACK
+from merge_runner_analysis.web.leaks import refuse_leaks
+from merge_runner_analysis.web.offline import offline, page_of_trials
+from merge_runner_analysis.web.pages.trial import trial_page
+from merge_runner_analysis.web.reading import Row
+from merge_runner_analysis.web.site import SCOPE, STATIC, NotThere, Site
+from merge_runner_analysis.web.urls import query_of
+
+MOST = 1_000  # trials of drivers; of humans there are at most 990
+# The pages of an export by the first part of their path, and what their addresses ask for. They
+# are of all trials, so that a link within a scope leads to the page without it.
+FOLLOWED: dict[str, Collection[str]] = {
+    **dict.fromkeys(
+        ("", "sweeps", "conditions", "tables", "figures", "prompts", "notes", "glossary"), ()
+    ),
+    "drivers": ("variant",),
+    "trials": ("spec", "page", *FACETS),
+    "discordant": ("model", "variant"),
+}
+OF_TRIALS = ("trials", "glossary")
+OF_A_TRIAL, MOST_HELPERS = "/trials/", 4
+MOMENT = ("side", "decision")  # the script of a trial's page reads these
+POLICY = (
+    "default-src 'none'; script-src 'self' file:; style-src 'self' file:; "
+    "img-src 'self' file: data:; base-uri 'none'; form-action 'none'"
+)
+HTML = b"<!doctype html"
+OURS = f'{HTML.decode()}>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'.encode()
+INDEX, FILES = "index.html", "files"
+SERVED = ("htmx*", "lost.js", "notes.js", "single.js")  # scripts that need a server, or one page
+BUSY, POLL_S = 'class="computing"', 0.1
+_FILE_LINKS = re.compile(r'href="(/(?:tables|figures)/[^"]+\.(?:csv|tex|svg))"')
+_ODD = re.compile(r"[^A-Za-z0-9_.]+")
+LONGEST_NAME = 120
+
+
+def export_folder(
+    db: Path,
+    folder: Path,
+    wanted: Sequence[str] = (),
+    told: Callable[[int], object] = lambda _: None,
+) -> Path:
+    """Write the pages of a study into a folder; returns the first of them.
+
+    ``wanted`` are names of trials, in which * stands for anything: then it is their list and their
+    pages alone. ``told`` gets the number of pages so far. An earlier export in the folder goes.
+    Raises UsageError; then, as where a page holds a key or a path of this machine, the folder stays
+    as it was.
+    """
+    index, files = folder / INDEX, folder / FILES
+    if folder.is_file():
+        raise UsageError(f"{folder} is a file: name a folder")
+    refuse_another_kind(index, OURS, "exported study")
+    if files.exists() and not index.exists():
+        raise UsageError(f"{files} is there, and is no exported study's: name another folder")
+    begin, heads = ("/trials", OF_TRIALS) if wanted else ("/", tuple(FOLLOWED))
+    with _opened(db, wanted) as (site, rows), _staged(folder) as stage:
+        if wanted:
+            site.catalogue.keep([row["number"] for row in rows])
+        (stage / FILES).mkdir()
+        try:
+            asyncio.run(_crawl(site, begin, heads, stage, told))
+        except BrokenProcessPool:
+            raise UsageError("nothing was written: a process that helped was ended") from None
+        shutil.copytree(STATIC, stage / FILES / "static", ignore=shutil.ignore_patterns(*SERVED))
+    return index
+
+
+def export_page(db: Path, file: Path, wanted: Sequence[str]) -> Path:
+    """Write one page with the wanted trials; returns its path. Raises UsageError."""
+    refuse_another_kind(file, HTML, "page of HTML")
+    with _opened(db, wanted) as (site, rows), _staged(file.parent) as stage:
+        (stage / file.name).write_text(page_of_trials(site, rows), encoding="utf-8")
+    return file
+
+
+async def _crawl(
+    site: Site, begin: str, heads: tuple[str, ...], stage: Path, told: Callable[[int], object]
+) -> None:
+    """Save the pages to which links lead, as they are served, with links from file to file."""
+    files, waiting = {begin: INDEX}, deque([begin])
+    # Most pages are of trials, and most of the time they are what is waited for.
+    rendering: dict[str, Future[str]] = {}
+    helpers = processes(min(os.cpu_count() or 1, MOST_HELPERS))
+
+    def leads(root: str, address: str) -> str:
+        """The way to the file of an address; empty where there is none."""
+        page, moment = _page_of(address, heads)
+        if page and page not in files:
+            files[page] = _file_of(page, files.values())
+            waiting.append(page)
+            if page.startswith(OF_A_TRIAL):
+                rendering[page] = helpers.submit(_trial_page, site.db, page)
+        return f"{root}{files[page]}{moment}" if files.get(page) else ""
+
+    transport = httpx.ASGITransport(explorer(site), raise_app_exceptions=False)
+    plain = {"accept-encoding": "identity"}
+    client = httpx.AsyncClient(transport=transport, base_url=f"http://{LOOPBACK}", headers=plain)
+    with ExitStack() as ends:
+        ends.callback(helpers.shutdown, cancel_futures=True)
+        while waiting:
+            address = waiting.popleft()
+            text = await asyncio.wrap_future(rendering.pop(address)) if address in rendering else ""
+            text = text or await _served(client, address)
+            if BUSY in text:
+                waiting.append(address)
+                await asyncio.sleep(POLL_S)
+                continue
+            # Files come before the pages that link to them: a figure that cannot be drawn has none.
+            links = {unescape(href) for href in _FILE_LINKS.findall(text)}
+            for link in sorted(links - files.keys()):
+                if page := _page_of(link, heads)[0]:
+                    file = await client.get(page)
+                    files[page] = "" if file.is_error else _file_of(page, files.values())
+                    if files[page]:
+                        refuse_leaks(site.db, page, file.text)
+                        (stage / files[page]).write_bytes(file.content)
+            root = "" if address == begin else "../"
+            text = offline(text, site.db.name, POLICY, partial(leads, root))
+            text = text.replace('="/static/', f'="{root}{FILES}/static/')
+            refuse_leaks(site.db, files[address], text)
+            (stage / files[address]).write_text(text, encoding="utf-8")
+            told(len(files) - len(waiting))
+
+
+async def _served(client: httpx.AsyncClient, address: str) -> str:
+    """A page as it is served, also one that says what is not there; raises UsageError."""
+    reply = await client.get(address)
+    if reply.is_error and reply.status_code != httpx.codes.NOT_FOUND:
+        raise UsageError(
+            f"nothing was written: {address} answers {reply.status_code}; `merge-runner view` "
+            "shows why"
+        )
+    return reply.text
+
+
+@lru_cache(1)
+def _still(db: Path) -> tuple[Site, ExitStack]:
+    """The site of a process that helps, and what keeps its database open."""
+    site, kept = Site(db, is_still=True), ExitStack()
+    site.catalogue.refresh()
+    site.open = kept.enter_context(read_database(db))
+    site.open.execute("SET threads = 1")  # there are several of these
+    return site, kept
+
+
+def _trial_page(db: Path, page: str) -> str:
+    """The page of a trial, as it is served; empty where it is not there."""
+    parts = urlsplit(page)
+    name = unquote(parts.path.removeprefix(OF_A_TRIAL))
+    with suppress(NotThere):
+        return trial_page(_still(db)[0], name, dict(parse_qsl(parts.query)))
+    return ""
+
+
+@cache  # pages link to each other
+def _page_of(address: str, heads: tuple[str, ...]) -> tuple[str, str]:
+    """Split an address into a page and the moment it shows; two empty texts for other pages."""
+    parts = urlsplit(address)
+    head = parts.path.removeprefix("/").partition("/")[0]
+    if head not in heads or parts.netloc or not parts.path.startswith("/"):
+        return "", ""
+    known, asked = FOLLOWED[head], dict(parse_qsl(parts.query))
+    moment = query_of({name: asked.pop(name) for name in MOMENT if name in asked})
+    # In one order, whatever the page that links to it says first.
+    kept = {n: asked[n] for n in sorted(asked) if n in known or n.startswith(FACTOR)}
+    if parts.path.endswith(".png") or asked.keys() - kept.keys() - {*SCOPE}:
+        return "", ""
+    return parts.path + query_of(kept), moment + (f"#{parts.fragment}" if parts.fragment else "")
+
+
+def _file_of(page: str, taken: Collection[str]) -> str:
+    """Return a name for the file of a page that no other one has, whatever the page is called."""
+    parts = urlsplit(page)
+    path = PurePosixPath(unquote(parts.path))
+    suffix = path.suffix if page.startswith(("/tables/", "/figures/")) else ""
+    asked = [part for pair in parse_qsl(parts.query) if pair[0] != "spec" for part in pair]
+    words = "-".join([str(path).removesuffix(suffix), *asked])
+    name = f"{FILES}/{_ODD.sub('-', words).strip('-')[:LONGEST_NAME]}"
+    others = {file.lower() for file in taken}
+    named = (f"{name}{end}{suffix or '.html'}" for end in chain([""], map("-{}".format, count(2))))
+    return next(file for file in named if file.lower() not in others)
+
+
+@contextmanager
+def _opened(db: Path, wanted: Sequence[str]) -> Iterator[tuple[Site, list[Row]]]:
+    """Give a site and the wanted trials, by name; raises UsageError for none or too many."""
+    site = Site(db)
+    site.refresh()
+    site.is_still = True  # so that all pages are of the same trials
+    rows = [
+        row
+        for row in site.catalogue.every({})
+        if not wanted or any(fnmatchcase(row["trial_id"], pattern) for pattern in wanted)
+    ]
+    if not rows:
+        names = ", ".join(wanted) or "any name"
+        raise UsageError(f"{db} holds no trial called {names}; `merge-runner view` lists them")
+    if (number := sum(row["source"] != "human" for row in rows)) > MOST:
+        raise UsageError(
+            f"these are {number:,} trials, and pages without a server are for {MOST:,}: choose "
+            f"some with --trials, or send {db.name} and open it with `merge-runner view --db "
+            f"{db.name}`"
+        )
+    try:
+        yield site, rows
+    finally:
+        site.close()
+
+
+@contextmanager
+def _staged(folder: Path) -> Iterator[Path]:
+    """Give a temporary folder, of which all goes into this one in the end; raises UsageError."""
+    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.is_dir())
+    try:
+        with tempfile.TemporaryDirectory(prefix=".merge-runner-", dir=there) as stage:
+            yield Path(stage)
+            folder.mkdir(parents=True, exist_ok=True)
+            for path in Path(stage).iterdir():
+                earlier = folder / path.name
+                if path.is_dir() and earlier.is_dir():
+                    shutil.rmtree(earlier)
+                path.replace(earlier)
+    except OSError as exc:
+        raise UsageError(f"{folder} cannot be written: {exc}") from exc

@@ -1,0 +1,113 @@
+"""Verdicts as marks on an axis: places in percent, so that no picture is stretched."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from merge_runner_analysis.wording import (
+    MEASURES,
+    OPEN,
+    SHOWN,
+    STRONGER,
+    UNLIKE,
+    WEAKER,
+    Measure,
+    Values,
+    number,
+    share,
+    verdict_word,
+    with_interval,
+)
+
+SHAPES = {SHOWN: "like", WEAKER: "weaker", STRONGER: "stronger", UNLIKE: "unlike", OPEN: "open"}
+LARGE_PERCENT = 10.0  # from here on a share of collisions has no decimals
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """Where a value, its interval and 0 lie, and a shape; one outside the axis is an arrow."""
+
+    shape: str
+    at: float | None
+    ends: tuple[float, float] | None
+    arrow: str = ""
+    zero: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One verdict as a page shows it; ``words`` is it in full, with what is to be known of it."""
+
+    measure: Measure
+    values: Values
+    mark: Mark | None
+    text: str
+    interval: str
+    verdict: str
+    words: str
+
+
+def place(measure: Measure, value: float) -> float:
+    """The place of a value on a measure's axis in percent; beyond it is its end."""
+    low, high = measure.ends
+    return round(min(max(100 * (value - low) / (high - low), 0.0), 100.0), 2)
+
+
+def mark(measure: Measure, values: Values) -> Mark | None:
+    """The mark of a verdict; None without a value or an interval."""
+    value, ci, (low, high) = values.get("estimate"), values.get("ci"), measure.ends
+    ends = None if ci is None else (place(measure, ci[0]), place(measure, ci[1]))
+    if value is None:
+        return None if ends is None else Mark("", None, ends)
+    shape = SHAPES.get(values.get("state") or "", "plain")
+    arrow = "beyond" if value > high else "below" if value < low else ""
+    return Mark(shape, place(measure, value), ends, arrow)
+
+
+def rate(count: int, of: int) -> Mark:
+    """The mark of a share on an axis from 0 to 100 %, with its score interval; empty of none."""
+    # Imported here: scipy takes a second, and only a driver's page has rates.
+    from merge_runner_analysis.stats.intervals import wilson
+
+    if not of:
+        return Mark("", None, None)
+    low, high = wilson(count / of, of)
+    return Mark("plain", round(100 * count / of, 2), (round(100 * low, 2), round(100 * high, 2)))
+
+
+def band(measure: Measure, human: Values) -> Mark:
+    """The humans' interval and value on the axis, and 0 where the axis has it inside."""
+    value, (low, high) = human.get("estimate"), measure.ends
+    if measure.margin is not None and human.get("ci") is None and value is not None:
+        human = {**human, "ci": (value - measure.margin, value + measure.margin)}
+    placed = mark(measure, human) or Mark("", None, None)
+    zero = place(measure, 0.0) if low < 0 < high else None
+    return replace(placed, zero=zero)
+
+
+def cells(verdicts: dict[str, Values]) -> dict[str, Cell]:
+    """The verdicts of a driver and prompt by measure; empty where it is not judged."""
+    if "" in verdicts:
+        return {}
+    return {name: _cell(MEASURES[name], values) for name, values in verdicts.items()}
+
+
+def _cell(measure: Measure, values: Values) -> Cell:
+    value, ci = values.get("estimate"), values.get("ci")
+    is_large = (value or 0.0) >= LARGE_PERCENT
+    decimals = {"gap-headway": 2, "collisions": 0 if is_large else 1}.get(measure.name, 1)
+    text = "–" if value is None else number(value, decimals)
+    if values.get("undecided"):
+        text = share(values, 0)
+    word = verdict_word(values) if values.get("kind") != "humans" else ""
+    whole = share(values) if values.get("undecided") else with_interval(value, ci, 2)
+    said = [f"{whole} {measure.unit}", word, f"n = {values['n']}", values["note"]]
+    return Cell(
+        measure,
+        values,
+        mark(measure, values),
+        text,
+        "" if ci is None else f"[{number(ci[0], decimals)}, {number(ci[1], decimals)}]",
+        word,
+        "; ".join(filter(None, said)),
+    )

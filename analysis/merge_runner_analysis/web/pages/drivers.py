@@ -1,0 +1,113 @@
+"""Drivers: all of them in a list, and a page for each, beside the humans and perhaps another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from merge_runner_analysis.names import HUMAN
+from merge_runner_analysis.tables.formats import printed
+from merge_runner_analysis.web.computing import Job
+from merge_runner_analysis.web.display_text import with_minus
+from merge_runner_analysis.web.marks import rate
+from merge_runner_analysis.web.pages.computed import computed_table
+from merge_runner_analysis.web.pages.home import (
+    Driver,
+    by_condition,
+    by_kind,
+    humans_of,
+    judged,
+    noted,
+)
+from merge_runner_analysis.web.scope import Scope, scope_of, unmarked
+from merge_runner_analysis.web.site import NotThere, Site
+from merge_runner_analysis.wording import DIFFERS, OPEN, SHOWN, UNLIKE
+
+# How attempts of a driver's trials with a prompt ended, and which model answered.
+ATTEMPTS = """
+SELECT served, outcome, count(*) AS times
+FROM tried SEMI JOIN (FROM listed WHERE model = ? AND variant = ?) USING (number)
+GROUP BY ALL ORDER BY ALL
+"""
+
+
+def drivers_page(site: Site, asked: Mapping[str, str]) -> str:
+    """All drivers with their prompts; raises NotThere."""
+    bar = scope_of(site, asked)
+    chosen = bar.scope.drivers or bar.drivers
+    drivers, values = judged(site, bar, asked)
+    kinds = by_kind([one for one in drivers if unmarked(one.name) in chosen])
+    return site.render("drivers.html", here="drivers", kinds=kinds, **values)
+
+
+def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
+    """A driver with one prompt, of ``human`` the humans; raises NotThere."""
+    bar = scope_of(site, asked, "" if name == HUMAN else name)
+    scope = bar.scope
+    drivers, values = judged(site, bar, asked)
+    by_name = {one.name: one for one in drivers if one.prompt == scope.prompt}
+    own = by_name.get(name)
+    if own is None and name != HUMAN and values["table"] is not None:
+        raise NotThere(
+            f"no driver {name!r} was played with this prompt; there are: "
+            f"{', '.join(by_name) or 'none'}"
+        )
+    trials = scope.trials(name, scope.prompt)
+    was_asked = own and own.facts and own.facts["asked"]
+    awaited, first = _first(site, name, scope) if was_asked else (None, "")
+    beside = by_name.get(asked.get("with", ""))
+    conditions = by_condition(site, scope, [one for one in (own, beside) if one])
+    # Of each condition, the humans' and the drivers' share of trials in which left goes first.
+    shares = (
+        [rate(cell["left_first"], cell["merged"]) if cell else rate(0, 0) for cell in cells]
+        for cells in (conditions["humans"], *(cells for _, cells in conditions["rows"]))
+    )
+    return site.render(
+        "driver.html",
+        here="drivers",
+        name=name,
+        own=own,
+        beside=beside,
+        others=[one for one in by_name.values() if one is not own],
+        **values | {"human": humans_of(values["table"], own)},
+        awaited=awaited,
+        first=first,
+        found=site.words.search(trials) if was_asked else None,
+        kept=trials,
+        summary=_summary(own) if own and own.cells else "",
+        attempts=site.catalogue.ask(ATTEMPTS, unmarked(name), scope.prompt),
+        accounts=[
+            row
+            for row in site.catalogue.counts({**trials, "outcome": "collided"}, "account")
+            if row["account"]
+        ],
+        conditions=conditions,
+        rates=zip(*shares, strict=True),
+        notes=noted([own] if own else []),
+    )
+
+
+def _summary(own: Driver) -> str:
+    """How many of the humans' traits are shown, and how many measures are open."""
+    states = {name: state for name, cell in own.cells.items() if (state := cell.values["state"])}
+    traits = [states[name] for name in states if name not in {"collisions", "gap"}]
+    shown = sum(state in {SHOWN, *DIFFERS} - {UNLIKE} for state in traits)
+    return (
+        f"{shown} of {len(traits)} human traits shown; "
+        f"{[*states.values()].count(OPEN)} of {len(states)} measures inconclusive."
+    )
+
+
+def _first(site: Site, driver: str, scope: Scope) -> tuple[Job, str]:
+    """What a driver does first, by the table of first actions; empty until that is made."""
+    found, table = computed_table(site, "first-action", scope.sweep, scope.condition)
+    told = []
+    for row in table.rows if table else []:
+        is_told = row.groups[0] in {f"{driver}/{scope.prompt}", HUMAN}
+        if table and is_told and row.values.get("slope_ci"):
+            of = printed(table, row)
+            told.append(
+                f"{of['driver']}: brakes in {of['brake_percent']} %, holds in {of['hold_percent']}"
+                f" %, goes in {of['go_percent']} % of {of['n']}; m/s² per m/s of own relative "
+                f"velocity: {of['slope']} {of['slope_ci']}."
+            )
+    return found, with_minus(" ".join(told)) if len(told) > 1 else ""

@@ -1,0 +1,32 @@
+"""What readers noted, all of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from merge_runner_analysis.web.pages.trial import find
+from merge_runner_analysis.web.reading import Row
+from merge_runner_analysis.web.site import Site
+from merge_runner_analysis.web.urls import whole
+
+
+def notes_page(site: Site, _: Mapping[str, str]) -> str:
+    """Return all notes, the latest first, each with the address of what it is of.
+
+    It has none where the trial is not in this database.
+    """
+    kept, shown = site.notes.kept(), []
+    for note in reversed(kept.notes):
+        row = site.catalogue.find(note.trial_id, note.spec_hash)
+        at = {"side": note.side, "decision": note.decision}
+        shown.append((note, row and site.at.trial(row, **at)))
+    return site.render("notes.html", here="notes", kept=kept, shown=shown)
+
+
+def add_note(site: Site, given: Mapping[str, str]) -> Row:
+    """Note what a form gives; returns the trial. Raises NotThere and UsageError."""
+    row = find(site, given.get("trial", ""), given)
+    side, number = given.get("side", ""), whole(given.get("decision", ""))
+    text = given.get("text", "").replace("\r\n", "\n").strip()
+    site.notes.add(row["trial_id"], row["spec_hash"], side, number, text)
+    return row

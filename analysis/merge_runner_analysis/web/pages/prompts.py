@@ -1,0 +1,158 @@
+"""Prompts: what each says otherwise than the baseline, and what that does, driver by driver."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Mapping
+from functools import partial
+from typing import Any
+
+from merge_runner.prompts.blocks import Variant, blocks_of
+from merge_runner_analysis.metrics import COLLISIONS
+from merge_runner_analysis.names import BASELINE
+from merge_runner_analysis.tables.formats import printed
+from merge_runner_analysis.tables.model import Row, Table
+from merge_runner_analysis.web import views
+from merge_runner_analysis.web.marks import Mark
+from merge_runner_analysis.web.pages.computed import computed_table
+from merge_runner_analysis.web.pages.home import Driver, judged
+from merge_runner_analysis.web.prompts import parts_of
+from merge_runner_analysis.web.reading import reading, records
+from merge_runner_analysis.web.scope import scope_of, unmarked
+from merge_runner_analysis.web.site import NotThere, Site
+
+# The blocks of a prompt, as its specs name them; a program has none.
+STORED = """
+SELECT any_value(names) AS names FROM listed JOIN (
+    SELECT spec_hash, json_keys(spec, '$.prompt_blocks') AS names FROM specs
+) USING (spec_hash) WHERE variant = ? AND len(names) > 0
+"""
+# What each variant asks first: of all of them in the same condition, as far as that was played.
+FIRST = """
+SELECT variant, arg_min(prompt, (condition, decisions.side, trial_id)) AS prompt
+FROM decisions JOIN trials USING (trial_id, spec_hash)
+WHERE decision = 0 AND prompt IS NOT NULL GROUP BY variant ORDER BY variant <> ?, variant
+"""
+# Trials of a variant and of its driver's baseline in equal conditions and repetitions, whose specs
+# differ in nothing but the prompt.
+PAIRS = """
+WITH tasks AS (
+    SELECT spec_hash, json_merge_patch(spec, '{"prompt_blocks": null}') AS task FROM specs
+), tasked AS (FROM listed JOIN tasks USING (spec_hash) WHERE source <> 'human')
+SELECT one.condition, one.rep, one.trial_id, one.spec_hash, one.outcome,
+    base.trial_id AS base_id, base.spec_hash AS base_hash, base.outcome AS base_outcome
+FROM tasked AS one JOIN tasked AS base USING (model, model_left, condition, rep, task)
+WHERE one.model = ? AND one.variant = ? AND base.variant = ?
+ORDER BY one.trial_id, one.spec_hash, base.spec_hash
+"""
+
+
+def prompts_page(site: Site, asked: Mapping[str, str]) -> str:
+    """All prompts side by side, and the differences that they make."""
+    bar = scope_of(site, asked)
+    chosen = bar.scope.drivers or bar.drivers
+    found, contrasts = computed_table(site, "contrasts", bar.scope.sweep, bar.scope.condition)
+    played, values = judged(site, bar, asked)
+    driven: dict[str, list[Driver]] = {}
+    for one in played:
+        if unmarked(one.name) in chosen:
+            driven.setdefault(one.name, []).append(one)
+    with reading(site.db) as connection:
+        texts = {row["variant"]: row["prompt"] for row in records(connection, FIRST, [BASELINE])}
+    drivers, ends = differences(contrasts, chosen) if contrasts else ({}, {})
+    return site.render(
+        "prompts.html",
+        here="prompts",
+        **values | {"headings": {}},
+        found=found,
+        contrasts=contrasts,
+        prompts={name: parts_of(text, texts.get(BASELINE)) for name, text in texts.items()},
+        left_out=partial(left_out, site),
+        drivers=drivers,
+        ends=ends,
+        collisions=COLLISIONS.name,
+        # Those that were played with several prompts, the baseline first.
+        kinds={
+            name: sorted(prompts, key=lambda one: one.prompt != BASELINE)
+            for name, prompts in sorted(driven.items())
+            if len(prompts) > 1
+        },
+    )
+
+
+def differences(
+    table: Table, chosen: Collection[str]
+) -> tuple[dict[str, dict[str, dict[str, Any]]], dict[str, float]]:
+    """What each prompt changes, by driver of these, by both prompts, and by measure.
+
+    Each difference is as it is printed, with its mark, 0 in the middle of its axis, and what a link
+    to its trials needs. And where the axis of each measure ends on both sides, in its unit.
+    """
+    # A driver that is not judged has none.
+    rows = [row for row in table.rows if row.values.get("difference") is not None]
+    ends: dict[str, float] = {}
+    for row in rows:
+        name = row.id.rpartition("/")[2]
+        ends[name] = max(ends.get(name, 0.0), *map(abs, _values(row)))
+    drivers: dict[str, dict[str, dict[str, Any]]] = {}
+    for row in rows:
+        name, (driver, _, prompt) = row.id.rpartition("/")[2], row.groups[0].rpartition("/")
+        if unmarked(driver) not in chosen:
+            continue
+        _, *limits = _values(row)
+        at, *places = (round(50 + 48 * v / (ends[name] or 1.0), 2) for v in _values(row))
+        apart = limits and (limits[0] > 0 or limits[1] < 0)
+        compared = f"{prompt} against {row.values['reference']}"
+        of_driver = drivers.setdefault(str(row.values["driver"]), {})
+        of_driver.setdefault(compared, {})[name] = {
+            **printed(table, row),
+            "row": row.id,
+            "driver": driver,
+            "prompt": prompt,
+            "mark": Mark(
+                "like" if apart else "open", at, (places[0], places[1]) if places else None
+            ),
+        }
+    return drivers, ends
+
+
+def _values(row: Row) -> list[float]:
+    """A difference, with the ends of its interval if it has one."""
+    values: Mapping[str, Any] = row.values
+    return [values["difference"], *(values.get("ci") or ())]
+
+
+def left_out(site: Site, variant: str) -> str:
+    """What a variant's prompt leaves out and adds, by name and meaning."""
+    ((names,),) = map(dict.values, site.catalogue.ask(STORED, variant))
+    if names is None:
+        return f"of which {views.UNKNOWN}"
+    own, baseline = frozenset(names), frozenset(blocks_of(BASELINE))
+    changes = Variant(removes=baseline - own, adds=own - baseline)
+    return views.changes_text(changes, _named) or "the whole prompt"
+
+
+def _named(block: str) -> str:
+    """A block with what it means, if that is known here."""
+    meaning = views.block_meaning(block)
+    return block if meaning == views.UNKNOWN else f"{block}: {meaning}"
+
+
+def discordant_page(site: Site, asked: Mapping[str, str]) -> str:
+    """The pairs of trials that ended otherwise with a variant than with the baseline."""
+    driver, variant = asked.get("model", ""), asked.get("variant", "")
+    if not driver or not variant:
+        raise NotThere("/discordant needs model=MODEL and variant=VARIANT")
+    pairs = site.catalogue.ask(PAIRS, unmarked(driver), variant, BASELINE)
+    differing = [pair for pair in pairs if pair["outcome"] != pair["base_outcome"]]
+    kinds = Counter((pair["base_outcome"], pair["outcome"]) for pair in differing)
+    return site.render(
+        "discordant.html",
+        here="prompts",
+        model=driver,
+        variant=variant,
+        left_out=left_out(site, variant),
+        pairs=pairs,
+        differing=differing,
+        kinds=kinds.most_common(),
+    )

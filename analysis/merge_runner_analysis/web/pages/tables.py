@@ -1,0 +1,84 @@
+"""The tables of the analysis, as in the report; every number leads to the trials behind it."""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from collections.abc import Collection, Mapping
+from importlib import metadata
+
+from starlette.responses import Response
+
+from merge_runner_analysis.figures import FIGURES
+from merge_runner_analysis.names import TableFormat
+from merge_runner_analysis.tables import TABLES
+from merge_runner_analysis.tables.formats import render, shown_columns, table_view
+from merge_runner_analysis.tables.model import from_text
+from merge_runner_analysis.web.pages.computed import awaited, computed, computed_table
+from merge_runner_analysis.web.scope import every
+from merge_runner_analysis.web.site import NotThere, Site, download
+
+TABLE_FILES = {"csv": TableFormat.CSV, "tex": TableFormat.LATEX}
+FIGURE_FILES = {"svg": "image/svg+xml", "png": "image/png"}
+# Matplotlib writes styles into its SVG, and traces as pictures.
+DRAWN = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox"
+
+
+def tables_page(site: Site, _: Mapping[str, str]) -> str:
+    """The list of all tables and figures."""
+    return site.render("tables.html", here="tables", tables=TABLES, figures=FIGURES)
+
+
+def table_file(site: Site, name: str, suffix: str, _: Mapping[str, str]) -> Response:
+    """A table as a file; raises NotThere and StoreError."""
+    form = TABLE_FILES[_known(suffix, TABLE_FILES, "file")]
+    content = awaited(site, ("table", _known(name, TABLES, "table"), "", ""))
+    return download(render([from_text(content["table"])], form) + "\n", f"{name}.{suffix}")
+
+
+def figure_file(site: Site, name: str, suffix: str, _: Mapping[str, str]) -> Response:
+    """A figure as a file; raises NotThere and StoreError."""
+    kind = FIGURE_FILES[_known(suffix, FIGURE_FILES, "file")]
+    content = awaited(site, ("figure", _known(name, FIGURES, "figure"), suffix))
+    return Response(content["file"], headers={"content-security-policy": DRAWN}, media_type=kind)
+
+
+def figure_page(site: Site, name: str, _: Mapping[str, str]) -> str:
+    """A figure with its caption, its files, and how it is cited; raises NotThere."""
+    about = FIGURES[_known(name, FIGURES, "figure")]
+    found = computed(site, ("figure", name, "svg"))
+    return site.render(
+        "figure.html",
+        here="tables",
+        name=name,
+        about=about,
+        computed=found,
+        image=b64encode(found.content["file"]).decode() if found.content else "",
+        version=metadata.version("merge-runner"),
+    )
+
+
+def table_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
+    """One table; raises NotThere."""
+    found, table = computed_table(site, _known(name, TABLES, "table"))
+    without = every(asked, "without")
+    columns = shown_columns(table) if table else []
+    return site.render(
+        "table.html",
+        here="tables",
+        name=name,
+        about=TABLES[name].about,
+        computed=found,
+        table=table
+        and table_view(
+            table, lambda table, row, column: site.at.cell(table.name, row.id, column.name)
+        ),
+        columns=columns,
+        places=[place for place, column in enumerate(columns) if column.name not in without],
+        without=without,
+    )
+
+
+def _known(name: str, known: Collection[str], what: str) -> str:
+    if name not in known:
+        raise NotThere(f"there is no {what} {name}; there are {', '.join(known)}")
+    return name

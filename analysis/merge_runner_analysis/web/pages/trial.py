@@ -1,0 +1,196 @@
+"""One trial, one decision of it, and the trials to lay beside it: found by words, or offered."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext, suppress
+from operator import itemgetter
+from typing import Any
+
+from markupsafe import Markup
+
+from merge_runner.llm.formats import reasoning_of
+from merge_runner.records import DAMAGED, reply_object
+from merge_runner.text_safety import quoted
+from merge_runner_analysis.web import views
+from merge_runner_analysis.web.display_text import clamped, shortened, visible
+from merge_runner_analysis.web.pictures import step_points
+from merge_runner_analysis.web.prompts import parts_of
+from merge_runner_analysis.web.reading import Row, reading
+from merge_runner_analysis.web.site import REPLAY, NotThere, Site
+
+# What is offered to lay beside a trial, and by what rule.
+HUMAN, REPETITION = "nearest human", "next repetition"
+OFFERS = {
+    HUMAN: "the human trial of this condition, at such speeds, whose headway "
+    "stays closest to this one's until its first vehicle has merged (root mean square)",
+    REPETITION: "the next repetition with the same driver, prompt and condition",
+}
+REPLY = "select max_by(reply, attempt) as reply from calls where call_key = '{}'"
+SAMPLES = "from states where trial_id = {} and spec_hash = {} order by step, side"
+FOUND = 12
+# An address calls a trial by its name, and by its spec where that name has several.
+NAMED = """
+SELECT trial_id || if(count(*) OVER (PARTITION BY trial_id) = 1, '', '@' || spec_hash) AS key,
+    outcome, coalesce(stand_in, '') AS note, condition, trial_id, spec_hash,
+    lower(concat_ws(' ', trial_id, model, variant, outcome)) AS words
+FROM listed
+"""
+# Times are compared in ms: drivers and recordings have steps of their own. A human trial counts
+# that is as fast on average, and lasts as long as what it is compared with.
+NEAREST = """
+WITH near AS (
+    SELECT trial_id, spec_hash, (trial_id, spec_hash) = ($trial, $spec) AS own,
+        coalesce((spec->>'$.mean_speed_mps')::DOUBLE, mean_speed_mps()) AS mean_mps
+    FROM trials LEFT JOIN specs USING (spec_hash)
+    WHERE condition = $condition AND (source = 'human' OR own)
+), told AS (
+    SELECT trial_id, spec_hash, own, mean_mps, round(1000 * time_s)::INTEGER AS ms,
+        sum(if(side = 'left', position_m, -position_m)) AS headway_m, max(position_m) AS first_m
+    FROM states JOIN near USING (trial_id, spec_hash)
+    WHERE time_s >= 0 GROUP BY ALL HAVING count(*) = 2
+), mine AS (FROM told WHERE own AND first_m < merge_point_m())
+SELECT told.trial_id, told.spec_hash FROM told JOIN mine USING (mean_mps, ms) WHERE NOT told.own
+GROUP BY ALL HAVING max(ms) = (SELECT max(ms) FROM mine)
+ORDER BY avg((told.headway_m - mine.headway_m) ** 2), told.trial_id, told.spec_hash LIMIT 1
+"""
+
+
+def trial_page(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
+    """Return a trial with all of its decisions."""
+    row, trial = found(site, trial_id, asked)
+    account = views.account_of(row, trial)
+    return site.render(
+        "trial.html",
+        here="trials",
+        scripts=REPLAY,
+        panels=panels(site, row, trial),
+        row=row,
+        outcome=views.outcome_text(row),
+        facts=views.facts(row),
+        judged=views.judged_text(trial.scenario),
+        view_box=views.VIEW_BOX,
+        data=views.replay_data(row, trial, account, site.at.trial(row)) if trial.states else None,
+        account=account,
+        reply_of=REPLY,
+        samples=SAMPLES.format(quoted(row["trial_id"]), quoted(row["spec_hash"])),
+        lines=views.summary(trial),
+        trial_decisions=trial.by_side,
+        offers=OFFERS,
+        clamped=clamped,
+        last_words=[
+            said[-1]
+            for mine in trial.by_side.values()
+            if (said := [d for d in mine if d["tactical"]])
+        ],
+    )
+
+
+def find(site: Site, trial_id: str, asked: Mapping[str, str]) -> Row:
+    """The trial that an address names; raises NotThere."""
+    row = site.catalogue.find(trial_id, asked.get("spec", ""))
+    if row is None:
+        raise NotThere(f"the database holds no trial {trial_id}")
+    return row
+
+
+def found(site: Site, trial_id: str, asked: Mapping[str, str]) -> tuple[Row, views.Trial]:
+    """The trial that an address names, with what was stored of it; raises NotThere."""
+    row = find(site, trial_id, asked)
+    with nullcontext(site.open) if site.open else reading(site.db) as connection:
+        return row, views.read_trial(connection, row["trial_id"], row["spec_hash"])
+
+
+def panels(site: Site, row: Row, trial: views.Trial) -> list[Markup]:
+    """Return the panels of all decisions of a trial, in the order of its ribbons."""
+    others = site.catalogue.ask("FROM others")
+    decisions = (d for mine in trial.by_side.values() for d in mine)
+    return [decision_panel(site, row, trial, d, others) for d in decisions]
+
+
+def decision_panel(
+    site: Site, row: Row, trial: views.Trial, decision: Row, others: Sequence[Row]
+) -> Markup:
+    """What a driver was told, said, planned and did; ``others`` are answers of another model."""
+    named = {"side": decision["side"], "decision": decision["decision"]}
+    before = decision["before"]
+    thoughts = ""
+    with suppress(*DAMAGED):  # a reply of a server that failed is any text
+        thoughts = reasoning_of(reply_object(decision["reply"]))
+    panel = site.render(
+        "_decision.html",
+        d=decision,
+        driver=row[f"model_{decision['side']}"],
+        page=site.at.trial(row, **named),
+        clamped=clamped,
+        before=before,
+        parts=parts_of(decision["prompt"] or "", before["prompt"] if before else None),
+        meaning=views.block_meaning,
+        others=others,
+        reply=shortened(decision["reply"]) if decision["reply"] else None,
+        reasoning=shortened(thoughts) if thoughts else None,
+        raw=site.at.to("sql.csv", q=REPLY.format(decision["call_key"])),
+        chart=views.plan_chart(decision, trial),
+        points=step_points,
+    )
+    return Markup(panel)  # noqa: S704 # rendered by a template of ours, which escapes
+
+
+def others(site: Site, trial_id: str, asked: Mapping[str, str]) -> dict[str, Any] | str | None:
+    """What a trial's page asks about others: one to lay beside it, one that is offered, or several.
+
+    ``compare=KEY`` gives what a replay draws of it, ``offer=KIND`` a key; None where there is none.
+    ``q=WORDS`` gives the first trials that have the words, those of the same condition before
+    others. Raises NotThere.
+    """
+    row = find(site, trial_id, asked)
+    if "compare" in asked:
+        other = named(site, asked["compare"])
+        return None if other is None else _laid(site, other)
+    if "offer" in asked:
+        offers = {HUMAN: _nearest_human, REPETITION: _next_repetition}
+        if asked["offer"] not in offers:
+            raise NotThere(f"there are no other offers than {', '.join(OFFERS)}")
+        offered = offers[asked["offer"]](site, row)
+        sql = f"SELECT key FROM ({NAMED}) WHERE trial_id = ? AND spec_hash = ?"  # noqa: S608 # constants
+        return site.catalogue.ask(sql, *offered)[0]["key"] if offered else None
+    words = asked.get("q", "").lower().split()
+    fits = " AND contains(words, ?)" * len(words)
+    rows = site.catalogue.ask(
+        f"SELECT key, outcome, note FROM ({NAMED}) WHERE (trial_id, spec_hash) <> (?, ?){fits} "  # noqa: S608 # constants
+        f"ORDER BY condition <> ?, trial_id, spec_hash LIMIT {FOUND}",
+        *(row["trial_id"], row["spec_hash"], *words, row["condition"]),
+    )
+    return {"found": [other | {"note": visible(other["note"])} for other in rows]}
+
+
+def named(site: Site, key: str) -> Row | None:
+    """The trial that a key stands for; a name with several specs stands for the first of them."""
+    name, _, spec = key.rpartition("@")
+    return site.catalogue.find(key) or (site.catalogue.find(name, spec) if name else None)
+
+
+def _laid(site: Site, row: Row) -> dict[str, Any] | None:
+    with reading(site.db) as connection:
+        trial = views.read_trial(connection, row["trial_id"], row["spec_hash"])
+    if not trial.states:
+        return None
+    return {
+        **views.replay_data(row, trial, views.account_of(row, trial), site.at.trial(row)),
+        "ribbons": site.render("_ribbons.html", row=row, trial_decisions=trial.by_side),
+        "panels": "".join(panels(site, row, trial)),
+    }
+
+
+def _nearest_human(site: Site, row: Row) -> tuple[str, str] | None:
+    given = {"trial": row["trial_id"], "spec": row["spec_hash"], "condition": row["condition"]}
+    with reading(site.db) as connection:
+        return connection.execute(NEAREST, given).fetchone()
+
+
+def _next_repetition(site: Site, row: Row) -> tuple[str, str] | None:
+    same = {name: row[name] for name in ("condition", "model", "variant", "pair", "spec_hash")}
+    rows = sorted(site.catalogue.every(same), key=itemgetter("rep", "trial_id"))
+    alike = [(other["trial_id"], other["spec_hash"]) for other in rows]
+    place = alike.index((row["trial_id"], row["spec_hash"]))
+    return (alike * 2)[place + 1] if len(alike) > 1 else None

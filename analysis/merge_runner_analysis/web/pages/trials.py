@@ -1,0 +1,121 @@
+"""The list of trials."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from merge_runner_analysis.tables import TABLES
+from merge_runner_analysis.web.catalogue import FACETS, FACTOR, PAGE, SORTS, Wanted
+from merge_runner_analysis.web.pages.computed import awaited, computed
+from merge_runner_analysis.web.pictures import sparkline, speed_range
+from merge_runner_analysis.web.scope import carried
+from merge_runner_analysis.web.search import LONGEST_QUERY, MOST_TERMS
+from merge_runner_analysis.web.site import NotThere, Site, TooMuch, news_of
+from merge_runner_analysis.web.urls import whole
+
+# So many facets may be chosen at once, each by a value of up to so many characters. What is longer
+# is a fault within DuckDB, or the end of the process.
+MOST_CHOSEN, LONGEST_VALUE = 30, 1_000
+# What facets are called that have another name in an address.
+HEADINGS = {"sweep": "run", "model": "driver", "variant": "prompt"}
+
+
+def trials_page(site: Site, asked: Mapping[str, str]) -> str:
+    """One page of the trials that an address asks for; raises NothingNew as it was ``seen``."""
+    state = site.catalogue.state()
+    seen = news_of(state, asked.get("seen", ""))
+    news = site.at.to("trials", **{**asked, "seen": seen})
+    if "seen" in asked:  # that the trials are no longer those that were seen
+        here = site.at.to("trials", **{**asked, "seen": ""})
+        return site.render("_news.html", trials=state["trials"], here=here, news=news)
+    chosen, sort, cell = filter_of(asked), sort_of(asked), asked.get("cell", "")
+    wanted, named = chosen, None
+    if cell:
+        named = computed(site, cell_request(cell))
+        if named.content is None:
+            return site.render("behind.html", here="trials", cell=cell, computed=named)
+        wanted = {**chosen, "trials": named.content["trials"]}
+    totals = {row["who"]: row for row in site.catalogue.counts(wanted, "who")}
+    trials = sum(part["trials"] for part in totals.values())
+    last = max(1, -(-trials // PAGE))
+    page = min(whole(asked.get("page", "")) or 1, last)
+    rows = site.catalogue.every(wanted, sort, page)
+    return site.render(
+        "trials.html",
+        here="trials",
+        facets={} if site.is_still else site.catalogue.facets(wanted),  # an export has no filters
+        chosen=chosen,
+        headings=HEADINGS,
+        carried=carried(asked),
+        kept={**chosen, "cell": cell},
+        cell=cell,
+        computed=named,
+        sort=sort,
+        sorts=SORTS,
+        totals=totals,
+        trials=trials,
+        rows=rows,
+        leveled=any(row["levels"] for row in rows),
+        scale=speed_range(rows),
+        news=news,
+        page=page,
+        last_page=last,
+        sparkline=sparkline,
+        unknown=[] if rows else _unknown(site, chosen),
+    )
+
+
+def _unknown(site: Site, chosen: Wanted) -> list[tuple[str, str, list[str]]]:
+    """Facets, as they are called, with a chosen value that no trial has, and the values there."""
+    known = site.catalogue.facets({})
+    return [
+        (HEADINGS.get(name, name.removeprefix(FACTOR)), value, [there for there, _ in values])
+        for name, value in chosen.items()
+        if name != "q" and value not in dict(values := known.get(name, []))
+    ]
+
+
+def export_filter(site: Site, asked: Mapping[str, str]) -> Wanted:
+    """The filter in an address, whose cell may have to be computed.
+
+    Raises NotThere, StoreError and TooMuch.
+    """
+    wanted, cell = filter_of(asked), asked.get("cell", "")
+    return {**wanted, "trials": awaited(site, cell_request(cell))["trials"]} if cell else wanted
+
+
+def cell_request(cell: str) -> tuple[str, str, str, str]:
+    """What is asked for a cell, ``TABLE/ROW:COLUMN``; raises NotThere."""
+    table, _, rest = cell.partition("/")
+    row, _, column = rest.rpartition(":")
+    if table not in TABLES or not row:
+        raise NotThere(f"a cell is named TABLE/ROW:COLUMN; the tables are {', '.join(TABLES)}")
+    return "cell", table, row, column
+
+
+def filter_of(asked: Mapping[str, str]) -> dict[str, str]:
+    """The filter in an address; raises TooMuch."""
+    wanted = {
+        name: value
+        for name, value in asked.items()
+        if value and (name in {*FACETS, "q"} or name.startswith(FACTOR))
+    }
+    words = wanted.get("q", "")
+    if len(words) > LONGEST_QUERY or len(words.split()) > MOST_TERMS:
+        raise TooMuch(
+            f"a search has up to {MOST_TERMS} words and {LONGEST_QUERY} characters, this one "
+            f"{len(words.split()):,} and {len(words):,}"
+        )
+    longest = max(map(len, asked.values()), default=0)
+    if len(wanted) > MOST_CHOSEN or longest > LONGEST_VALUE:
+        raise TooMuch(
+            f"a filter has up to {MOST_CHOSEN} parts of up to {LONGEST_VALUE:,} characters, this "
+            f"one {len(wanted):,} of up to {longest:,}"
+        )
+    return wanted
+
+
+def sort_of(asked: Mapping[str, str]) -> str:
+    """The order in an address; one that is unknown is that of the names."""
+    sort = asked.get("sort", "trial")
+    return sort if sort.removeprefix("-") in SORTS else "trial"

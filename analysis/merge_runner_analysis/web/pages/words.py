@@ -1,0 +1,46 @@
+"""What drivers said, searched: decisions whose words hold those of a query."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+from merge_runner_analysis.web.pages import trials
+from merge_runner_analysis.web.scope import carried
+from merge_runner_analysis.web.search import (
+    FACETS,
+    LIMITS,
+    terms_of,
+)
+from merge_runner_analysis.web.site import Site
+from merge_runner_analysis.web.urls import whole
+
+HEADINGS = trials.HEADINGS | {
+    "tactical": "said",
+    "switch": "change of mind",
+    "failure": "invalid",
+}
+# A number from -1 to 1.
+LIMIT = re.compile(r"-?(0?\.\d{1,6}|[01](\.0{1,6})?)")
+
+
+def words_page(site: Site, asked: Mapping[str, str]) -> str:
+    """A page of the decisions that an address asks for."""
+    query = asked.get("q", "")
+    wanted = trials.filter_of(asked) | {name: asked.get(name, "") for name in FACETS}
+    wanted = {name: value for name, value in wanted.items() if value and name != "q"}
+    limits = {name: text for name in LIMITS if LIMIT.fullmatch(text := asked.get(name, ""))}
+    chosen = {**wanted, **limits, "q": query}
+    page = whole(asked.get("page", "")) or 1
+    found = site.words.search(wanted, terms_of(query), limits, page)
+    return site.render(
+        "words.html",
+        here="words",
+        headings=HEADINGS,
+        carried=carried(asked),
+        limits=LIMITS,
+        found=found,
+        facets=found["facets"],
+        chosen=chosen,
+        kept=chosen,
+    )

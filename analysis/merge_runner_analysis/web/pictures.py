@@ -1,0 +1,70 @@
+"""Still pictures: where their lines and marks lie, in the units of the SVG that a template writes.
+
+Only the replay draws in the browser, since it moves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import ceil, floor
+
+from merge_runner.records import SIDES
+from merge_runner_analysis.web.reading import Row
+
+SPARK_WIDTH, SPARK_HEIGHT = 96.0, 22.0
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """Where values lie in a picture: ``low`` at ``from_``, ``high`` at ``to``, others between.
+
+    What lies beyond is drawn at the edge.
+    """
+
+    low: float
+    high: float
+    from_: float
+    to: float
+
+    def __call__(self, value: float) -> float:
+        """The place of a value."""
+        inside = min(max(value, self.low), self.high)
+        return self.from_ + (self.to - self.from_) * (inside - self.low) / (self.high - self.low)
+
+
+def speed_range(rows: Sequence[Row]) -> tuple[int, int]:
+    """The whole m/s at the bottom and the top of all sparklines of these trials."""
+    every = [end for row in rows for side in SIDES for end in row[f"{side}_range_mps"] or ()]
+    ends = [end for end in every if end is not None]  # a vehicle may have no samples
+    low = floor(min(ends, default=0.0))
+    return low, max(ceil(max(ends, default=0.0)), low + 1)
+
+
+def sparkline(row: Row, speeds: tuple[int, int]) -> dict[str, str] | None:
+    """The speeds of both vehicles: points of two lines, and in words.
+
+    None where a vehicle has none.
+    """
+    if not (row["left_mps"] and row["right_mps"]):
+        return None
+    (left_low, left_high), (right_low, right_high) = row["left_range_mps"], row["right_range_mps"]
+    return {
+        "left": _spark_points(row["left_mps"], speeds),
+        "right": _spark_points(row["right_mps"], speeds),
+        "words": f"speed of the left vehicle {left_low:.1f} to {left_high:.1f} m/s, "
+        f"of the right one {right_low:.1f} to {right_high:.1f} m/s",
+    }
+
+
+def _spark_points(values: Sequence[float], speeds: tuple[int, int]) -> str:
+    x, y = Scale(0, max(len(values) - 1, 1), 0, SPARK_WIDTH), Scale(*speeds, SPARK_HEIGHT, 0)
+    return " ".join([f"{x(i):.0f},{y(speed):.1f}" for i, speed in enumerate(values)])
+
+
+def step_points(values: Sequence[float], width: float, height: float, steps: int) -> str:
+    """Points of a step line from -1 to 1, ``steps`` across the width."""
+    x, y = Scale(0, max(steps, 1), 0, width), Scale(-1, 1, height, 0)
+    return " ".join(
+        [f"{x(i):.1f},{y(v):.1f} {x(i + 1):.1f},{y(v):.1f}" for i, v in enumerate(values)]
+    )

@@ -1,0 +1,288 @@
+"""The report: one HTML file with everything in it, which needs no network."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterator
+from datetime import datetime
+from difflib import unified_diff
+from importlib.metadata import version
+from pathlib import Path
+from typing import NamedTuple
+
+import jinja2
+import pandas as pd
+from pandas.api.types import is_string_dtype
+
+from merge_runner.drivers.registry import MOCKS
+from merge_runner.errors import UsageError
+from merge_runner.prompts.blocks import title_of
+from merge_runner.records import NO_DECISION
+from merge_runner.results.provenance import program
+from merge_runner_analysis.cache import finished, keep_finished
+from merge_runner_analysis.explain import Source, sources_of, sql_command
+from merge_runner_analysis.figures import FIGURES
+from merge_runner_analysis.figures.gallery import rendered, write_figures
+from merge_runner_analysis.frames import load_each
+from merge_runner_analysis.grouping import levels_of
+from merge_runner_analysis.names import BASELINE, DESCRIPTIONS, TableFormat
+from merge_runner_analysis.provenance import Provenance, provenance, tally
+from merge_runner_analysis.published import published
+from merge_runner_analysis.study import Study
+from merge_runner_analysis.tables import finished_tables
+from merge_runner_analysis.tables.against import FILES, against
+from merge_runner_analysis.tables.formats import render, table_view
+from merge_runner_analysis.tables.model import Column, Row, Table
+from merge_runner_analysis.tables.verdicts import verdicts
+from merge_runner_analysis.wording import TABLE, sentences
+
+# What each variant asks first: of all of them in the same condition, as far as that was played.
+PROMPTS = """
+SELECT variant, spec_hash, arg_min(prompt, (condition, decisions.side, trial_id)) AS prompt
+FROM decisions JOIN trials USING (trial_id, spec_hash)
+WHERE decision = 0 AND prompt IS NOT NULL GROUP BY variant, spec_hash
+ORDER BY min((condition, decisions.side, trial_id)) DESC
+"""
+# At most so many trials are listed for a row: a page with all of them would be unwieldy.
+LISTED = 300
+# The share of a group's decisions above which an alarm is raised: a convention.
+MANY_FALLBACKS = 0.05
+# The worst first: what each alarm says of the groups that it names.
+MEANINGS = {
+    "Another model answered": "These trials are not what they claim to be.",
+    "A scripted stand-in answered": "These rows stand last, are in no conclusion, and never beside "
+    "the paper's row of that model.",
+    "Too few valid decisions": "What was driven is mostly not what the model decided: no value, "
+    "test or conclusion rests on these trials.",
+    "Trials repeat earlier ones": "Copies of programs add nothing to any n, interval or test. "
+    "Where a cache answered a language model on the way, or its temperature is 0, equal trials are "
+    "no samples, and intervals and tests claim too much.",
+    "Trials failed": "They are in no measure; the same sweep again plays them anew.",
+    "Many fallbacks": "There the older plan was driven, or none: tables --without-fallbacks shows "
+    "whether that changes the results.",
+    "Decisions are missing": "The plans of these replies were driven, but the tactical decision "
+    "that was asked for is not in them: they are in no table of what drivers say.",
+    "Attempts of unknown fate": "A run was killed before their reply was seen: they may have been "
+    "paid for.",
+    "Several settings under one name": "They are never pooled: all but the most frequent carry a "
+    "mark.",
+}
+LIBRARIES = ("statsmodels", "scipy", "numpy", "pandas", "matplotlib")
+
+
+def write_report(study: Study, out: Path, files: Path | None) -> Iterator[Path]:
+    """Write the report, and every table and figure into the folder ``files``; yields the paths.
+
+    Raises UsageError.
+    """
+    tables = finished_tables(study.db, study=study)
+    if files is not None:
+        yield from write_figures(study, files)
+        for table in tables:
+            for form in TableFormat:
+                path = files / f"{table.name}.{form.suffix}"
+                path.write_text(render([table], form) + "\n", encoding="utf-8")
+                yield path
+    text = report_html(study, tables, finished_figures(study))
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(text, encoding="utf-8")
+    except OSError as exc:
+        raise UsageError(f"{out} cannot be written: {exc}") from exc
+    yield out
+
+
+def finished_figures(study: Study) -> dict[str, str]:
+    """Every figure by name as SVG in Base64: read from the database where stored, else drawn."""
+    files = {f"{name}.svg": name for name in FIGURES}  # a table may have the name alone
+    found = finished(study.db, study.state, study.options, list(files))
+    drawn = {
+        file: base64.b64encode(rendered(study, name, "svg")).decode()
+        for file, name in files.items()
+        if file not in found
+    }
+    if drawn:
+        keep_finished(study.db, study.state, study.options, drawn)
+    return {name: (found | drawn)[file] for file, name in files.items()}
+
+
+def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> str:
+    """The report as one HTML document; ``figures`` maps names to SVG in Base64."""
+    # Rows with equal sources share a number.
+    numbers: dict[tuple[Source, ...], int] = {}
+
+    def number(table: Table, row: Row, _column: Column) -> int:
+        return numbers.setdefault(sources_of(study, table, row), len(numbers) + 1)
+
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).with_name("templates")),
+        autoescape=True,
+        # A misspelt name fails the report rather than leaving a blank in it.
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    origin = provenance(study.db)
+    finished = next((table for table in tables if table.name == TABLE), None)
+    descriptions, levels, prompts = design(study)
+    headline, *others = sentences((finished or verdicts(study)).rows)
+    beside = (against(table, study) if table.name in FILES else table for table in tables)
+    return environment.get_template("report.html").render(
+        study=study,
+        descriptions=descriptions,
+        levels=levels,
+        prompts=prompts,
+        alarms=alarms(study, origin),
+        headline=headline,
+        sentences=others,
+        figures=[(name, FIGURES[name].caption, data) for name, data in figures.items()],
+        tables=[table_view(table, number) for table in beside],
+        numbers=numbers,
+        listed=LISTED,
+        command=sql_command(study),
+        libraries=", ".join(f"{name} {version(name)}" for name in LIBRARIES),
+        origin=origin,
+        shown_plainly=_plain,
+        readings=published("readings"),
+        cited=published("sources"),
+        program=program(),
+    )
+
+
+def design(study: Study) -> tuple[list[str], dict[str, list[str]], dict[str, str]]:
+    """Read the design of a study from what was played: descriptions, levels, prompts.
+
+    The levels are those of each factor, the conditions and the trials; prompts have by title the
+    text of the first one, of variants the lines that differ from the baseline's.
+    """
+    found = load_each({"descriptions": DESCRIPTIONS, "prompts": PROMPTS}, study.db)
+    played, levels = study.played, levels_of(study.played, study.order)
+    levels.pop("model", None)  # the drivers say it
+    specs = {name for group in played for name in group.trials["spec_hash"]}
+    prompts = found["prompts"][found["prompts"]["spec_hash"].isin(specs)]
+    texts = dict(zip(prompts["variant"], prompts["prompt"], strict=True))
+    baseline = texts.get(BASELINE)
+    shown = {}
+    for name in dict.fromkeys(group.setting for group in played if group.setting in texts):
+        title, text = title_of(name), texts[name]
+        if baseline and name != BASELINE:
+            title, text = f"{title}: against the baseline", _changes(baseline, text)
+        shown[title] = text
+    return (
+        list(found["descriptions"]["description"])
+        if study.source is None
+        else [study.source.file.description] * bool(study.source.file.description),
+        {
+            "drivers": [group.label for group in played],
+            **{name: [*known] for name, known in levels.items()},
+            "conditions": sorted({name for group in played for name in group.trials["condition"]}),
+            "trials": [str(sum(len(group.trials) for group in played))],
+        },
+        shown,
+    )
+
+
+def _changes(baseline: str, prompt: str) -> str:
+    """The lines that were taken out (-) and put in (+)."""
+    lines = unified_diff(baseline.splitlines(), prompt.splitlines(), lineterm="", n=0)
+    return "\n".join(line for line in lines if not line.startswith(("---", "+++", "@@")))
+
+
+class PlainColumn(NamedTuple):
+    """A column of rows of the database as a reader sees it; only ``text`` may be wrapped."""
+
+    name: str
+    text: bool
+    cells: list[str]
+
+
+def _plain(rows: pd.DataFrame) -> list[PlainColumn]:
+    found = rows.convert_dtypes()
+    return [
+        PlainColumn(
+            str(name).replace("_usd", " (USD)").replace("_", " "),
+            is_string_dtype(found[name]),
+            ["" if pd.isna(value) else _shown(value) for value in found[name]],
+        )
+        for name in found
+    ]
+
+
+def _shown(value: object) -> str:
+    match value:
+        case float():
+            return f"{value:.6g}"
+        case datetime():
+            return f"{value:%Y-%m-%d %H:%M:%S}"
+    return str(value)
+
+
+def alarms(study: Study, origin: Provenance) -> dict[str, str]:
+    """What casts doubt on the results of a study by title, the worst first."""
+    found: dict[str, list[str]] = {title: [] for title in MEANINGS}
+    for title, text in _found(study, origin):
+        found[title].append(text)
+    return {
+        title: f"{'; '.join(texts)}. {MEANINGS[title]}" for title, texts in found.items() if texts
+    }
+
+
+def _repeats(study: Study) -> Iterator[str]:
+    """Which drivers have equal trials, at one level of their factors or at several."""
+    by_name: dict[str, list[pd.DataFrame]] = {}
+    for group in study.played:
+        by_name.setdefault(group.name, []).append(group.trials)
+        if group.repeated:
+            yield (
+                f"{group.id}: {group.repeated} of {len(group.stored.trials)} trials of programs "
+                "are as an earlier one to the last state; they are left out"
+            )
+        if group.equal:
+            yield (
+                f"{group.id}: {group.equal} of {len(group.trials)} trials are as an earlier one to "
+                "the last state; each counts"
+            )
+    for name, parts in by_name.items():
+        every = pd.concat(parts)
+        distinct = len(every.drop_duplicates(["condition", "way"]))
+        if distinct < len(every):
+            yield (
+                f"{name}: {distinct} of {len(every)} trials of programs at different levels of "
+                "factors are distinct; each counts once where levels are pooled, and copies are "
+                "not compared"
+            )
+
+
+def _found(study: Study, origin: Provenance) -> Iterator[tuple[str, str]]:
+    for one in origin.mismatches.itertuples():
+        answers = f"{one.answers} answer{'s' * (one.answers != 1)}"
+        said = f"{one.requested} was asked for, {one.served} answered: {answers}, in {one.sweeps}"
+        yield "Another model answered", said
+    for group in (*study.unjudged, *study.unjudged_asked):
+        yield "Too few valid decisions", f"{group.id}: {group.unjudged}"
+    names: dict[str, dict[str, None]] = {}
+    for group in study.played:
+        names.setdefault(group.name, {})[group.name + group.mark] = None
+        trials, counts = len(group.trials), tally(study, group)
+        # A mock model's own name is honest.
+        if group.scripted and MOCKS.isdisjoint(group.models):
+            yield "A scripted stand-in answered", f"{group.id}: {group.posing}"
+        if failed := counts["failed"]:
+            reasons = group.trials["error"].dropna()
+            why = reasons.mode().get(0, "no reason is stored")
+            more = ", among other reasons" if reasons.nunique() > 1 else ""
+            yield "Trials failed", f"{failed} of {trials} of {group.id} ({why}{more})"
+        fallbacks, decisions = counts["fallback"], counts["decisions"]
+        if not group.unjudged and fallbacks > MANY_FALLBACKS * decisions:
+            share = f"{100 * fallbacks / decisions:.1f} %"
+            said = f"{fallbacks} of {decisions} decisions of {group.id} ({share})"
+            yield "Many fallbacks", said
+        if missing := counts[NO_DECISION]:
+            yield "Decisions are missing", f"{missing} of {decisions} decisions of {group.id}"
+        if counts["unknown"]:
+            said = f"{counts['unknown']} of {counts['attempts']} of {group.id}"
+            yield "Attempts of unknown fate", said
+    yield from (("Trials repeat earlier ones", text) for text in _repeats(study))
+    for marked in names.values():
+        if len(marked) > 1:
+            yield "Several settings under one name", ", ".join(marked)

@@ -1,0 +1,141 @@
+"""Search in what drivers said, planned and drove, beside the list of trials."""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from merge_runner_analysis.web.catalogue import Catalogue, facets_of, where_of
+from merge_runner_analysis.web.database_copy import Copies
+from merge_runner_analysis.web.reading import records
+
+PAGE = 50
+LONGEST = 65_536  # characters of a text that are searched
+MOST_TERMS, LONGEST_QUERY = 12, 300
+TERM = re.compile(r'"([^"]*)"?|([^\s"]+)')
+SHOWN, BEFORE = 600, 200  # characters that are shown of a text, and of these before a match
+# Within this part of the greatest acceleration a driver holds its speed, beyond it goes or brakes.
+HOLDS = 0.08
+FACETS = ("tactical", "planned", "driven", "switch", "failure", "sweep", "model", "variant",
+          "condition", "outcome", "account", "tag")  # fmt: skip
+# In figures: the least or the most of a mean, as a part of the greatest acceleration.
+LIMITS = {
+    f"{name}_{end}": f"{column} {'>=' if end == 'from' else '<='} ?::DOUBLE"
+    for name, column in (("planned", "plan_mean"), ("driven", "drive_mean"))
+    for end in ("from", "to")
+}
+ACTION = (
+    f"CASE WHEN list_avg({{0}}) < -{HOLDS} THEN 'brake' WHEN list_avg({{0}}) > {HOLDS} THEN 'go' "
+    "WHEN list_avg({0}) IS NOT NULL THEN 'hold' END"
+)
+# A line break is a space to whoever looks for a phrase.
+FOLDED = f"lower(translate(left(rationale, {LONGEST}), chr(10) || chr(13) || chr(9), '   '))"
+# A change of mind is between what a driver said and what it had said before. ``place`` is the row
+# of the text: all texts are read to find some of them, and those of a page to show them.
+HITS = f"""
+CREATE TEMP TABLE hits AS
+WITH decided AS (
+    SELECT trial_id, spec_hash, side, decision, time_s, coalesce(tactical, 'none') AS tactical,
+        CASE WHEN tactical <> lag(tactical IGNORE NULLS) OVER said
+            THEN lag(tactical IGNORE NULLS) OVER said || ' to ' || tactical END AS switch,
+        failure, {ACTION.format("plan")} AS planned, {ACTION.format("applied")} AS driven,
+        list_avg(plan) AS plan_mean, list_avg(applied) AS drive_mean, rowid AS place
+    FROM copied.decisions WHERE call_key IS NOT NULL
+    WINDOW said AS (PARTITION BY trial_id, spec_hash, side ORDER BY decision)
+)
+SELECT number, side, decision, time_s, tactical, switch, failure, planned, driven, plan_mean, place
+FROM decided JOIN listed USING (trial_id, spec_hash) WHERE {{}}
+"""  # noqa: S608 # constants
+FOUND = "hits JOIN listed USING (number)"
+
+
+@dataclass(slots=True)
+class Words:
+    """What the drivers of a database said. One search goes on at a time."""
+
+    catalogue: Catalogue
+    copies: Copies
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def search(
+        self,
+        wanted: Mapping[str, str],
+        terms: Sequence[str] = (),
+        limits: Mapping[str, str] | None = None,
+        page: int = 1,
+    ) -> dict[str, Any]:
+        """Decisions with all ``terms`` within ``limits``, of which ``hits`` are those of a page.
+
+        Each has the ``pieces`` of its words. ``crossed`` counts all of them by what was said, M or
+        Y, and by what was planned. Raises UsageError and StoreLocked.
+        """
+        copy, limits = self.copies.current(), limits or {}
+        conditions = ["true", *(LIMITS[name] for name in limits)]
+        if terms:
+            holding = " AND ".join([f"contains({FOLDED}, lower(?))"] * len(terms))
+            conditions.append(f"place IN (SELECT rowid FROM copied.decisions WHERE {holding})")  # noqa: S608 # constants
+        where, values = where_of(wanted)
+        found = f"FROM {FOUND} WHERE {where}"
+        with self._lock, self.catalogue.cursor() as connection:
+            connection.execute(f"ATTACH {copy.file} AS copied (READ_ONLY)")
+            try:
+                connection.execute(
+                    HITS.format(" AND ".join(conditions)), [*limits.values(), *terms]
+                )
+                (totals,) = records(
+                    connection,
+                    "SELECT count(*) AS decisions, count(DISTINCT number) AS trials, "
+                    "histogram(planned) FILTER (tactical = 'M') AS \"M\", "
+                    f"histogram(planned) FILTER (tactical = 'Y') AS \"Y\" {found}",
+                    values,
+                )
+                last_page = max(1, -(-totals["decisions"] // PAGE))
+                page = min(page, last_page)
+                rows = records(
+                    connection,
+                    f"SELECT trial_id, spec_hash, outcome, hits.* {found} "
+                    f"ORDER BY trial_id, spec_hash, hits.decision, hits.side LIMIT {PAGE} OFFSET ?",
+                    [*values, PAGE * (page - 1)],
+                )
+                texts = dict(
+                    connection.execute(
+                        f"SELECT rowid, left(rationale, {LONGEST}) FROM copied.decisions "  # noqa: S608 # constants
+                        "WHERE rowid IN (SELECT unnest(?::BIGINT[]))",
+                        [[row["place"] for row in rows]],
+                    ).fetchall()
+                )
+                facets = facets_of(connection, FOUND, FACETS, wanted)
+            finally:
+                connection.execute("DETACH copied")
+        crossed = {letter: counts for letter in "MY" if (counts := totals.pop(letter))}
+        for row in rows:
+            text = texts.get(row["place"])
+            row["pieces"] = None if text is None else pieces_of(text, terms)
+        return {**totals, "hits": rows, "page": page, "last_page": last_page, "facets": facets,
+                "crossed": crossed}  # fmt: skip
+
+
+def terms_of(query: str) -> tuple[str, ...]:
+    """The words of a query, and its phrases in quotes.
+
+    >>> terms_of('yield "collision course')
+    ('yield', 'collision course')
+    """
+    words = (
+        " ".join((quoted or word).split()) for quoted, word in TERM.findall(query[:LONGEST_QUERY])
+    )
+    return tuple(dict.fromkeys(filter(None, words)))[:MOST_TERMS]
+
+
+def pieces_of(text: str, terms: Sequence[str]) -> list[tuple[str, bool]]:
+    """A part of a text with its first match, cut into the terms, True, and what is between them."""
+    longest_first = sorted(terms, key=len, reverse=True)
+    looked_for = "|".join(re.escape(term).replace(r"\ ", r"\s") for term in longest_first)
+    pattern = re.compile(f"({looked_for or '(?!)'})", re.IGNORECASE)
+    first = pattern.search(text)
+    start = max(0, first.start() - BEFORE) if first else 0
+    shown = f"{'… ' * (start > 0)}{text[start : start + SHOWN]}{' …' * (start + SHOWN < len(text))}"
+    return [(part, bool(i % 2)) for i, part in enumerate(pattern.split(shown))]

@@ -1,0 +1,206 @@
+"""What all pages share: the database, the list of its trials, the templates, the addresses."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import shlex
+import threading
+from contextvars import copy_context
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar
+
+import jinja2
+from duckdb import DuckDBPyConnection
+from jinja2.bccache import Bucket
+from starlette.responses import Response
+
+from merge_runner.errors import MergeRunnerError
+from merge_runner.paths import DEFAULT_DB
+from merge_runner_analysis.metrics import METRICS
+from merge_runner_analysis.web.catalogue import Catalogue
+from merge_runner_analysis.web.computing import Computing
+from merge_runner_analysis.web.database_copy import Copies
+from merge_runner_analysis.web.display_text import MINUS, shown_number, visible, with_minus
+from merge_runner_analysis.web.notes import LONGEST_TEXT, Notes
+from merge_runner_analysis.web.queries import Queries
+from merge_runner_analysis.web.reading import stamp_of
+from merge_runner_analysis.web.search import Words
+from merge_runner_analysis.web.urls import HOME, Links
+from merge_runner_analysis.web.views import clock, condition_text
+from merge_runner_analysis.wording import MEASURES, TABLE
+
+TEMPLATES, STATIC = (Path(__file__).with_name(name) for name in ("templates", "static"))
+STYLES = [f"styles/{name}.css" for name in ("base", "answers", "trial", "pages")]
+# What draws and moves a trial, in the order in which it is loaded.
+_PARTS = "moment track charts ribbons panel clock comparison start"
+REPLAY = [f"replay/{part}.js" for part in _PARTS.split()]
+PAGES = {
+    "Study": HOME,
+    "Drivers": "drivers",
+    "Trials": "trials",
+    "Words": "words",
+    "Prompts": "prompts",
+    "Runs": "sweeps",
+    "SQL": "sql",
+}
+# What all templates call, without a word of where it is.
+MACROS = ("scope", "words", "computed", "mark", "conditions", "trust", "notes")
+# The parts of a scope in an address; the list of trials filters by the same names.
+SCOPE = ("sweep", "model", "variant", "condition")
+# What hangs under these, each with one list of all.
+LISTS = {"Tables and figures": "tables", "Notes": "notes"}
+
+
+class Compiled(jinja2.BytecodeCache):
+    """Templates that this process has compiled, for every study that it shows."""
+
+    kept: ClassVar[dict[str, bytes]] = {}
+
+    def load_bytecode(self, bucket: Bucket) -> None:
+        """Take a template from what is kept, if it is there."""
+        if bucket.key in self.kept:
+            bucket.bytecode_from_string(self.kept[bucket.key])
+
+    def dump_bytecode(self, bucket: Bucket) -> None:
+        """Keep a template."""
+        self.kept[bucket.key] = bucket.bytecode_to_string()
+
+
+class NotThere(Exception):
+    """What an address asks for is not there; the text says what is."""
+
+
+class TooMuch(Exception):
+    """An address asks for more than a query may hold; the text says how much it may."""
+
+
+class NothingNew(Exception):
+    """What was seen of a page is what it still shows."""
+
+
+def download(text: str, name: str) -> Response:
+    """A file that a browser saves under this name."""
+    kind = {".csv": "text/csv", ".tex": "application/x-tex"}[Path(name).suffix]
+    headers = {"content-disposition": f'attachment; filename="{name}"'}
+    return Response(text, headers=headers, media_type=f"{kind}; charset=utf-8")
+
+
+def news_of(shown: object, seen: str, state: str = "all") -> str:
+    """What is shown, as a short text that differs where it does; raises NothingNew."""
+    now = f"{state}-{hashlib.sha256(repr(shown).encode()).hexdigest()[:16]}"
+    if now == seen:
+        raise NothingNew
+    return now
+
+
+@dataclass
+class Site:
+    """The explorer of one database."""
+
+    db: Path
+    at: Links = field(default_factory=Links)
+    program: str = "merge-runner"
+    """What to type to run this program."""
+    reader: str = "reader"
+    """Who writes notes."""
+    is_still: bool = False
+    """Whether no news is taken in."""
+    open: DuckDBPyConnection | None = None
+    """The database, where a process does nothing but to read its trials."""
+
+    def __post_init__(self) -> None:
+        self._first_reading: threading.Thread | None = None
+        self._conditions: dict[str, str] = {}
+        self.catalogue = Catalogue(self.db)
+        copies = Copies(self.db)
+        self.queries = Queries(copies)
+        self.computing = Computing(self.db)
+        self.words = Words(self.catalogue, copies)
+        self.notes = Notes(self.db, self.reader)
+        self._environment = jinja2.Environment(
+            loader=jinja2.FileSystemLoader(TEMPLATES),
+            autoescape=True,
+            auto_reload=False,
+            bytecode_cache=Compiled(),
+            undefined=jinja2.StrictUndefined,
+            # Whatever a page says shows itself; what a form sends back is escaped before.
+            finalize=lambda value: visible(value) if type(value) is str else value,
+            trim_blocks=True,
+            lstrip_blocks=True,
+        )
+        # Jinja's own format makes markup of its pattern, and escapes number by number.
+        self._environment.filters.update(
+            format=lambda text, *values: (str(text) % values).replace("-", MINUS),
+            num=shown_number,
+            whole="{:,}".format,
+            minus=lambda text: with_minus(str(text)),
+        )
+        self._environment.globals.update(
+            at=self.at,
+            metrics=METRICS,
+            notes=self.notes,
+            longest_note=LONGEST_TEXT,
+            measures=MEASURES,
+            pages=PAGES,
+            lists=LISTS,
+            share=self.share,
+            program=self.program,
+            styles=STYLES,
+            study=str(self.db),
+            carried={},
+            scope_names=SCOPE,
+            clock=clock,
+            condition_text=condition_text,
+            in_words=self.in_words,
+        )
+        for name in MACROS:
+            macros = vars(self._environment.get_template(f"_{name}.html").module)
+            self._environment.globals |= {k: v for k, v in macros.items() if k[0] != "_"}
+
+    def begin(self) -> None:
+        """Read the trials and make the first page's table, before anything is asked."""
+        self.computing.ask(("table", TABLE, "", ""), stamp_of(self.db))
+        self._first_reading = threading.Thread(
+            target=copy_context().run, args=(self._read_first,), daemon=True
+        )
+        self._first_reading.start()
+
+    def _read_first(self) -> None:
+        # The first page tries again, and says what is wrong.
+        with contextlib.suppress(MergeRunnerError):
+            self.refresh()
+
+    def refresh(self) -> None:
+        """Take in what is new: in the database, and in the notes beside it."""
+        if self.is_still:
+            return
+        if self.catalogue.refresh():
+            self._conditions = {}
+        self.catalogue.tag(self.notes.kept().tags)
+
+    def in_words(self, condition: str) -> str:
+        """What a condition's name says; empty where no human drove it and it has no trial."""
+        if condition not in self._conditions:
+            self._conditions = self.catalogue.condition_texts()
+        return self._conditions.get(condition, "")
+
+    @property
+    def beginning(self) -> bool:
+        """Whether the trials are being read for the first time."""
+        return self._first_reading is not None and self._first_reading.is_alive()
+
+    def share(self, *options: str) -> str:
+        """The command that writes what is shown here as files."""
+        db = [] if self.db == DEFAULT_DB else ["--db", str(self.db)]
+        return shlex.join([self.program, "view", *db, *options])
+
+    def render(self, template: str, **values: object) -> str:
+        """Return a page, or a part of one."""
+        found = self._environment.get_template(template)
+        return found.render({"held": self.catalogue.held, **values})
+
+    def close(self) -> None:
+        """Leave nothing behind."""
+        self.computing.close()

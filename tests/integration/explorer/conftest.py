@@ -1,1 +1,0 @@
-from tests.support.explorer_fixtures import browser, page

@@ -1,0 +1,295 @@
+"""The pages of runs: how far, how well, what went wrong; and how a page follows one."""
+
+import html
+import re
+import shutil
+from collections import Counter
+from dataclasses import replace
+from datetime import UTC, datetime
+from urllib.parse import parse_qs, urlsplit
+
+import duckdb
+import pytest
+
+from merge_runner.results.database import write_database
+from merge_runner.results.store import Store, query, sweep_facts
+from merge_runner.run.progress import remove_standing, write_standing
+from merge_runner.run.stored_replay import audit_database
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner_analysis.web.pages.sweep import list_runs, numbers_of, sweep_page
+from merge_runner_analysis.web.pages.trials import filter_of
+from merge_runner_analysis.web.site import Site
+from tests.support.serving import Page, client_of, held
+from tests.support.standings import progress, runner
+from tests.support.studies import Said, write_study, yielding
+
+URL = "/sweeps/sweep-1"
+ARM = {"model": "o3", "variant": "baseline", "repetitions": 3, "factors": {}, "label": "baseline"}
+CONFIG = {
+    "model": "o3",
+    "models": {
+        "o3": {"id": "o3", "provider": "openai", "aliases": ["o3-alias"], "note": "retires soon"}
+    },
+    "arms": [{**ARM, "sides": {"left": "o3", "right": "o3"}}],
+    "conditions": list(CONDITIONS),
+    "max_cost_usd": 9.0,
+}
+TROUBLE = (
+    Said(("refusal",), "refusal"),
+    Said(failure="no_array"),
+    Said(("timeout", "timeout"), lost=True),
+    Said(("rate_limit", "ok")),
+    Said(("unknown", "ok")),
+    Said(served="another"),
+    Said(served="o3-alias"),
+)
+END = datetime(2026, 11, 21, 1)  # noqa: DTZ001 # as the database keeps times
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """A sweep of 33 planned trials that holds 30, one of them failed, with troubles."""
+    said = dict(enumerate(TROUBLE))
+    drives = [
+        replace(drive, said={1: said[i]} if i in said else {})
+        for i, drive in enumerate(yielding("o3")[:30])
+    ]
+    path = write_study(tmp_path_factory.mktemp("study") / "m.duckdb", drives, config=CONFIG)
+    with duckdb.connect(str(path)) as connection:
+        connection.execute("UPDATE calls SET http_status = 200 WHERE model_served IS NOT NULL")
+    return path
+
+
+@pytest.fixture
+def study(written, tmp_path):
+    """The same, to change it."""
+    return shutil.copy(written, tmp_path / "m.duckdb")
+
+
+def change(db, *statements):
+    # Waits for the audit that a page has asked for.
+    with write_database(db) as connection:
+        for statement in statements:
+            connection.execute(statement)
+
+
+def text_of(client, url=URL):
+    reply = client.get(url)
+    assert reply.status_code == 200
+    return Page(reply.text).text
+
+
+def page_of(site):
+    site.catalogue.refresh()
+    return html.unescape(sweep_page(site, "sweep-1", {}))
+
+
+def asked_by(url):
+    return {name: value for name, [value] in parse_qs(urlsplit(url).query).items()}
+
+
+def news_of(client, url):
+    """Where a page looks for what is new."""
+    text = url if "<" in url else client.get(url).text
+    return html.unescape(re.search(r'hx-get="([^"]*seen=[^"]*)"', text)[1])
+
+
+def running(db, ended=None, **changes):
+    """Say that the sweep runs, in this process."""
+    shown = progress(runner(), planned=3 * len(CONDITIONS))
+    shown.outcome_counts = Counter(ended or {"finished": 2})
+    write_standing(db, shown.standing("sweep-1").model_copy(update={"left_s": 20.0, **changes}))
+
+
+def test_the_page_has_the_numbers_of_the_database_and_every_rate_leads_to_its_trials(written):
+    facts = sweep_facts(written, "sweep-1")
+    with duckdb.connect(str(written), read_only=True) as connection:
+        ((answers, attempts, failures),) = connection.execute(
+            "SELECT (SELECT count(*) FROM calls WHERE http_status = 200), count(*), "
+            "count(*) FILTER (outcome <> 'ok') FROM attempts"
+        ).fetchall()
+        invalid = connection.execute(
+            "SELECT DISTINCT trial_id FROM decisions WHERE NOT valid ORDER BY ALL"
+        ).fetchall()
+    client = client_of(written)
+    text = text_of(client)
+    for name, count, of, things in (
+        ("collisions", dict(facts["outcomes"]).get("collided", 0), 29, "ended trials"),
+        ("failed trials", 1, 30, "stored trials"),
+        ("invalid replies", 2, facts["decisions"], "decisions asked"),
+        ("fallbacks", 2, facts["decisions"], "decisions asked"),
+        ("faults", failures, attempts, "attempts"),
+        ("another model answered", 1, answers, "answers"),
+    ):
+        part = f" ({100 * count / of:.1f} %)" if count else ""
+        assert f"{name} {count:,} of {of:,}{part} {things}" in text
+    assert "its runs could spend at most 9.00 USD; 1 attempts of unknown cost are not in it" in text
+    assert (facts["invalid"], facts["fallbacks"], len(facts["failed"])) == (2, 2, 1)
+    trials = {}
+    for name, url in re.findall(r'id="(rate-\d)" href="([^"]*)"', page_of(client.site)):
+        asked = asked_by(url)
+        assert asked["sweep"] == "sweep-1"
+        found = client.site.catalogue.every(filter_of(asked))
+        trials[name] = [(row["trial_id"],) for row in found]
+    assert trials["rate-3"] == trials["rate-4"] == invalid
+    assert len(invalid) == 2
+
+
+def test_every_arm_and_every_cause_leads_to_the_trials_that_it_counts(written):
+    site = Site(written)
+    links = re.findall(r'id="[ac][^"]*" href="(/trials\?[^"]*)"[^>]*>(\d+)', page_of(site))
+    causes = set()
+    for url, count in links:
+        asked = asked_by(url)
+        causes.add(asked.get("cause"))
+        totals = site.catalogue.counts(filter_of(asked))
+        there = sum(part["trials" if "cause" in asked else "ended"] for part in totals)
+        assert there == int(count), url
+    attempts = {f"attempt: {name}" for name in ("refusal", "timeout", "rate_limit", "unknown")}
+    assert causes == {None, "model: o3 → another", "plan: no_array", "plan: refusal"} | attempts
+
+
+def test_an_alias_is_nothing_that_went_wrong_and_two_other_models_have_a_line_each(study):
+    change(study, "UPDATE calls SET model_served = 'third' WHERE trial_id LIKE '%N_0_0%'")
+    site = Site(study)
+    lines = re.findall(r"model: o3 → ([^<]*)</th>", page_of(site))
+    assert sorted(lines) == ["another", "third"]
+    for name, trials in (("o3-alias", 0), ("o3", 0), ("another", 1), ("third", 3)):
+        found = site.catalogue.every(filter_of({"cause": f"model: o3 → {name}"}))
+        assert len(found) == trials
+    change(
+        study,
+        "UPDATE calls SET outcome = 'ok', model_served = 'o3'",
+        "UPDATE decisions SET failure = NULL, valid = true, fallback = false",
+        "UPDATE trials SET status = 'finished' WHERE status = 'failed'",
+    )
+    assert "What went wrong" not in page_of(Site(study))
+
+
+def test_what_runs_and_trials_share_counts_once_over_all_runs(study):
+    with write_database(study) as connection:
+        connection.execute(
+            "INSERT INTO sweeps BY NAME SELECT * REPLACE ('newer' AS sweep_id) FROM sweeps;"
+            "INSERT INTO sweep_trials SELECT 'newer', trial_id, spec_hash FROM sweep_trials;"
+            "INSERT INTO calls BY NAME SELECT * REPLACE (other.trial_id AS trial_id) FROM calls, "
+            "(SELECT max(trial_id) AS trial_id FROM trials) AS other WHERE calls.trial_id = "
+            "(SELECT min(trial_id) FROM trials)"
+        )
+        calls, usd, shared = connection.execute(
+            "SELECT count(*), sum(usd), count(*) FILTER (trials > 1) FROM (SELECT count(DISTINCT "
+            "trial_id) AS trials, any_value(cost_usd) AS usd FROM calls GROUP BY call_key, attempt)"
+        ).fetchone()
+    catalogue = Site(study).catalogue
+    assert (len(list_runs(catalogue)), shared > 0) == (2, True)
+    counted = numbers_of(catalogue, {})
+    for row in counted.values():
+        assert (row["replies"], row["shared"], row["ended"]) == (calls, shared, 29)
+        assert row["cost_usd"] == pytest.approx(usd)
+    # A run that begins while its page is made has counted nothing yet.
+    assert counted["begun since"] == dict.fromkeys(counted[""], 0)
+
+
+def test_runs_show_how_they_ended_and_what_the_audit_finds_and_a_scope_changes_numbers_alone(
+    study, tmp_path
+):
+    change(
+        study,
+        "UPDATE sweeps SET ended_at = started_at + INTERVAL 2 HOURS, exit_code = 1",
+        "UPDATE trials SET end_time_s = 99 WHERE status = 'finished'",
+    )
+    client = client_of(study)
+    text, whole, part = (
+        text_of(client, f"/sweeps{of}") for of in ("/sweep-1", "", "?condition=N_0_0")
+    )
+    assert ("lasted 2.0 h" in text, " 2.0 h " in whole) == (True, True)
+    assert "found: outcome: sweep-1" in text
+    assert "found: outcome: sweep-1" in whole
+    [run] = audit_database(study, "sweep-1")
+    assert all(" ".join(note.split()) in text for note in run.notes)
+    said = re.search(r"How each ended .*", whole)[0]
+    assert said.split(" To go on")[0] in part
+    assert "30 (3.3 %)" in whole
+    assert ("0 of 3 " in whole, "0 of 3 " in part) == (False, True)
+    assert re.search(r"all runs together 3 ", part)
+    Store(tmp_path / "none.duckdb")
+    client = client_of(tmp_path / "none.duckdb")
+    assert "No trial of a driver is stored. merge-runner sweep baseline" in text_of(client, "/")
+    assert "holds no sweep" in text_of(client, "/sweeps")
+    assert client.get("/sweeps/none").status_code == 404
+
+
+def test_a_page_follows_a_sweep_to_its_end_and_has_each_state_read_out_once(study):
+    running(study, updated_at=datetime(2026, 1, 1, tzinfo=UTC))
+    client = client_of(study)
+    shown = client.get(URL).text
+    assert "Stopped without a word" in shown
+    hostile = "<script>alert(1)</script>\u202e<img src=x>"
+    rows = (("WARNING", f"another model answers: {hostile}"), ("cost", "1.50 USD"))
+    running(study, ended={"finished": 1, "failed": 1}, rows=rows)  # it had slept
+    text = text_of(client)
+    for said in (
+        "Running: 1 of 33 trials ended, 1 failed, about 20 s left.",
+        "cost 1.50 USD",
+        "o3 baseline 29 1 ",
+        "<script>alert(1)</script>[U+202E]<img src=x>",
+    ):
+        assert said in text
+    told = client.get(news_of(client, shown)).text
+    assert "<span>Running: 1 of 33" in told
+    assert not re.search("<script>alert|<img", told + client.get(URL).text)
+    look = news_of(client, told)
+    assert client.get(look).status_code == 204
+    running(study, ended={"finished": 3})
+    told = client.get(look).text
+    # Who listens finds the same state, which is not read out again.
+    assert '<span aria-live="off">Running: 3 of 33' in told
+    look = news_of(client, told)
+    with held(study):  # its end cannot be read: it is not said to be lost
+        remove_standing(study, "sweep-1")
+        assert client.get(look).status_code == 204
+    assert "Stopped without a word" in client.get(look).text
+    Store(study).end_sweep("sweep-1", END, 130)
+    assert "<span>Stopped: it was interrupted" in client.get(look).text
+
+
+def test_a_page_that_looks_for_news_gets_them_once_and_the_newest_run_is_first(study):
+    Store(study).end_sweep("sweep-1", END, 0)
+    client = client_of(study)
+    pages = ("/sweeps", "/trials", "/conditions/N_0_0", URL)
+    looks = {page: news_of(client, page) for page in pages}
+    assert [client.get(look).status_code for look in looks.values()] == [204] * 4
+    change(
+        study,
+        "INSERT INTO sweeps BY NAME SELECT * REPLACE ('newer' AS sweep_id, "
+        "started_at + INTERVAL 1 DAY AS started_at) FROM sweeps",
+        "DELETE FROM trials WHERE condition = 'N_0_0' AND rep = 1",
+    )
+    told = {page: client.get(look).text for page, look in looks.items()}
+    assert [to for to, _ in Page(told["/sweeps"]).to("/sweeps/")][:2] == ["/sweeps/newer", URL]
+    assert "the database holds only" in told[URL]
+    assert "A later run went on with it." in text_of(client)
+    assert "The database has changed since" in told["/trials"]
+    assert [client.get(news_of(client, text)).status_code for text in told.values()] == [204] * 4
+    assert "seen=" not in re.search(r'<a href="([^"]*)">Show them', told["/trials"])[1]
+
+
+def test_a_run_of_a_crossed_study_shows_each_driver_and_what_goes_on_with_it(golden_copy):
+    db = golden_copy / "golden.duckdb"
+    change(
+        db, "UPDATE sweeps SET exit_code = 3", "DELETE FROM trials WHERE trial_id LIKE '%rep02%'"
+    )
+    client = client_of(db)
+    ((sweep,),) = query(db, "SELECT sweep_id FROM sweeps WHERE name = 'mine'")[1]
+    text = client.get(f"/sweeps/{sweep}").text
+    said = Page(text).text
+    for words in (
+        "mine: cheap, dear drives",
+        "18 of 36 trials have an outcome",
+        "merge-runner sweep mine.toml --yes --trust --db ",
+        "dear [temperature=0.2]",
+    ):
+        assert words in said
+    arms = re.findall(r'id="arm-[0-9]+" href="([^"]+)">([0-9]+)<', text)
+    assert len(arms) == 6
+    for link, count in arms:
+        assert f"<strong>{count}</strong> trials" in client.get(html.unescape(link)).text, link

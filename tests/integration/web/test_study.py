@@ -1,0 +1,233 @@
+"""The study on one screen and its drivers: the numbers of the table, and where they lead."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from html import unescape
+
+import pytest
+
+from merge_runner.results.store import query
+from merge_runner_analysis.names import TableFormat
+from merge_runner_analysis.study import Study
+from merge_runner_analysis.tables import formats, make_tables
+from merge_runner_analysis.tables.model import from_text
+from merge_runner_analysis.web.computing import Computing, Numbers
+from merge_runner_analysis.web.display_text import with_minus
+from merge_runner_analysis.wording import MEASURES, by_group, headline, sentence, verdict_word
+from tests.support.serving import Never, Page, client_of, listed
+from tests.support.studies import Said, changed, write_study, yielding
+
+WORST = "L_0_-8"
+COLUMNS = {
+    "o3": ("estimate", "ci"),
+    "humans": ("human", "human_ci"),
+    "difference": ("difference", "difference_ci"),
+    "detectable": ("detectable", ""),
+}
+NUMBER = re.compile(r"[−-]?\d+(?:\.\d+)?(?:e-\d+)?")
+
+
+@pytest.fixture(scope="module")
+def db(tmp_path_factory):
+    """o3 and a variant of it, which collide in two conditions, and o4; one trial is lost.
+
+    o3 drove one condition less often, so that the humans beside it weigh otherwise than by
+    themselves.
+    """
+    drives = yielding("o4", reps=1)
+    for drive in [*yielding("o3", reps=2), *yielding("o3", "A1", reps=1)]:
+        crash = drive.condition == WORST or (drive.condition == "N_0_0" and drive.rep == 1)
+        is_lost = drive.condition == "R_0_8" and drive.rep == 2
+        said = {1: Said(("timeout",), lost=True)} if is_lost else {}
+        straight = {"left": (0.0,), "right": (0.0,)} if crash else {}
+        if drive.condition != "R_-2_8" or drive.rep == 1:
+            drives.append(replace(drive, said=said, **straight))
+    config = {"typed": ["sweep", "test"]}
+    return write_study(tmp_path_factory.mktemp("home") / "study.duckdb", drives, config=config)
+
+
+@pytest.fixture(scope="module")
+def client(db):
+    return client_of(db)
+
+
+@pytest.fixture(scope="module")
+def verdicts(db):
+    return by_group(table_of(db, "verdicts").rows)
+
+
+def table_of(db, *asked):
+    """A table, which is made once for a page and what it is compared with."""
+    return from_text(Numbers(db).answer(("table", *asked))["table"])
+
+
+def agree(html: str, values: list[float]) -> bool:
+    """Whether a piece of a page begins with these values, each rounded to its decimals."""
+    texts = NUMBER.findall(re.sub(r"<[^>]*>", " ", html).replace("−", "-"))
+    return len(texts) >= len(values) and all(
+        abs(float(text) - value) <= 0.5000001 * 10.0 ** -len(text.partition(".")[2])
+        for text, value in zip(texts, values, strict=False)
+    )
+
+
+def test_the_study_says_and_shows_what_the_table_of_verdicts_has(client, verdicts):
+    text = unescape(client.get("/").text)
+    page, own = Page(text), verdicts["o3/baseline"]
+    for said in (
+        " ".join(headline({"o3": own, "o4": verdicts["o4/baseline"]})),
+        sentence(own),
+        "Not shown: 1 other prompt.",
+    ):
+        assert said in page.text
+    assert sentence(verdicts["o3/A1"]) not in page.text
+    told = dict(re.findall(r'href="/drivers/o3\?[^"#]*#([\w-]+)"\s+title="([^"]+)"', text))
+    judged = {name: values for name, values in own.items() if values["estimate"] is not None}
+    assert len(judged) >= 3
+    for name, values in judged.items():
+        assert agree(told[name], [values["estimate"], *values["ci"]]), name
+        assert f"n = {values['n']}" in told[name]
+        assert verdict_word(values) in told[name]
+    assert page.inline == []
+    for address in ("/", "/drivers/o3?variant=baseline", "/tables/verdicts", "/tables/gap"):
+        html = client.get(address).text
+        shown = re.sub(r"<(script|svg).*?</\1>|<[^>]*>", " ", html, flags=re.DOTALL)
+        assert not re.search(r"(?<![\w-])-\d+\.\d", shown)
+        assert re.search(r"−\d", shown)
+
+
+def test_a_drivers_page_has_the_numbers_of_the_table_with_the_trials_behind_them(client, verdicts):
+    text, own = unescape(client.get("/drivers/o3?variant=baseline").text), verdicts["o3/baseline"]
+    assert sentence(own) in text
+    table = text.split('class="verdicts')[1].split("</table>")[0]
+    for name, values in own.items():
+        row = table.split(f'id="{name}"')[1].split("</tr>")[0]
+        assert MEASURES[name].trait in row
+        cells = dict(re.findall(r'<td[^>]*data-l="([^"]+)"[^>]*>(.*?)</td>', row, re.DOTALL))
+        for label, column in COLUMNS.items():
+            estimate, ci = (values.get(part) for part in column)
+            assert estimate is None or agree(cells[label], [estimate, *(ci or ())]), (name, label)
+    page = Page(text)
+    ((link, n), *_) = [link for link in page.to("/trials?") if "cell=verdicts" in link[0]]
+    assert listed(client.get(link).text) == int(n) == own["headway"]["n"]
+    for link, count in page.to("/trials?"):
+        assert not count.isdigit() or listed(client.get(link).text) == int(count), link
+    assert "990 trials" in client.get("/drivers/human").text
+    assert client.get("/drivers/nobody").status_code == 404
+    for wrong in ("variant=A9", "condition=nowhere", "sweep=none", "model=nobody"):
+        assert client.get(f"/?{wrong}").status_code == 404
+
+
+def test_a_table_comes_as_a_file_and_the_page_of_prompts_has_the_differences_of_one(client, db):
+    page, tables = Page(client.get("/tables/attempts").text), make_tables(Study(db), ["attempts"])
+    for form, suffix in ((TableFormat.CSV, "csv"), (TableFormat.LATEX, "tex")):
+        reply = client.get(f"/tables/attempts.{suffix}")
+        assert reply.text == formats.render(tables, form) + "\n"
+        assert f'filename="attempts.{suffix}"' in reply.headers["content-disposition"]
+        assert page.to(f"/tables/attempts.{suffix}")
+        assert client.get(f"/tables/nothing.{suffix}").status_code == 404
+    assert client.get("/tables/attempts.exe").status_code == 404
+    contrasts, page = table_of(db, "contrasts"), Page(client.get("/prompts").text)
+    shown = [row for row in contrasts.rows if row.values["difference"] is not None]
+    assert shown
+    for row in shown:
+        told = {name: with_minus(value) for name, value in formats.printed(contrasts, row).items()}
+        assert f"{told['difference']} {told['ci']}, Holm {told['p_holm']}" in page.text
+    assert page.to("/discordant?model=o3&variant=A1")
+
+
+def test_the_scope_is_in_the_address_and_every_number_obeys_it(client, db):
+    variant = Page(client.get("/?variant=A1").text)
+    assert variant.to("/drivers/o3?variant=A1")
+    assert variant.to("/drivers/o3?variant=baseline") == []
+    one = Page(client.get(f"/?condition={WORST}").text)
+    whole = {to for to, n in one.to("/trials?") if n == "2" and "outcome" not in to}
+    assert {listed(client.get(link).text) for link in whole} == {2}
+    rows = by_group(table_of(db, "verdicts", "", WORST).rows)
+    collisions = rows["o3/baseline"]["collisions"]
+    assert collisions["n"] + (collisions["undecided"] or 0) == 2
+    assert rows["human"]["collisions"]["n"] == 90
+    numbers = [
+        [len(group.trials) for group in Study(db, sweep=s).played] for s in ("sweep-1", "no")
+    ]
+    assert numbers == [[21, 11, 11], []]
+
+
+def test_links_take_the_scope_to_every_page(client):
+    part = f"variant=baseline&condition={WORST}"
+    pages = ("drivers", "trials", "words", "prompts", "sweeps", "sql")
+    for page in ("", *pages):
+        text = unescape(client.get(f"/{page}?{part}").text)
+        assert re.search(f'<option value="{WORST}"[^>]* selected', text)
+        assert {f"/{other}?{part}" for other in pages} <= {to for to, _ in Page(text).links}
+    assert f"condition in ('{WORST}')" in text
+
+
+def test_a_driver_stands_beside_another(client, db):
+    text = client.get("/drivers/o3?variant=baseline&with=o4").text
+    verdicts, _, by_condition = text.partition("In the conditions")
+    drawn = re.findall(r'class="o" href="#(\w+)" x="([\d.]+)%"', verdicts)
+    assert {shape for shape, _ in drawn} == {"other", "beyond"}
+    # Outside its axis it is an arrow, and no value at the end.
+    assert (("beyond", "100.0") in drawn, ("other", "100.0") in drawn) == (True, False)
+    left_first = re.search(r"Left goes first <small>.*?</tr>", by_condition, re.DOTALL)[0]
+    sql = (
+        "SELECT round(100 * avg((merged_first = 'left')::INT), 2) FROM trials "
+        "WHERE spec_hash = 'o3-baseline' AND merged_first IS NOT NULL GROUP BY condition"
+    )
+    shares = sorted(share for (share,) in query(db, sql)[1])
+    marks = re.findall(r'class="d" href="#plain" x="([\d.]+)%"', left_first)
+    assert (sorted(map(float, marks)), len(marks)) == (shares, 10)  # in one it collides
+    assert left_first.count('class="band"') == left_first.count('href="#other"') == 11
+    numbers = [words for _, words in Page(client.get("/drivers").text).to("/trials?")]
+    assert sum(words.isdigit() for words in numbers) == 3
+
+
+def test_a_driver_that_is_not_judged_has_no_verdict_and_missing_decisions_are_counted(tmp_path):
+    prose = dict.fromkeys(range(99), Said(failure="no_array"))
+    missing = dict.fromkeys(range(2), Said(failure="no_decision"))
+    bad = [replace(drive, said=prose, left=(), right=()) for drive in yielding("bad", reps=1)]
+    good = [replace(drive, said=missing) for drive in yielding("o3", reps=1)[:3]]
+    client = client_of(write_study(tmp_path / "t.duckdb", [*bad, *good]))
+    page = Page(client.get("/").text)
+    why = "Not judged: 46 of the 92 decisions of bad are invalid (50.0 %, more than 20 %)."
+    assert why in page.text
+    assert "Not judged" in client.get("/drivers/bad").text
+    judged = {to.partition("?")[0] for to, _ in page.to("/drivers/") if "#" in to}
+    assert judged == {"/drivers/o3"}
+    ((link, count),) = [one for one in page.to("/trials?") if "missing" in one[0]]
+    assert (count, listed(client.get(link).text)) == ("6", 3)
+    driver = Page(client.get("/drivers/o3?variant=baseline").text).text
+    assert "Without the decision asked for 6" in driver
+    assert "missing decisions" in client.get("/sweeps/sweep-1").text
+
+
+def test_the_study_begins_with_its_description_and_says_what_to_type_and_counts_at_once(
+    db, tmp_path
+):
+    copy = shutil.copy(db, tmp_path / "study.duckdb")
+    config = json.dumps({"description": "Who is <first>?", "typed": ["sweep", "test"]})
+    changed(copy, f"UPDATE sweeps SET config = '{config}', ended_at = started_at, exit_code = 3")
+    client = client_of(copy, Computing(copy, Never), program="/opt/bin/merge-runner")
+    text = client.get("/").text
+    page = Page(text)
+    assert "<h1>Who is &lt;first&gt;?</h1>" in text
+    for said in (
+        "This could not be computed",
+        "Stopped: the account",
+        "/opt/bin/merge-runner sweep test",
+    ):
+        assert said in page.text
+    links = [(to, words) for to, words in page.to("/trials?") if words.isdigit()]
+    assert len(links) >= 3
+    assert [(to, str(listed(client.get(to).text))) for to, _ in links] == links
+    (again,) = re.findall(r'hx-get="(/\?seen=[^"]+)"', text)
+    assert client.get(again).status_code == 204
+    changed(copy, "UPDATE sweeps SET exit_code = 0")
+    assert "Stopped: the account" not in client.get(again).text
+    # They would hold up the first page by a second; the worker imports them beside it.
+    code = "import sys, merge_runner_analysis.web.app; sys.exit('scipy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,58 @@
+"""A trial's account in words, and the moments that are marked."""
+
+import pytest
+
+from merge_runner_analysis.web.collision_account import Mark, account
+from tests.support.crashes import EXAMPLES, course_of, crash, decided, drive
+from tests.support.studies import played
+
+WORDS = {
+    "both insisted": "Both insisted: both had sped up. At 2.0 s, when one driver alone could "
+    "last have avoided it, by braking or speeding up, the left vehicle was 2.5 m/s faster and the "
+    "right one 2.0 m/s faster than at the start; 0.5 m/s or more count as acting.",
+    "no action": "Neither acted.",
+    "near miss": "It came close: the gap was 0.4 m at the first merge, then the time to collision "
+    "fell to 0.9 s.",
+    "long wait": "The first vehicle reached the merge point after 12.5 s: 2 times as long as at "
+    "the initial speeds, or longer.",
+}
+FACTS = {"gap_m": 0.42, "min_ttc_s": 0.9, "time_to_merge_s": 12.5}
+
+
+def told(name):
+    """The account of an example."""
+    condition, left, right, said = EXAMPLES[name]
+    if name in ("near miss", "long wait"):
+        record = played(drive(name))
+        made = course_of(record), decided(record)
+    else:
+        made = crash(condition, left, right, said)
+    return account(*made, {"account": name, **FACTS})
+
+
+@pytest.mark.parametrize("name", WORDS)
+def test_an_account_begins_with_what_the_trial_is_an_example_of(name):
+    assert told(name).sentences[0].startswith(WORDS[name])
+
+
+def test_of_each_driver_it_says_what_would_have_helped():
+    left, right = told("both insisted").sentences[1:]
+    assert left == (
+        "The left driver could still have avoided it at 1.6 s, by braking at 2.0 m/s² from then on."
+    )
+    assert right.startswith("The right driver could still have avoided it at 2.0 s")
+
+
+def test_a_change_of_mind_is_marked_once():
+    course, decisions = crash(*EXAMPLES["both insisted"])
+    for decision in decisions:
+        at = decision["decision"]
+        decision["tactical"] = ("Y", "M", "M")[at] if decision["side"] == "left" else "M"
+    found = account(course, decisions, {"account": "both insisted"})
+    assert found.marks == [
+        Mark(0.0, "left", "choice", "chooses to yield"),
+        Mark(0.0, "right", "choice", "chooses to merge"),
+        Mark(1.0, "left", "choice", "chooses to merge"),
+        Mark(1.6, "left", "last chance", "last moment to brake"),
+        Mark(2.0, "right", "last chance", "last moment to brake"),
+    ]

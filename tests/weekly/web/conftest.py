@@ -1,0 +1,1 @@
+from tests.support.web_fixtures import browser, page

@@ -1,0 +1,99 @@
+"""Every page fits its window and keeps nobody out who reads with other eyes."""
+
+import shutil
+
+import pytest
+from playwright.sync_api import expect
+
+from merge_runner.results.store import Store
+from merge_runner_analysis.study import Study
+from merge_runner_analysis.tables import make_tables
+from merge_runner_analysis.web.report import report_html
+from tests.support.serving import in_a_thread, served
+from tests.support.studies import played, yielding
+from tests.support.web_fixtures import serious
+
+LONG = ("meta-llama/Llama-3.3-70B-Instruct-Turbo", "instruct at localhost:8123+idm/set1")
+COMPUTED_MS = 600_000  # on a busy machine
+PAPER_PX = round(190 * 96 / 25.4)  # A4 within its margins
+# A number, a share, a p-value, an interval or a date, of which no part may stand in a line below.
+BROKEN = r"""() => [...document.querySelectorAll("td")].filter((cell) => {
+  if (!/^[-+<\[\]\d., :]*\d[-\d., :\]%]*$/.test(cell.textContent.trim())) return false;
+  const range = document.createRange();
+  range.selectNodeContents(cell);
+  const lines = [...range.getClientRects()].filter((box) => box.width > 0);
+  return new Set(lines.map((box) => Math.round(box.bottom))).size > 1;
+}).map((cell) => cell.textContent)"""
+PAGES = (
+    "/",
+    "/drivers",
+    "/drivers/quantal?variant=baseline",
+    "/trials",
+    "/trials?cell=attempts/emulator%2Fbaseline:calls",
+    "/words?q=merge",
+    "/prompts",
+    "/discordant?model=cheap&variant=taxi",
+    "/conditions/N_0_0",
+    "/sweeps",
+    "/tables",
+    "/tables/indicators",
+    "/figures/first-action",
+    "/glossary",
+    "/notes",
+    "/sql?q=select+1",
+    "/trials/emulator/baseline/N_0_0/rep01?side=left&decision=2"
+    "&compare=emulator/baseline/N_0_0/rep02",
+)
+DRAWN_ANEW = "new Promise(then => requestAnimationFrame(() => requestAnimationFrame(then)))"
+OVER = "document.documentElement.scrollWidth - innerWidth"
+
+
+@pytest.fixture(scope="module")
+def db(golden, tmp_path_factory):
+    """Every kind of trial, and drivers with long names."""
+    path = shutil.copy(golden / "golden.duckdb", tmp_path_factory.mktemp("pages") / "t.duckdb")
+    drives = [drive for name in LONG for drive in yielding(name, reps=1)]
+    Store(path).write("long", [played(drive) for drive in drives], patience_s=5)
+    return path
+
+
+@pytest.fixture(scope="module")
+def site(db):
+    with served(db) as address:
+        yield address
+
+
+def opened(page, address):
+    page.goto(address)
+    page.wait_for_load_state("networkidle")
+    expect(page.locator(".computing")).to_have_count(0, timeout=COMPUTED_MS)
+
+
+def test_every_page_fits_its_window_and_axe_finds_nothing_serious(page):
+    found = []
+    for address in PAGES:
+        opened(page, address)
+        for scheme, width in (("light", 1024), ("dark", 420)):
+            page.emulate_media(color_scheme=scheme)
+            page.set_viewport_size({"width": width, "height": 900})
+            page.evaluate(DRAWN_ANEW)
+            wrong = [over for over in [page.evaluate(OVER)] if over > 0] + serious(page)
+            found += [(address, scheme, width, one) for one in wrong]
+    assert found == []
+
+
+def test_a_report_breaks_no_number_and_cuts_no_table_on_a_screen_and_on_paper(page, db, tmp_path):
+    study = in_a_thread(Study, db)
+    html = in_a_thread(lambda: report_html(study, make_tables(study), {}))
+    (tmp_path / "report.html").write_text(html)
+    page.goto((tmp_path / "report.html").as_uri())
+    last = page.locator("#verdicts + .wide th").last
+    assert last.text_content() == "verdict"
+    for media, width in (("screen", 1440), ("print", PAPER_PX)):
+        page.emulate_media(media=media)
+        page.set_viewport_size({"width": width, "height": 1000})
+        assert page.evaluate(BROKEN) == []
+        box = last.bounding_box()
+        assert box["x"] + box["width"] <= width
+        assert media == "screen" or page.evaluate(OVER) <= 0
+    page.goto("/glossary")
