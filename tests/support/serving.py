@@ -8,6 +8,7 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -15,8 +16,9 @@ import uvicorn
 from starlette.testclient import TestClient
 
 from merge_runner.errors import UsageError
+from merge_runner_analysis.web.answers import answer
 from merge_runner_analysis.web.app import explorer, listen
-from merge_runner_analysis.web.computing import Computing, Numbers, Worker
+from merge_runner_analysis.web.computing import Computing
 from merge_runner_analysis.web.export import export_folder
 from merge_runner_analysis.web.site import Site
 from tests.support.gate import HANGS_S
@@ -28,28 +30,14 @@ INLINE = {
 }
 
 
-class InProcess(Worker):
-    """Computes in a thread of this process."""
-
-    def __init__(self, db):
-        self.numbers = Numbers(db)
-        self.thread = ThreadPoolExecutor(1)
-
-    def answer(self, request):
-        return self.numbers.answer(request)
-
-    def submit(self, request):
-        return self.thread.submit(self.answer, request)
-
-    def close(self):
-        self.thread.shutdown(wait=False, cancel_futures=True)
+def in_process(db, compute=answer):
+    """A computation in a thread of this process."""
+    return Computing(db, compute, partial(ThreadPoolExecutor, 1))
 
 
-class Never(InProcess):
+def never(db, request):
     """A computation that never comes to anything."""
-
-    def answer(self, request):
-        raise UsageError("not now")
+    raise UsageError("not now")
 
 
 class Awaited(Computing):
@@ -62,7 +50,7 @@ class Awaited(Computing):
 def client_of(db: Path, computing: Computing | None = None, **options) -> TestClient:
     """A client without a server, which has the ``site`` and awaits its numbers."""
     site = Site(db, **options)
-    site.computing = computing or Awaited(db, InProcess)
+    site.computing = computing or Awaited(db, start=partial(ThreadPoolExecutor, 1))
     client = TestClient(explorer(site), base_url=f"http://{HOST}", raise_server_exceptions=False)
     client.site = site
     return client

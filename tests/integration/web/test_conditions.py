@@ -5,10 +5,9 @@ import re
 import duckdb
 import pytest
 
-from merge_runner_analysis.web.computing import Computing
 from merge_runner_analysis.web.pages import conditions
 from merge_runner_analysis.web.pages.conditions import BAND, PANELS, TRACES
-from tests.support.serving import Never, Page, client_of
+from tests.support.serving import Page, client_of, in_process, never
 from tests.support.studies import Drive, as_humans, write_study, yielding
 
 CRASH = Drive("o3", "baseline", "N_0_0", 9, (0.0,) * 9, (0.0,) * 9)
@@ -23,7 +22,7 @@ def client(tmp_path_factory):
     others = [*yielding("o3", "A1", reps=2), *yielding("o4", reps=2)]
     write_study(path, [*yielding("o3", reps=2), CRASH, *others, *HUMANS])
     as_humans(path)
-    return client_of(path, Computing(path, Never))
+    return client_of(path, in_process(path, never))
 
 
 @pytest.fixture(scope="module")

@@ -11,10 +11,9 @@ import pytest
 
 from merge_runner.errors import UsageError
 from merge_runner_analysis.web.app import PAGES, explorer, listen
-from merge_runner_analysis.web.computing import Computing
 from merge_runner_analysis.web.site import Site
 from tests.support.cases import cases
-from tests.support.serving import HOST, InProcess, client_of, held
+from tests.support.serving import HOST, client_of, held, in_process
 from tests.support.studies import write_study, yielding
 
 TRIAL = "/trials/o3/baseline/N_0_0/rep01"
@@ -124,7 +123,7 @@ def test_nothing_is_said_of_a_browser_that_left(study, caplog):
 def test_while_another_program_holds_the_database_the_last_list_is_shown(study, tmp_path):
     db = shutil.copy(study, tmp_path / "t.duckdb")
     # What is computed is not waited for: that process waits for the database.
-    client = client_of(db, Computing(db, InProcess))
+    client = client_of(db, in_process(db))
     told = "Another program holds the database"
     assert told not in client.get("/trials").text
     with held(db):

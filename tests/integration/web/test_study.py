@@ -15,10 +15,10 @@ from merge_runner_analysis.names import TableFormat
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables import formats, make_tables
 from merge_runner_analysis.tables.model import from_text
-from merge_runner_analysis.web.computing import Computing, Numbers
+from merge_runner_analysis.web.answers import answer
 from merge_runner_analysis.web.display_text import with_minus
 from merge_runner_analysis.wording import MEASURES, by_group, headline, sentence, verdict_word
-from tests.support.serving import Never, Page, client_of, listed
+from tests.support.serving import Page, client_of, in_process, listed, never
 from tests.support.studies import Said, changed, write_study, yielding
 
 WORST = "L_0_-8"
@@ -62,7 +62,7 @@ def verdicts(db):
 
 def table_of(db, *asked):
     """A table, which is made once for a page and what it is compared with."""
-    return from_text(Numbers(db).answer(("table", *asked))["table"])
+    return from_text(answer(db, ("table", *asked))["table"])
 
 
 def agree(html: str, values: list[float]) -> bool:
@@ -211,7 +211,7 @@ def test_the_study_begins_with_its_description_and_says_what_to_type_and_counts_
     copy = shutil.copy(db, tmp_path / "study.duckdb")
     config = json.dumps({"description": "Who is <first>?", "typed": ["sweep", "test"]})
     changed(copy, f"UPDATE sweeps SET config = '{config}', ended_at = started_at, exit_code = 3")
-    client = client_of(copy, Computing(copy, Never), program="/opt/bin/merge-runner")
+    client = client_of(copy, in_process(copy, never), program="/opt/bin/merge-runner")
     text = client.get("/").text
     page = Page(text)
     assert "<h1>Who is &lt;first&gt;?</h1>" in text

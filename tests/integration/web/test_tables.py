@@ -23,12 +23,13 @@ from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.figures.gallery import MAKERS
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.model import from_text
-from merge_runner_analysis.web import computing as worker
-from merge_runner_analysis.web.computing import Computing, Numbers, Worker
+from merge_runner_analysis.web import computing as computing_module
+from merge_runner_analysis.web.answers import answer, numbers
+from merge_runner_analysis.web.computing import Computing
 from merge_runner_analysis.web.reading import stamp_of
 from tests.support.cases import cases
 from tests.support.gate import HANGS_S
-from tests.support.serving import InProcess, Page, client_of, listed
+from tests.support.serving import Page, client_of, in_process, listed
 from tests.support.studies import Said, write_study, yielding
 
 HOSTILE = '<img src=x onerror="alert(1)">'
@@ -71,21 +72,20 @@ def answering(db, *answers):
     """A computation that gives these answers, or raises them, and what it was asked."""
     asked, left = [], iter(answers)
 
-    class Scripted(InProcess):
-        def answer(self, request):
-            asked.append(request)
-            answer = next(left)
-            if isinstance(answer, Exception):
-                raise answer
-            return answer
+    def scripted(_, request):
+        asked.append(request)
+        answer = next(left)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
 
-    computing = Computing(db, Scripted)
+    computing = in_process(db, scripted)
     return computing, asked, lambda state, *of: computing.ask(of, state, wait_s=HANGS_S).content
 
 
 @pytest.mark.parametrize(("name", "every"), [("ablation-quantitative", 9), ("contrasts", 25)])
 def test_every_number_leads_to_the_trials_that_explain_names(ask, db, name, every):
-    study, table = Study(db), from_text(Numbers(db).answer(("table", name))["table"])
+    study, table = Study(db), from_text(answer(db, ("table", name))["table"])
     links = cells(ask(f"/tables/{name}"))
     assert len(links) > 20
     for link in links[::every]:
@@ -162,10 +162,10 @@ def test_that_a_cell_is_none_stands_as_long_as_its_state_and_a_fault_does_not_st
 
 
 def test_the_database_is_read_anew_where_it_changed(db):
-    first = worker.numbers(db, stamp_of(db))
-    assert worker.numbers(db, stamp_of(db)) is first
+    first = numbers(db, stamp_of(db))
+    assert numbers(db, stamp_of(db)) is first
     os.utime(db)
-    assert worker.numbers(db, stamp_of(db)) is not first
+    assert numbers(db, stamp_of(db)) is not first
 
 
 def test_discordant_trials_are_the_pairs_that_differ(ask, db):
@@ -203,13 +203,12 @@ def test_every_figure_is_offered_and_comes_as_svg_and_png_and_is_cited(client, a
 def test_a_page_is_served_while_a_computation_runs_and_a_failure_is_said(db):
     going, asked = threading.Event(), threading.Event()
 
-    class Slow(InProcess):
-        def answer(self, request):
-            asked.set()
-            going.wait()
-            raise UsageError("it broke <off>")
+    def slow(*_):
+        asked.set()
+        going.wait()
+        raise UsageError("it broke <off>")
 
-    client = client_of(db, Computing(db, Slow))
+    client = client_of(db, in_process(db, slow))
     assert "Computing, " in client.get("/tables/attempts").text
     assert asked.wait(HANGS_S)
     assert listed(client.get("/trials").text) == 66
@@ -223,17 +222,16 @@ def test_a_page_is_served_while_a_computation_runs_and_a_failure_is_said(db):
 def test_an_older_answer_stands_for_a_while_and_until_there_is_a_newer_one(db, monkeypatch):
     made, going = [], threading.Event()
 
-    class Counting(InProcess):
-        def answer(self, request):
-            made.append(request)
-            assert len(made) == 1 or going.wait(HANGS_S)
-            return {"counted": len(made)}
+    def counting(_, request):
+        made.append(request)
+        assert len(made) == 1 or going.wait(HANGS_S)
+        return {"counted": len(made)}
 
-    computing = Computing(db, Counting)
+    computing = in_process(db, counting)
     first = computing.ask(("home", ""), (1, 1), wait_s=HANGS_S)
     assert computing.ask(("home", ""), (2, 2)) == replace(first, older=True)
     assert len(made) == 1
-    monkeypatch.setattr(worker, "STANDS_S", 0.0)
+    monkeypatch.setattr(computing_module, "STANDS_S", 0.0)
     assert computing.ask(("home", ""), (1, 1)) == first
     assert computing.ask(("home", ""), (2, 2)) == replace(first, older=True)
     going.set()
@@ -253,17 +251,17 @@ def test_a_process_of_its_own_answers_alike_takes_no_file_of_the_users_and_is_re
     def ask(*request):
         return computing.ask(request, (1, 1), wait_s=HANGS_S)
 
-    assert ask("table", "attempts").content == Numbers(db).answer(("table", "attempts"))
+    assert ask("table", "attempts").content == answer(db, ("table", "attempts"))
     assert ask("nothing").failure == "nothing answers ('nothing',)"
     computing.ask(("table", "gap"), (1, 1))
     for child in set(psutil.Process().children(recursive=True)) - before:
         if "spawn_main" in " ".join(child.cmdline()):
             child.send_signal(signal.SIGKILL)
     assert "ended without an answer" in ask("table", "gap").failure
-    assert ask("table", "criticality").content == Numbers(db).answer(("table", "criticality"))
+    assert ask("table", "criticality").content == answer(db, ("table", "criticality"))
     computing.close()
-    with closing(Worker(db)) as worker:
-        worker.submit(("table", "attempts"))
+    with closing(Computing(db)) as computing:
+        computing.ask(("table", "attempts"), (1, 1))
     assert set(threading.enumerate()) <= threads, "a program could stumble over it"
 
 
@@ -275,7 +273,7 @@ def test_what_the_pages_compute_knows_the_study_as_the_explorer_was_given_it(gol
     def compute():
         use(load_study(golden_copy / "mine.toml", trust=True)[1])
         plugin.write_text("raise RuntimeError('nobody agreed to this')")
-        with closing(Worker(db)) as process:
-            return process.submit(("table", "factors")).result(HANGS_S)
+        with closing(Computing(db)) as computing:
+            return computing.ask(("table", "factors"), (1, 1), wait_s=HANGS_S).content
 
     assert "opponent=sleepy/duration_s" in copy_context().run(compute)["table"]

@@ -9,8 +9,7 @@ import duckdb
 import pytest
 
 from merge_runner.results.database import SCHEMA_VERSION
-from merge_runner_analysis.web.computing import Computing
-from tests.support.serving import InProcess, client_of
+from tests.support.serving import client_of, in_process
 from tests.support.studies import write_study, yielding
 
 TRIAL = "/trials/o3/baseline/N_0_0/rep01"
@@ -52,7 +51,7 @@ def db(good, tmp_path):
 @pytest.mark.parametrize("what", ["garbage", "empty", "half", "zeros", "foreign"])
 @pytest.mark.parametrize("in_place", list(product([True, False], repeat=2)))
 def test_the_good_one_is_shown_again_after_a_plain_message(db, good, bad, what, in_place):
-    client = client_of(db, Computing(db, InProcess))
+    client = client_of(db, in_process(db))
     assert [client.get(page).status_code for page in PAGES] == [200] * 4
     put(db, bad[what], in_place=in_place[0])
     for page in PAGES:
@@ -64,7 +63,7 @@ def test_the_good_one_is_shown_again_after_a_plain_message(db, good, bad, what, 
 
 
 def test_nobody_who_asks_meanwhile_gets_an_error_page(db, good, bad):
-    client, codes, done = client_of(db, Computing(db, InProcess)), [], threading.Event()
+    client, codes, done = client_of(db, in_process(db)), [], threading.Event()
 
     def look(page):
         while not done.is_set():

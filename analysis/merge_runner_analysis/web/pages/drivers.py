@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 from merge_runner_analysis.names import HUMAN
 from merge_runner_analysis.tables.formats import printed
+from merge_runner_analysis.web.computed import computed_table
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.display_text import with_minus
 from merge_runner_analysis.web.marks import rate
-from merge_runner_analysis.web.pages.computed import computed_table
 from merge_runner_analysis.web.pages.home import (
     Driver,
     by_condition,

@@ -10,8 +10,8 @@ from typing import Any
 from merge_runner_analysis.names import DESCRIPTIONS, HUMAN
 from merge_runner_analysis.published import human_counts
 from merge_runner_analysis.tables.model import Table
+from merge_runner_analysis.web.computed import computed_table
 from merge_runner_analysis.web.marks import Cell, band, cells
-from merge_runner_analysis.web.pages.computed import computed_table
 from merge_runner_analysis.web.pages.sweep import standing_of
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.scope import Bar, Scope, carried, scope_of, unmarked

@@ -13,8 +13,8 @@ from merge_runner_analysis.names import BASELINE
 from merge_runner_analysis.tables.formats import printed
 from merge_runner_analysis.tables.model import Row, Table
 from merge_runner_analysis.web import views
+from merge_runner_analysis.web.computed import computed_table
 from merge_runner_analysis.web.marks import Mark
-from merge_runner_analysis.web.pages.computed import computed_table
 from merge_runner_analysis.web.pages.home import Driver, judged
 from merge_runner_analysis.web.prompts import parts_of
 from merge_runner_analysis.web.reading import reading, records

@@ -13,8 +13,8 @@ from merge_runner.audit.checks import not_judged
 from merge_runner.config import both_sides, pair_name
 from merge_runner.run.progress import Standing, read_standing
 from merge_runner_analysis.web.catalogue import MISSING, Catalogue, Wanted
+from merge_runner_analysis.web.computed import computed
 from merge_runner_analysis.web.computing import Job
-from merge_runner_analysis.web.pages.computed import computed
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.scope import carried, scope_of
 from merge_runner_analysis.web.site import NothingNew, NotThere, Site, news_of

@@ -13,7 +13,7 @@ from merge_runner_analysis.names import TableFormat
 from merge_runner_analysis.tables import TABLES
 from merge_runner_analysis.tables.formats import render, shown_columns, table_view
 from merge_runner_analysis.tables.model import from_text
-from merge_runner_analysis.web.pages.computed import awaited, computed, computed_table
+from merge_runner_analysis.web.computed import awaited, computed, computed_table
 from merge_runner_analysis.web.scope import every
 from merge_runner_analysis.web.site import NotThere, Site, download
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from merge_runner_analysis.tables import TABLES
 from merge_runner_analysis.web.catalogue import FACETS, FACTOR, PAGE, SORTS, Wanted
-from merge_runner_analysis.web.pages.computed import awaited, computed
+from merge_runner_analysis.web.computed import awaited, computed
 from merge_runner_analysis.web.pictures import sparkline, speed_range
 from merge_runner_analysis.web.scope import carried
 from merge_runner_analysis.web.search import LONGEST_QUERY, MOST_TERMS

@@ -1,0 +1,139 @@
+"""What pages show of the analysis of one state of a database, made once and kept beside it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import duckdb
+
+from merge_runner.audit.checks import audited_database, check_sweep
+from merge_runner.errors import UsageError
+from merge_runner.results.database import read_database
+from merge_runner.results.store import results_digest
+from merge_runner.text_safety import first_line
+from merge_runner_analysis.cache import finished, keep_finished, options_text, present_state
+from merge_runner_analysis.tables import make_tables
+from merge_runner_analysis.tables.model import from_text, to_text
+from merge_runner_analysis.web.reading import stamp_of
+
+if TYPE_CHECKING:
+    from merge_runner_analysis.study import Study
+
+FOUND = 3  # findings of a run that its page shows
+Request = tuple[str, ...]
+"""``table NAME [SWEEP CONDITION]``, ``cell TABLE ROW COLUMN``, ``figure NAME FORM``,
+``audit``."""
+RUNS = """
+SELECT sweep_id, coalesce(exit_code = 0, false) FROM sweeps
+ORDER BY started_at DESC, sweep_id DESC
+"""
+
+
+def answer(db: Path, request: Request) -> dict[str, Any]:
+    """Return the answer of the database as it is now; raises MergeRunnerError."""
+    try:
+        return numbers(db, stamp_of(db)).answer(request)
+    except duckdb.Error as exc:  # as where the file is replaced while it is read
+        raise UsageError(f"{db} cannot be read: {first_line(exc)}") from exc
+
+
+class Numbers:
+    """Answers from one state of a database, whose trials are read once something needs them."""
+
+    def __init__(self, db: Path) -> None:
+        self.db = db
+
+    def answer(self, request: Request) -> dict[str, Any]:
+        """Return what is asked for, with ``counted``: how many trials the database holds.
+
+        ``absent`` says that no table has a cell. Raises MergeRunnerError.
+        """
+        match request:
+            case ["table", name, *part]:
+                found: dict[str, Any] = {"table": self._table(name, *part)}
+            case ["cell", table, row, column]:
+                found = self._cell(table, row, column)
+            case ["figure", name, "svg" | "png" as form]:
+                from merge_runner_analysis.figures.gallery import rendered
+
+                digest, _ = results_digest(self.db)
+                found = {"file": rendered(self.study, name, form), "digest": digest}
+            case ["audit"]:
+                found = {"notes": json.loads(self._kept("audit", self._audit))}
+            case _:
+                raise UsageError(f"nothing answers {request!r}")
+        with read_database(self.db) as connection:
+            counted = connection.execute("SELECT count(*) FROM trials WHERE source <> 'seat'")
+            return {"counted": counted.fetchall()[0][0], **found}
+
+    @cached_property
+    def study(self) -> Study:
+        """The study, once it is read."""
+        from merge_runner_analysis.study import Study
+
+        return Study(self.db)
+
+    @cached_property
+    def _state(self) -> str:
+        return present_state(self.db)
+
+    def _kept(self, name: str, make: Callable[[], str], options: str = "") -> str:
+        """Return what is kept of the present state under a name; else it is made, and kept."""
+        options = options or options_text(self.db)
+        kept = finished(self.db, self._state, options, [name])
+        if not kept:
+            kept = {name: make()}
+            keep_finished(self.db, self._state, options, kept)
+        return kept[name]
+
+    def _table(self, name: str, sweep: str = "", condition: str = "") -> str:
+        """Return a table of all trials, or of those of a sweep and a condition."""
+
+        def make() -> str:
+            from merge_runner_analysis.study import Study
+
+            is_part = sweep or condition
+            study = Study(self.db, sweep=sweep, condition=condition) if is_part else self.study
+            return to_text(make_tables(study, [name])[0])
+
+        return self._kept(name, make, options_text(self.db, sweep=sweep, condition=condition))
+
+    def _audit(self) -> str:
+        """Return what the audit of each run found and notes, by its id; nothing is replayed."""
+        told = {}
+        with audited_database(self.db) as connection:
+            for run, ended in connection.execute(RUNS).fetchall():
+                audit = check_sweep(connection, run, (), finished=ended)
+                told[run] = [f"found: {one}" for one in audit.findings[:FOUND]] + audit.notes
+        return json.dumps(told)
+
+    def _cell(self, name: str, row: str, column: str) -> dict[str, Any]:
+        from merge_runner_analysis.explain import explain
+
+        table, study = from_text(self._table(name)), self.study
+        try:
+            found = explain(study, table, f"{row}:{column}")
+        except UsageError as exc:
+            return {"absent": str(exc)}
+        counts = any(one.counts for one in table.columns if one.name == column)
+        specs = {
+            group.id: dict(zip(trials["trial_id"], trials["spec_hash"], strict=True))
+            for group in (*study.measured, *study.asked, *study.unjudged, *study.unjudged_asked)
+            for trials in [group.stored.trials]
+        }
+        trials = [
+            (trial, specs[source.group][trial])
+            for source in found.sources
+            for trial in (source.numerator if counts else source.trials)
+        ]
+        return {"explained": found, "trials": trials}
+
+
+@lru_cache(1)
+def numbers(db: Path, _: tuple[int, ...]) -> Numbers:
+    """Return the numbers of a database with a stamp: what was read is read once."""
+    return Numbers(db)
