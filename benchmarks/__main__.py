@@ -25,6 +25,7 @@ from benchmarks.cases import (
     import_humans,
     in_flight,
     in_flight_floor,
+    libraries,
     limited,
     paid,
     parts,
@@ -68,6 +69,7 @@ CASES = (
     Case("recording 11,000", 1, record_many(11_000)),
     Case("replay of 11,000", 1, replay_many(11_000)),
     Case("import of 990 human trials", 1, import_humans),
+    Case("floor, libraries", 3, libraries),
     *(
         Case(f"{what} of {trials:,}, {heat}", 1, analysis(trials, what, warm=heat == "warm"))
         for trials in STUDIES

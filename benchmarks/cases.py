@@ -27,7 +27,7 @@ SHORT, SHORT_CALLS = ("--conditions", "R_-4_8"), 8
 # Few trials, whose calls are all under way before the first of them is answered.
 KILLED, KILLED_TRIALS = ("--reps", "2"), 22
 KILLED_DELAY_MS, QUIET_S = 1_000, 0.15
-STUDIES, MOST_DRIVEN = (110, 1_100, 11_000), 1_100
+STUDIES, MOST_DRIVEN = (110, 3_300, 11_000), 1_100
 
 
 @dataclass(frozen=True, slots=True)
@@ -354,12 +354,17 @@ def study_of(bench: Bench, trials: int, *, anew: bool = False) -> Path:
     return db
 
 
-def analysis(trials: int, *argv: str, warm: bool) -> Callable[[Bench], Figures]:
+def libraries(_: Bench) -> Figures:
+    """What tables cannot do without: the interpreter and its libraries of statistics."""
+    return figures_of(run([PYTHON, "-c", "import pandas, scipy.stats, statsmodels.api"]), calls=0)
+
+
+def analysis(trials: int, what: str, *, warm: bool) -> Callable[[Bench], Figures]:
     """Tables or a report of a study; cold: nothing of it is stored, of a report but the tables."""
 
     def measure(bench: Bench) -> Figures:
-        db = study_of(bench, trials, anew=not warm and "tables" in argv)
-        out = ["--out", str(bench.fresh("report") / "report.html")] if "report" in argv else []
-        return figures_of(run([*PROGRAM, *argv, "--db", str(db), *out]), calls=0)
+        db = study_of(bench, trials, anew=not warm and what == "tables")
+        out = ["--out", str(bench.fresh("report") / "report.html")] if what == "report" else []
+        return figures_of(run([*PROGRAM, what, "--db", str(db), *out]), calls=0)
 
     return measure
