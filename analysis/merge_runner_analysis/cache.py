@@ -110,10 +110,11 @@ def _run(db: Path, sql: str, rows: Sequence[tuple[str, ...]]) -> list[tuple[str,
             kept.execute(KEPT)
             return [found for row in rows for found in kept.execute(sql, row)]
     except sqlite3.Error as exc:
-        _say_once(str(exc))
+        say_once(str(exc))
         return []
 
 
 @cache
-def _say_once(reason: str) -> None:
+def say_once(reason: str) -> None:
+    """Log, once for each reason, that nothing is kept."""
     LOG.warning("what was computed is not kept for the next time: %s", reason)

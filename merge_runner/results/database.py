@@ -71,7 +71,8 @@ def has_these_measures(connection: duckdb.DuckDBPyConnection) -> bool:
 
 
 @cache  # warns once per file, which a page may read a hundred times
-def _warn_of_other_measures(path: Path) -> None:
+def warn_of_other_measures(path: Path) -> None:
+    """Log that another version of the program defined the measures of a database."""
     LOG.warning(
         "another version of the program defined the measures (trial_metrics and its views) of %s, "
         "and they are read as they are; `merge-runner sweep` into it brings them up to date",
@@ -345,7 +346,7 @@ def read_database(
     ):
         check_schema(connection, path)
         if not has_these_measures(connection):
-            _warn_of_other_measures(path)
+            warn_of_other_measures(path)
         yield connection
 
 

@@ -354,7 +354,8 @@ ENDS = {
 async def test_however_an_attempt_ends_its_money_ends_in_the_right_place(
     ledger, begun, attempts, error, money
 ):
-    """``money``: what is allowed to the trial, set aside for ever, and spent."""
+    """``money``: what is kept for the trial, set aside for ever, and spent."""
+    kept_usd, reserved_usd, spent_usd = money
     budget = Budget(ledger, 1.0, each(1.0))
     await budget.admit(1)
 
@@ -369,6 +370,7 @@ async def test_however_an_attempt_ends_its_money_ends_in_the_right_place(
     with pytest.raises(error):
         await ended()
     spending = budget.ledger.read()
-    allowed_usd = budget.trial_usd(1) - budget._charged_usd[1]
-    assert (allowed_usd, spending.reserved_usd, spending.spent_usd) == money
+    assert (spending.reserved_usd, spending.spent_usd) == (reserved_usd, spent_usd)
     assert (budget.in_flight, budget.queued_usd) == (0, 0)
+    with pytest.raises(TrialSuspended, match=f"{kept_usd:.4f} more are kept for the trials"):
+        await set_aside(budget, 1, 5.0)
