@@ -60,7 +60,7 @@ from merge_runner_analysis.web.urls import whole
 
 LOG = logging.getLogger(__name__)
 FIRST_TIME = (
-    "The trials are read for the first time; ten thousand take about ten seconds. This page comes "
+    "The trials are read for the first time; ten thousand take about two seconds. This page comes "
     "back by itself."
 )
 MOST_NOTED, MOST_FIELDS = 65_536, 10  # bytes and fields of a form with a note

@@ -23,12 +23,12 @@ import httpx
 
 from merge_runner.errors import UsageError
 from merge_runner.paths import refuse_another_kind
-from merge_runner.results.database import read_database
 from merge_runner_analysis.web.app import explorer
-from merge_runner_analysis.web.catalogue import FACETS, FACTOR
+from merge_runner_analysis.web.catalogue import FACETS
 from merge_runner_analysis.web.computing import processes
 from merge_runner_analysis.web.guard import LOOPBACK
 from merge_runner_analysis.web.leaks import refuse_leaks
+from merge_runner_analysis.web.listing import FACTOR
 from merge_runner_analysis.web.offline import offline, page_of_trials
 from merge_runner_analysis.web.pages.trial import trial_page
 from merge_runner_analysis.web.reading import Row
@@ -164,13 +164,12 @@ async def _served(client: httpx.AsyncClient, address: str) -> str:
 
 
 @lru_cache(1)
-def _still(db: Path) -> tuple[Site, ExitStack]:
-    """The site of a process that helps, and what keeps its database open."""
-    site, kept = Site(db, is_still=True), ExitStack()
+def _still(db: Path) -> Site:
+    """The site of a process that helps."""
+    site = Site(db, is_still=True)
     site.catalogue.refresh()
-    site.open = kept.enter_context(read_database(db))
-    site.open.execute("SET threads = 1")  # there are several of these
-    return site, kept
+    site.catalogue.ask("SET threads = 1")  # there are several of these
+    return site
 
 
 def _trial_page(db: Path, page: str) -> str:
@@ -178,7 +177,7 @@ def _trial_page(db: Path, page: str) -> str:
     parts = urlsplit(page)
     name = unquote(parts.path.removeprefix(OF_A_TRIAL))
     with suppress(NotThere):
-        return trial_page(_still(db)[0], name, dict(parse_qsl(parts.query)))
+        return trial_page(_still(db), name, dict(parse_qsl(parts.query)))
     return ""
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import duckdb
 
 from merge_runner.errors import UsageError
-from merge_runner.results.database import SHARED, Instance, by_name, read_database
+from merge_runner.results.database import by_name, read_database
 from merge_runner.text_safety import first_line
 
 ALONE = threading.RLock()
@@ -26,15 +26,13 @@ Row = dict[str, Any]
 
 
 @contextmanager
-def reading(
-    db: Path, instance: Instance = SHARED, patience_s: float = PATIENCE_S
-) -> Iterator[duckdb.DuckDBPyConnection]:
+def reading(db: Path, patience_s: float = PATIENCE_S) -> Iterator[duckdb.DuckDBPyConnection]:
     """Open the database for reading, for a moment; raises UsageError and StoreError.
 
     What lies there may be damaged, or have been made by another program.
     """
     try:
-        with ALONE, read_database(db, instance, patience_s) as connection:
+        with ALONE, read_database(db, patience_s=patience_s) as connection:
             yield connection
     except duckdb.Error as exc:
         raise UsageError(f"{db} cannot be read: {first_line(exc)}") from exc

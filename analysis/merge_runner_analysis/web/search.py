@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from merge_runner_analysis.web.catalogue import Catalogue, facets_of, where_of
-from merge_runner_analysis.web.database_copy import Copies
 from merge_runner_analysis.web.reading import records
 
 PAGE = 50
@@ -43,7 +42,7 @@ WITH decided AS (
             THEN lag(tactical IGNORE NULLS) OVER said || ' to ' || tactical END AS switch,
         failure, {ACTION.format("plan")} AS planned, {ACTION.format("applied")} AS driven,
         list_avg(plan) AS plan_mean, list_avg(applied) AS drive_mean, rowid AS place
-    FROM copied.decisions WHERE call_key IS NOT NULL
+    FROM decisions WHERE call_key IS NOT NULL
     WINDOW said AS (PARTITION BY trial_id, spec_hash, side ORDER BY decision)
 )
 SELECT number, side, decision, time_s, tactical, switch, failure, planned, driven, plan_mean, place
@@ -57,7 +56,6 @@ class Words:
     """What the drivers of a database said. One search goes on at a time."""
 
     catalogue: Catalogue
-    copies: Copies
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def search(
@@ -70,46 +68,40 @@ class Words:
         """Decisions with all ``terms`` within ``limits``, of which ``hits`` are those of a page.
 
         Each has the ``pieces`` of its words. ``crossed`` counts all of them by what was said, M or
-        Y, and by what was planned. Raises UsageError and StoreLocked.
+        Y, and by what was planned.
         """
-        copy, limits = self.copies.current(), limits or {}
+        limits = limits or {}
         conditions = ["true", *(LIMITS[name] for name in limits)]
         if terms:
             holding = " AND ".join([f"contains({FOLDED}, lower(?))"] * len(terms))
-            conditions.append(f"place IN (SELECT rowid FROM copied.decisions WHERE {holding})")  # noqa: S608 # constants
+            conditions.append(f"place IN (SELECT rowid FROM decisions WHERE {holding})")  # noqa: S608 # constants
         where, values = where_of(wanted)
         found = f"FROM {FOUND} WHERE {where}"
         with self._lock, self.catalogue.cursor() as connection:
-            connection.execute(f"ATTACH {copy.file} AS copied (READ_ONLY)")
-            try:
+            connection.execute(HITS.format(" AND ".join(conditions)), [*limits.values(), *terms])
+            (totals,) = records(
+                connection,
+                "SELECT count(*) AS decisions, count(DISTINCT number) AS trials, "
+                "histogram(planned) FILTER (tactical = 'M') AS \"M\", "
+                f"histogram(planned) FILTER (tactical = 'Y') AS \"Y\" {found}",
+                values,
+            )
+            last_page = max(1, -(-totals["decisions"] // PAGE))
+            page = min(page, last_page)
+            rows = records(
+                connection,
+                f"SELECT trial_id, spec_hash, outcome, hits.* {found} "
+                f"ORDER BY trial_id, spec_hash, hits.decision, hits.side LIMIT {PAGE} OFFSET ?",
+                [*values, PAGE * (page - 1)],
+            )
+            texts = dict(
                 connection.execute(
-                    HITS.format(" AND ".join(conditions)), [*limits.values(), *terms]
-                )
-                (totals,) = records(
-                    connection,
-                    "SELECT count(*) AS decisions, count(DISTINCT number) AS trials, "
-                    "histogram(planned) FILTER (tactical = 'M') AS \"M\", "
-                    f"histogram(planned) FILTER (tactical = 'Y') AS \"Y\" {found}",
-                    values,
-                )
-                last_page = max(1, -(-totals["decisions"] // PAGE))
-                page = min(page, last_page)
-                rows = records(
-                    connection,
-                    f"SELECT trial_id, spec_hash, outcome, hits.* {found} "
-                    f"ORDER BY trial_id, spec_hash, hits.decision, hits.side LIMIT {PAGE} OFFSET ?",
-                    [*values, PAGE * (page - 1)],
-                )
-                texts = dict(
-                    connection.execute(
-                        f"SELECT rowid, left(rationale, {LONGEST}) FROM copied.decisions "  # noqa: S608 # constants
-                        "WHERE rowid IN (SELECT unnest(?::BIGINT[]))",
-                        [[row["place"] for row in rows]],
-                    ).fetchall()
-                )
-                facets = facets_of(connection, FOUND, FACETS, wanted)
-            finally:
-                connection.execute("DETACH copied")
+                    f"SELECT rowid, left(rationale, {LONGEST}) FROM decisions "  # noqa: S608 # constants
+                    "WHERE rowid IN (SELECT unnest(?::BIGINT[]))",
+                    [[row["place"] for row in rows]],
+                ).fetchall()
+            )
+            facets = facets_of(connection, FOUND, FACETS, wanted)
         crossed = {letter: counts for letter in "MY" if (counts := totals.pop(letter))}
         for row in rows:
             text = texts.get(row["place"])

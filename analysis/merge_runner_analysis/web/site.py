@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import ClassVar
 
 import jinja2
-from duckdb import DuckDBPyConnection
 from jinja2.bccache import Bucket
 from starlette.responses import Response
 
@@ -21,7 +20,6 @@ from merge_runner.paths import DEFAULT_DB
 from merge_runner_analysis.metrics import METRICS
 from merge_runner_analysis.web.catalogue import Catalogue
 from merge_runner_analysis.web.computing import Computing
-from merge_runner_analysis.web.database_copy import Copies
 from merge_runner_analysis.web.display_text import MINUS, shown_number, visible, with_minus
 from merge_runner_analysis.web.notes import LONGEST_TEXT, Notes
 from merge_runner_analysis.web.queries import Queries
@@ -107,17 +105,14 @@ class Site:
     """Who writes notes."""
     is_still: bool = False
     """Whether no news is taken in."""
-    open: DuckDBPyConnection | None = None
-    """The database, where a process does nothing but to read its trials."""
 
     def __post_init__(self) -> None:
         self._first_reading: threading.Thread | None = None
         self._conditions: dict[str, str] = {}
         self.catalogue = Catalogue(self.db)
-        copies = Copies(self.db)
-        self.queries = Queries(copies)
+        self.queries = Queries(self.catalogue.copies)
         self.computing = Computing(self.db)
-        self.words = Words(self.catalogue, copies)
+        self.words = Words(self.catalogue)
         self.notes = Notes(self.db, self.reader)
         self._environment = jinja2.Environment(
             loader=jinja2.FileSystemLoader(TEMPLATES),

@@ -103,33 +103,22 @@ def test_each_trial_has_its_account_by_which_it_is_counted_filtered_and_download
     assert [row["account"] for row in rows] == ["both insisted"] * 2
 
 
-def test_what_was_measured_once_is_measured_again_only_where_rows_or_rules_differ(
+def test_the_list_follows_the_database_beside_which_it_leaves_nothing_and_a_long_one_stands(
     accounts, tmp_path, monkeypatch
 ):
     path = shutil.copy(accounts, tmp_path / "t.duckdb")
-    stored, measured = path.read_bytes(), []
-    judge = catalogue_module.collision_class
-    monkeypatch.setattr(
-        catalogue_module, "collision_class", lambda *of: measured.append(of) or judge(*of)
+    stored, catalogue = path.read_bytes(), read(path)
+    assert (catalogue.refresh(), path.read_bytes(), [*tmp_path.iterdir()]) == (
+        False,
+        stored,
+        [path],
     )
-
-    def listed():
-        measured.clear()
-        rows = [{**row, "number": 0} for row in read(path).every({})]
-        return rows, len(measured)
-
-    rows, collisions = listed()
-    assert collisions > 3
-    assert path.read_bytes() == stored
-    assert listed() == (rows, 0)
+    before = catalogue.state
+    monkeypatch.setattr(catalogue_module, "MANY", 0)
     damage(path, "UPDATE decisions SET fallback = true WHERE trial_id LIKE 'o4/%'")
-    changed, measured_again = listed()
-    assert measured_again == 1
-    assert {row["validity"] for row in changed if row["model"] == "o4"} == {"fallbacks"}
-    monkeypatch.setattr(catalogue_module, "program", lambda: "other rules")
-    assert listed()[1] == collisions
-    catalogue_module.measured_beside(path).write_text("no Parquet")
-    assert listed()[1] == collisions
+    assert (catalogue.refresh(), catalogue.state) == (False, before)
+    assert (catalogue.refresh(at_once=True), catalogue.state == before) == (True, False)
+    assert {row["validity"] for row in catalogue.every({"model": "o4"})} == {"fallbacks"}
 
 
 @pytest.mark.parametrize(

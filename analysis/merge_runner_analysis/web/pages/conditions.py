@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from math import ceil, floor
-from pathlib import Path
 from typing import Any
 
 from merge_runner_analysis.web.pictures import Scale
-from merge_runner_analysis.web.reading import Row, reading, records
+from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.scope import carried, scope_of
 from merge_runner_analysis.web.site import NotThere, Site, news_of
 
@@ -17,6 +16,7 @@ from merge_runner_analysis.web.site import NotThere, Site, news_of
 MOST = 500
 # Sizes in the picture, in its units.
 WIDTH, LEFT, RIGHT, PANEL, BETWEEN, TOP, FOOT = 1000, 42, 8, 170, 34, 24, 42
+KEY = "trial_id", "spec_hash"
 CROSS = "m-5-5 10 10m0-10-10 10"
 # What is drawn of a trial, each as a list; the headway is that of the vehicle that went first.
 PANELS = {
@@ -75,7 +75,7 @@ def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
 
     Raises NotThere, and NothingNew as they were ``seen``.
     """
-    state = news_of(site.catalogue.state(), asked.get("seen", ""))
+    state = news_of(site.catalogue.state, asked.get("seen", ""))
     if not site.in_words(name):
         raise NotThere(f"there is no condition {name!r} here")
     bar = scope_of(site, asked, any_prompt=True)
@@ -83,11 +83,11 @@ def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     rows = site.catalogue.every(wanted)
     humans = site.catalogue.every({"condition": name, "who": "humans"})
     chosen = [rows[i * len(rows) // MOST] for i in range(MOST)] if len(rows) > MOST else rows
-    traces = {(row["trial_id"], row["spec_hash"]): row for row in _read(site.db, TRACES, chosen)}
+    traces = {(row["trial_id"], row["spec_hash"]): row for row in _read(site, TRACES, chosen)}
     drawn = [
         row | trace for row in chosen if (trace := traces.get((row["trial_id"], row["spec_hash"])))
     ]
-    band = _read(site.db, BAND, humans)
+    band = _read(site, BAND, humans)
     return site.render(
         "condition.html",
         here="",
@@ -163,8 +163,6 @@ def _path(row: Row, time: Scale, scales: Mapping[str, Scale]) -> str:
     return "".join(parts)
 
 
-def _read(db: Path, sql: str, trials: Sequence[Row]) -> list[Row]:
+def _read(site: Site, sql: str, trials: Sequence[Row]) -> list[Row]:
     """What a query finds of trials."""
-    keys = [[row[name] for row in trials] for name in ("trial_id", "spec_hash")]
-    with reading(db) as connection:
-        return records(connection, sql, keys)
+    return site.catalogue.ask(sql, *([row[name] for row in trials] for name in KEY))

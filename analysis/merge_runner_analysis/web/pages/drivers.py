@@ -24,8 +24,8 @@ from merge_runner_analysis.wording import DIFFERS, OPEN, SHOWN, UNLIKE
 
 # How attempts of a driver's trials with a prompt ended, and which model answered.
 ATTEMPTS = """
-SELECT served, outcome, count(*) AS times
-FROM tried SEMI JOIN (FROM listed WHERE model = ? AND variant = ?) USING (number)
+SELECT model_served AS served, outcome, count(*) AS times
+FROM calls SEMI JOIN (FROM listed WHERE model = ? AND variant = ?) USING (trial_id, spec_hash)
 GROUP BY ALL ORDER BY ALL
 """
 

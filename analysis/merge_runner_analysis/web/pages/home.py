@@ -67,7 +67,7 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
     bar = scope_of(site, asked)
     scope = bar.scope
     drivers, values = judged(site, bar, asked)
-    now = standing, site.catalogue.state(), site.catalogue.held, values["computed"].older
+    now = standing, site.catalogue.state, site.catalogue.held, values["computed"].older
     seen = news_of(now, asked.get("seen", ""))
     shown = [
         one

@@ -17,7 +17,6 @@ from merge_runner_analysis.web.computed import computed_table
 from merge_runner_analysis.web.marks import Mark
 from merge_runner_analysis.web.pages.home import Driver, judged
 from merge_runner_analysis.web.prompts import parts_of
-from merge_runner_analysis.web.reading import reading, records
 from merge_runner_analysis.web.scope import scope_of, unmarked
 from merge_runner_analysis.web.site import NotThere, Site
 
@@ -57,8 +56,7 @@ def prompts_page(site: Site, asked: Mapping[str, str]) -> str:
     for one in played:
         if unmarked(one.name) in chosen:
             driven.setdefault(one.name, []).append(one)
-    with reading(site.db) as connection:
-        texts = {row["variant"]: row["prompt"] for row in records(connection, FIRST, [BASELINE])}
+    texts = {row["variant"]: row["prompt"] for row in site.catalogue.ask(FIRST, BASELINE)}
     drivers, ends = differences(contrasts, chosen) if contrasts else ({}, {})
     return site.render(
         "prompts.html",

@@ -12,17 +12,18 @@ from typing import Any
 from merge_runner.audit.checks import not_judged
 from merge_runner.config import both_sides, pair_name
 from merge_runner.run.progress import Standing, read_standing
-from merge_runner_analysis.web.catalogue import MISSING, Catalogue, Wanted
+from merge_runner_analysis.web.catalogue import Catalogue, Wanted
 from merge_runner_analysis.web.computed import computed
 from merge_runner_analysis.web.computing import Job
+from merge_runner_analysis.web.listing import MISSING
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.scope import carried, scope_of
 from merge_runner_analysis.web.site import NothingNew, NotThere, Site, news_of
 
 CAUSES = """
-SELECT cause, count(*) AS trials, sum(times)::BIGINT AS times
-FROM causes SEMI JOIN (FROM members WHERE sweep = ?) USING (number)
-GROUP BY ALL ORDER BY trials DESC, cause
+SELECT value AS cause, count(*) AS trials, sum(times)::BIGINT AS times
+FROM several SEMI JOIN (FROM several WHERE facet = 'sweep' AND value = ?) USING (number)
+WHERE facet = 'cause' GROUP BY ALL ORDER BY trials DESC, cause
 """
 # Why a run ended early, by its exit code.
 REASONS = {
@@ -64,8 +65,8 @@ def list_runs(catalogue: Catalogue) -> list[Row]:
     runs: list[Row] = []
     # A run notes its end in the database before its file goes: one that seems to be lost may have
     # ended since the rows were read, by whoever refreshed the catalogue since.
-    for _ in range(2):
-        catalogue.refresh()
+    for is_sure in (False, True):
+        catalogue.refresh(at_once=is_sure)
         counted, newest, runs = numbers_of(catalogue, {}), dict[Any, str](), []
         for row in catalogue.ask("FROM sweeps ORDER BY started_at DESC, sweep_id DESC"):
             sweep_id, config = row["sweep_id"], json.loads(row["config"])
@@ -210,7 +211,7 @@ def sweeps_page(site: Site, asked: Mapping[str, str]) -> str:
         audit=audit_of(site, runs),
         trust=TRUST,
         duration=duration,
-        seen=news_of((runs, site.catalogue.state()), asked.get("seen", "")),
+        seen=news_of((runs, site.catalogue.state), asked.get("seen", "")),
     )
 
 
@@ -233,7 +234,7 @@ def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
         trust=TRUST,
         causes=site.catalogue.ask(CAUSES, sweep_id),
         duration=duration,
-        seen=news_of((run, site.catalogue.state()), seen, state),
+        seen=news_of((run, site.catalogue.state), seen, state),
         # A screen reader says the sentence once a state, and not every time that a number changes.
         quiet=seen.startswith(f"{state}-"),
         heard=bool(seen),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from operator import itemgetter
 from typing import Any
 
@@ -11,12 +11,13 @@ from markupsafe import Markup
 
 from merge_runner.llm.formats import reasoning_of
 from merge_runner.records import DAMAGED, reply_object
+from merge_runner.served_model import Pair
 from merge_runner.text_safety import quoted
 from merge_runner_analysis.web import views
 from merge_runner_analysis.web.display_text import clamped, shortened, visible
 from merge_runner_analysis.web.pictures import step_points
 from merge_runner_analysis.web.prompts import parts_of
-from merge_runner_analysis.web.reading import Row, reading
+from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.site import REPLAY, NotThere, Site
 
 # What is offered to lay beside a trial, and by what rule.
@@ -97,19 +98,24 @@ def find(site: Site, trial_id: str, asked: Mapping[str, str]) -> Row:
 def found(site: Site, trial_id: str, asked: Mapping[str, str]) -> tuple[Row, views.Trial]:
     """The trial that an address names, with what was stored of it; raises NotThere."""
     row = find(site, trial_id, asked)
-    with nullcontext(site.open) if site.open else reading(site.db) as connection:
-        return row, views.read_trial(connection, row["trial_id"], row["spec_hash"])
+    return row, read(site, row)
+
+
+def read(site: Site, row: Row) -> views.Trial:
+    """What was stored of a trial."""
+    with site.catalogue.cursor() as connection:
+        return views.read_trial(connection, row["trial_id"], row["spec_hash"])
 
 
 def panels(site: Site, row: Row, trial: views.Trial) -> list[Markup]:
     """Return the panels of all decisions of a trial, in the order of its ribbons."""
-    others = site.catalogue.ask("FROM others")
+    others = site.catalogue.others
     decisions = (d for mine in trial.by_side.values() for d in mine)
     return [decision_panel(site, row, trial, d, others) for d in decisions]
 
 
 def decision_panel(
-    site: Site, row: Row, trial: views.Trial, decision: Row, others: Sequence[Row]
+    site: Site, row: Row, trial: views.Trial, decision: Row, others: Sequence[Pair]
 ) -> Markup:
     """What a driver was told, said, planned and did; ``others`` are answers of another model."""
     named = {"side": decision["side"], "decision": decision["decision"]}
@@ -171,8 +177,7 @@ def named(site: Site, key: str) -> Row | None:
 
 
 def _laid(site: Site, row: Row) -> dict[str, Any] | None:
-    with reading(site.db) as connection:
-        trial = views.read_trial(connection, row["trial_id"], row["spec_hash"])
+    trial = read(site, row)
     if not trial.states:
         return None
     return {
@@ -184,7 +189,7 @@ def _laid(site: Site, row: Row) -> dict[str, Any] | None:
 
 def _nearest_human(site: Site, row: Row) -> tuple[str, str] | None:
     given = {"trial": row["trial_id"], "spec": row["spec_hash"], "condition": row["condition"]}
-    with reading(site.db) as connection:
+    with site.catalogue.cursor() as connection:
         return connection.execute(NEAREST, given).fetchone()
 
 

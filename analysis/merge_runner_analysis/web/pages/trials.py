@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from merge_runner_analysis.tables import TABLES
-from merge_runner_analysis.web.catalogue import FACETS, FACTOR, PAGE, SORTS, Wanted
+from merge_runner_analysis.web.catalogue import FACETS, PAGE, SORTS, Wanted
 from merge_runner_analysis.web.computed import awaited, computed
+from merge_runner_analysis.web.listing import FACTOR
 from merge_runner_analysis.web.pictures import sparkline, speed_range
 from merge_runner_analysis.web.scope import carried
 from merge_runner_analysis.web.search import LONGEST_QUERY, MOST_TERMS
@@ -22,7 +23,7 @@ HEADINGS = {"sweep": "run", "model": "driver", "variant": "prompt"}
 
 def trials_page(site: Site, asked: Mapping[str, str]) -> str:
     """One page of the trials that an address asks for; raises NothingNew as it was ``seen``."""
-    state = site.catalogue.state()
+    state = site.catalogue.state
     seen = news_of(state, asked.get("seen", ""))
     news = site.at.to("trials", **{**asked, "seen": seen})
     if "seen" in asked:  # that the trials are no longer those that were seen
