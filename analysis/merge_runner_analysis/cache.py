@@ -6,27 +6,28 @@ read-only disk, nothing is kept, and the next run computes them again.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 import sqlite3
 from collections.abc import Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
 import merge_runner
 import merge_runner_analysis
+from merge_runner.errors import UsageError
 from merge_runner.registry import in_use, plugin_sources, plugins
-from merge_runner.results.database import read_database
 
 KEPT = """
 CREATE TABLE IF NOT EXISTS finished (
     state TEXT NOT NULL, options TEXT NOT NULL, name TEXT NOT NULL, content TEXT NOT NULL
 )
 """
-# What tables are made of: all but prompts, texts, requests and replies.
+PACKAGES = (Path(merge_runner_analysis.__file__).parent, Path(merge_runner.__file__).parent)
+COMPUTING = {".py", ".sql", ".csv"}
+# What pages are made of: all but prompts, texts, requests and replies.
 ROWS = {
     "trials": "trials",
     "trial_factors": "trial_factors",
@@ -38,56 +39,48 @@ ROWS = {
     "sweep_trials": "sweep_trials",
     "views": "(FROM duckdb_views() SELECT sql WHERE database_name = current_database())",
 }
-LIBRARIES = ("duckdb", "jinja2", "matplotlib", "numpy", "pandas", "scipy", "statsmodels")
-PACKAGES = (Path(merge_runner_analysis.__file__).parent, Path(merge_runner.__file__).parent)
 PATIENCE_S = 0.5
 LOG = logging.getLogger(__name__)
 
 
-@cache
-def program() -> str:
-    """A hash of all that computes: our code, the published values, the libraries, the plug-ins.
-
-    Those of a study are not among them.
-    """
-    known = [f"{name} {version(name)}" for name in LIBRARIES]
-    for point in plugins():
-        release = f"{point.dist.name} {point.dist.version}" if point.dist else "of no distribution"
-        known.append(f"{release} {point.name} = {point.value}")
-    sources = [
-        path
-        for source in (*PACKAGES, *plugin_sources())
-        for path in (sorted(source.rglob("*")) if source.is_dir() else [source])
-        if path.suffix in {".py", ".sql", ".csv", ".html"}
-    ]
-    known += [f"{path.name} {hashlib.sha256(path.read_bytes()).hexdigest()}" for path in sources]
-    return hashlib.sha256("\n".join(known).encode()).hexdigest()
+def stamp_of(db: Path) -> tuple[int, ...]:
+    """Return what changes when a database does; raises UsageError where there is none."""
+    try:
+        stats = [db.stat()]
+    except FileNotFoundError:
+        raise UsageError(
+            f"there is no database {db}; `merge-runner sweep baseline` makes one, --db names "
+            "another"
+        ) from None
+    with suppress(FileNotFoundError):
+        stats.append(db.with_name(f"{db.name}.wal").stat())
+    return tuple(n for of in stats for n in (of.st_ino, of.st_mtime_ns, of.st_size))
 
 
 def present_state(db: Path) -> str:
-    """A hash of all that the tables of a database depend on: its rows and the program."""
-    # A sum of hashes does not depend on the order of rows, which DuckDB does not promise.
-    sums = " UNION ALL ".join(
-        f"SELECT '{name}', count(*), sum(hash(hash(one))::HUGEINT) FROM {rows} AS one"  # noqa: S608 # constants
-        for name, rows in ROWS.items()
-    )
-    with read_database(db) as connection:
-        found = sorted(connection.execute(sums).fetchall())
-    study = json.dumps([in_use().text, in_use().plugins])
-    return hashlib.sha256(f"{program()} {study}{found}".encode()).hexdigest()
+    """Return what the tables of a database depend on: its stamp, the program, a study's parts.
 
-
-def options_text(db: Path, **options: object) -> str:
-    """What a table depends on besides the results, as the options of a Study say it.
-
-    The path is among it, since notes name the database.
+    Raises UsageError where there is no database.
     """
-    given = {name: value for name, value in options.items() if value not in (None, False, "", {})}
-    return json.dumps([str(db), given], sort_keys=True)
+    return json.dumps([stamp_of(db), program(), in_use().text, in_use().plugins])
+
+
+@cache
+def program() -> str:
+    """Return the versions of the package and its plug-ins, and of their files the newest time.
+
+    Files of a checkout are edited under the same version.
+    """
+    releases = {point.dist.name: point.dist.version for point in plugins() if point.dist}
+    releases["merge-runner"] = version("merge-runner")
+    sources = (*PACKAGES, *plugin_sources())
+    files = [path for source in sources for path in (source, *source.rglob("*"))]
+    times = [path.stat().st_mtime_ns for path in files if path.suffix in COMPUTING]
+    return json.dumps([releases, len(times), max(times)], sort_keys=True)
 
 
 def finished(db: Path, made_of: str, options: str, names: Sequence[str]) -> dict[str, str]:
-    """The tables or figures that are kept of this state, by name."""
+    """Return the tables or figures that are kept of this state, by name."""
     if not Path(f"{db}.derived").exists():
         return {}
     query = "SELECT name, content FROM finished WHERE state = ? AND options = ?"

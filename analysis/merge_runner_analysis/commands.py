@@ -10,7 +10,7 @@ import re
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -33,6 +33,7 @@ from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, refuse_another_kind
 from merge_runner.text_safety import say
 from merge_runner_analysis.humans.commands import human_app
 from merge_runner_analysis.names import TableFormat
+from merge_runner_analysis.selection import Selection
 
 if TYPE_CHECKING:
     from merge_runner_analysis.study import Study
@@ -108,13 +109,13 @@ def tables(
     from merge_runner_analysis.tables.formats import render
 
     study = None
-    chosen: dict[str, Any] = {
-        "models": drivers(models),
-        "where": cli.levels(where or (), "--where") or None,
-        "file": study_file,
-        "by": by,
-        "without_fallbacks": without_fallbacks,
-    }
+    selection = Selection(
+        models=drivers(models),
+        where=cli.levels(where or (), "--where") or None,
+        file=study_file,
+        by=by,
+        without_fallbacks=without_fallbacks,
+    )
     if against is not None:
         from merge_runner_analysis.study import Study
         from merge_runner_analysis.tables.against import PAPER
@@ -122,8 +123,8 @@ def tables(
 
         if against != PAPER:
             raise UsageError(f"--against {against}: valid is {PAPER}")
-        study = Study(db, **chosen)
-    made = finished_tables(db, names or (), study, chosen)
+        study = Study(db, selection)
+    made = finished_tables(db, names or (), study, selection)
     if study is not None:
         made = [beside(table, study) for table in made]
     print_out(render(made, TableFormat.JSON if as_json else output, terminal_width()))
@@ -270,7 +271,8 @@ def _study(
     use_study(file, trust=trust)
     from merge_runner_analysis.study import Study
 
-    return Study(db, drivers(models), cli.levels(where or (), "--where") or None, file, by)
+    levels = cli.levels(where or (), "--where") or None
+    return Study(db, Selection(models=drivers(models), where=levels, file=file, by=by))
 
 
 def drivers(text: str | None) -> list[str] | None:

@@ -155,5 +155,5 @@ def _query(study: Study, group: Group, predicate: str, trials: tuple[str, ...]) 
 def _trials(study: Study, group: Group) -> duckdb.DuckDBPyConnection:
     """A connection in which ``trials`` are those of a group, with what became of their calls."""
     connection = duckdb.connect()
-    connection.register("trials", group.trials.merge(study.calls, "left", KEYS))
+    connection.register("trials", group.trials.merge(study.frames.calls, "left", KEYS))
     return connection

@@ -1,4 +1,4 @@
-"""Results as data frames: how they are read, and the frames of a study, which anybody may use.
+"""Results as data frames: single queries, and all that a study reads, in one opening of its file.
 
 A query that a single table, page or statistic needs stands beside it.
 """
@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
+from merge_runner.audit.checks import ASKED_DECISIONS
 from merge_runner.paths import DEFAULT_DB
 from merge_runner.results import frames
 from merge_runner.results.database import read_database
@@ -19,8 +20,9 @@ from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.served_model import other_models, sql_of
 from merge_runner.study.crossing import MODEL, PROMPT
 from merge_runner.text_safety import quoted
+from merge_runner_analysis.trials import judged, with_metrics
 
-# A trial that was driven to its end, as its ego sees it (see ``trial_drivers``): one whose ego sat
+# One row a trial, as its ego sees it (see ``trial_drivers``): one whose ego sat
 # on the right is mirrored, so that "left" is the ego everywhere, headway and relative velocity are
 # the ego's minus the other's, and the condition is the one with such numbers. Where only an ego on
 # the right has driven that, it is called after the one that was driven.
@@ -28,12 +30,11 @@ _PUBLISHED = ", ".join(
     f"({quoted(name)}, {one.projected_headway_m!r}::DOUBLE, {one.relative_velocity_mps!r}::DOUBLE)"
     for name, one in HUMAN_CONDITIONS.items()
 )
-_TRIALS = f"""
+TRIALS = f"""
 WITH placed AS (
     SELECT trials.*, driver, ego, ego = 'right' AS turned,
         (spec->>'$.mean_speed_mps')::DOUBLE AS mean_mps
     FROM trials JOIN trial_drivers USING (trial_id, spec_hash) LEFT JOIN specs USING (spec_hash)
-    WHERE {{which}}
 ), known (image, headway_m, velocity_mps, mean_mps, own) AS (
     SELECT *, NULL::DOUBLE, false FROM (VALUES {_PUBLISHED})
     UNION SELECT condition, projected_headway_m, relative_velocity_mps, mean_mps, true FROM placed
@@ -67,9 +68,6 @@ LEFT JOIN images ON turned AND headway_m = 0 - projected_headway_m
     AND images.mean_mps IS NOT DISTINCT FROM placed.mean_mps
 ORDER BY trial_id, spec_hash
 """  # noqa: S608 # constants
-TRIALS = _TRIALS.format(which="source <> 'seat'")
-# First situations that were only asked: equal columns, of trials that end before a second decision.
-ASKED_TRIALS = _TRIALS.format(which="source = 'seat'")
 # Of each driven trial that ended a hash of its states, as its ego sees them, and of what its
 # outcome and its gap depend on beside these: equal ones went the same way.
 TRACES = """
@@ -131,49 +129,26 @@ Order = Mapping[str, list[str]]
 
 
 def load(sql: str, db: Path | str = DEFAULT_DB) -> pd.DataFrame:
-    """The rows of one read-only query; raises UsageError."""
+    """Return the rows of one read-only query; raises UsageError."""
     return frames.load(Path(db), sql)
 
 
 def load_trials(db: Path | str = DEFAULT_DB) -> pd.DataFrame:
-    """One row a trial, as its ``ego`` sees it: condition, outcome and metrics in SI units.
+    """Return one row a trial, as its ``ego`` sees it: condition, outcome and metrics in SI units.
 
     See docs/reference/tables.md. A trial whose ego sat on the right is mirrored: its left is the
     ego's side. First situations that were only asked are left out.
     """
-    return load(TRIALS, db)
-
-
-def load_each(queries: Mapping[str, str], db: Path | str = DEFAULT_DB) -> dict[str, pd.DataFrame]:
-    """The rows of our own queries, by name; opening a database takes longer than most of them."""
-    with read_database(Path(db)) as connection:
-        return {name: frames.frame(connection.execute(sql)) for name, sql in queries.items()}
-
-
-def load_specs(db: Path | str = DEFAULT_DB) -> dict[str, dict[str, Any]]:
-    """The specs of all trials by their hash."""
-    rows = load_each({"specs": SPECS}, db)["specs"].itertuples()
-    return {row.spec_hash: json.loads(row.spec) for row in rows}
-
-
-def load_calls(db: Path | str = DEFAULT_DB) -> pd.DataFrame:
-    """Read what became of the calls: the rows of CALLS."""
-    with read_database(Path(db)) as connection:
-        sql = CALLS.format(answered=ANSWERED, others=sql_of(other_models(connection)))
-        trials = frames.frame(connection.execute(sql))
-    counts = [name for name in trials if name not in {"trial_id", "spec_hash", "failures"}]
-    return trials.fillna(dict.fromkeys(counts, 0))
+    return load(f"FROM ({TRIALS}) WHERE source <> 'seat'", db)
 
 
 class Studies(NamedTuple):
-    """The studies of a database.
-
-    ``trials`` has a row for each trial and study that it was played for; ``orders`` holds by study
-    the levels of each factor, in the order of the study.
-    """
+    """The studies of a database."""
 
     trials: pd.DataFrame
+    """A row for each trial and each run that it was played for: its key, sweep_id, study."""
     orders: Mapping[str, Order]
+    """By study the levels of each factor, in the order of the study."""
 
     def holds(self, study: str, frame: pd.DataFrame) -> pd.Series:
         """Return which rows of a frame are of trials that were played for a study."""
@@ -182,22 +157,57 @@ class Studies(NamedTuple):
         return pd.Series(held, index=frame.index)
 
 
-def read_studies(db: Path) -> Studies:
-    """Read the studies of a database from its sweeps."""
-    found = load_each({"sweeps": SWEEPS, "links": LINKS}, db)
+class Frames(NamedTuple):
+    """What a study reads of its database: nobody writes there until all of it is read."""
+
+    trials: pd.DataFrame
+    """TRIALS with a column for each metric and ``trace``, and whether they collided."""
+    asked: pd.DataFrame
+    """First situations that were only asked: of equal columns, of trials that end there."""
+    specs: Mapping[str, dict[str, Any]]
+    """By their hashes."""
+    studies: Studies
+    calls: pd.DataFrame
+    """CALLS: what became of the calls, by trial."""
+    decisions: pd.DataFrame
+    """ASKED_DECISIONS: how many are invalid, by trial and model."""
+    levels: pd.DataFrame
+    """The levels of factors, by trial."""
+
+
+def read_frames(db: Path) -> Frames:
+    """Read what a study needs, in one opening of the file; raises UsageError."""
+    with read_database(db) as connection:
+
+        def rows(sql: str) -> pd.DataFrame:
+            return frames.frame(connection.execute(sql))
+
+        specs = {row.spec_hash: json.loads(row.spec) for row in rows(SPECS).itertuples()}
+        calls = rows(CALLS.format(answered=ANSWERED, others=sql_of(other_models(connection))))
+        trials = with_metrics(connection, TRIALS).merge(rows(TRACES), on=KEYS, how="left")
+        asked = trials["source"] == "seat"
+        played = judged(connection, trials[~asked], specs)
+        studies = _studies(rows(SWEEPS), rows(LINKS))
+        decisions, levels = rows(ASKED_DECISIONS), rows("FROM trial_levels")
+    counts = calls.columns.drop([*KEYS, "failures"])
+    calls = calls.fillna(dict.fromkeys(counts, 0))
+    return Frames(played, trials[asked], specs, studies, calls, decisions, levels)
+
+
+def _studies(sweeps: pd.DataFrame, links: pd.DataFrame) -> Studies:
+    """Tell the studies of a database by its runs."""
     names: dict[str, str] = {}
     orders: dict[str, dict[str, list[str]]] = {}
-    for row in found["sweeps"].itertuples():
+    for row in sweeps.itertuples():
         order = json.loads(row.levels)
         names[row.sweep_id] = study_name(row.name.removesuffix(row.seat), order)
         known = orders.setdefault(names[row.sweep_id], {})
         for factor, levels in order.items():
             known[factor] = list(dict.fromkeys([*known.get(factor, ()), *levels]))
-    trials = found["links"].assign(study=found["links"]["sweep_id"].map(names))
-    return Studies(trials[[*KEYS, "study"]].drop_duplicates(), orders)
+    return Studies(links.assign(study=links["sweep_id"].map(names)), orders)
 
 
 def study_name(name: str, factors: Iterable[str]) -> str:
-    """``mood (opponent, temperature)``: studies of one name but other factors are others."""
+    """Return ``mood (opponent, temperature)``: studies of one name but other factors are others."""
     own = sorted({*factors} - {MODEL, PROMPT})
     return f"{name} ({', '.join(own)})" if own else name

@@ -234,8 +234,9 @@ def groups_of(
     trials: pd.DataFrame,
     specs: Mapping[str, Mapping[str, Any]],
     decisions: pd.DataFrame,
+    levels: pd.DataFrame,
 ) -> list[Group]:
-    """Groups by driver and variant, scripted stand-ins last; ``decisions`` are ASKED_DECISIONS.
+    """Return groups by driver and variant, scripted stand-ins last; the frames are a study's.
 
     Where a driver was run under several settings of the task, all but the most frequent carry a
     mark, the same for a baseline and its variants; likewise where a prompt was changed, and where
@@ -265,7 +266,8 @@ def groups_of(
         # later may be equal until then.
         only_asked = rows["source"].iloc[0] == "seat" and any(map(has_chance, own))
         programs = all(map(programs_alone, own)) and not only_asked
-        groups.append(_distinct(group, programs=programs))
+        group = _distinct(group, programs=programs)
+        groups.append(replace(group, levels=levels_of_group(levels, group)))
     return sorted(groups, key=lambda g: (g.scripted, g.driver, g.setting != BASELINE, g.setting))
 
 

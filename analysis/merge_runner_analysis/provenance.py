@@ -15,7 +15,7 @@ from merge_runner.records import NO_DECISION, SIDES
 from merge_runner.results import frames
 from merge_runner.results.database import read_database
 from merge_runner.served_model import other_models, sql_of
-from merge_runner_analysis.frames import ANSWERED, load_specs
+from merge_runner_analysis.frames import ANSWERED
 from merge_runner_analysis.grouping import Group, of_trials
 from merge_runner_analysis.study import Study
 
@@ -49,7 +49,7 @@ FROM (
 GROUP BY provider, model_requested, model_served ORDER BY ALL
 """
 SPECS = """
-SELECT DISTINCT driver, variant, spec_hash
+SELECT DISTINCT driver, variant, spec_hash, spec
 FROM specs JOIN trials USING (spec_hash) JOIN trial_drivers USING (trial_id, spec_hash)
 WHERE source NOT IN ('human', 'seat') ORDER BY ALL
 """
@@ -97,10 +97,9 @@ def provenance(db: Path) -> Provenance:
             frames.frame(connection.execute(sql)) for sql in (SWEEPS, CALLS, MODEL_COSTS, served)
         )
         played = connection.execute(SPECS).fetchall()
-    specs = load_specs(db)
     settings = {
-        f"{driver}/{variant} ({name})": ", ".join(dict.fromkeys(_settings(specs[name])))
-        for driver, variant, name in played
+        f"{driver}/{variant} ({name})": ", ".join(dict.fromkeys(_settings(json.loads(spec))))
+        for driver, variant, name, spec in played
     }
     return Provenance(sweeps, calls, model_costs, mismatches, settings)
 
@@ -114,7 +113,7 @@ def tally(study: Study, group: Group) -> Counter[str]:
     lack the tactical decision asked for. ``fallback`` counts the ``decisions`` that were driven
     from an older plan, or none.
     """
-    trials = of_trials(study.calls, group.trials)
+    trials = of_trials(study.frames.calls, group.trials)
     counts = {name: int(trials[name].sum()) for name in trials.select_dtypes("number")}
     found = Counter("\n".join(trials["failures"].dropna()).splitlines())
     counts |= {

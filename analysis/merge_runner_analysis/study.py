@@ -9,155 +9,137 @@ from pathlib import Path
 
 import pandas as pd
 
-from merge_runner.audit.checks import ASKED_DECISIONS
 from merge_runner.errors import UsageError, unknown_name
 from merge_runner.paths import DEFAULT_DB
 from merge_runner.registry import require
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.study.crossing import PROMPT, listed_levels
 from merge_runner.study.file import StudySource, read_study
-from merge_runner_analysis.cache import options_text, present_state
-from merge_runner_analysis.frames import (
-    ASKED_TRIALS,
-    KEYS,
-    LINKS,
-    TRACES,
-    Order,
-    Studies,
-    load,
-    load_calls,
-    load_each,
-    load_specs,
-    read_studies,
-    study_name,
-)
+from merge_runner_analysis.cache import present_state
+from merge_runner_analysis.frames import KEYS, Order, Studies, load, read_frames, study_name
 from merge_runner_analysis.grouping import (
     Group,
     groups_of,
     humans_of,
     in_human_conditions,
     levels_of,
-    levels_of_group,
-    of_trials,
 )
-from merge_runner_analysis.humans.imported import findings, human_trials, of_published_pairs
+from merge_runner_analysis.humans.imported import VELOCITY_PAGES, findings, of_published_pairs
 from merge_runner_analysis.names import BASELINE, HUMAN
 from merge_runner_analysis.published import HUMAN_TRIALS
 from merge_runner_analysis.remember import remembered
-from merge_runner_analysis.trials import judged, trials_with_metrics
+from merge_runner_analysis.selection import Selection
 
 ONLY_ASKED = " [asked]"  # ends the name of a driver that was only asked
+EVERYTHING = Selection()
 SPEC = ["spec_hash", "variant"]
-QUERIES = {
-    "asked": ASKED_TRIALS,
-    "decisions": ASKED_DECISIONS,
-    "levels": "FROM trial_levels",
-    "traces": TRACES,
-}
 # So many human trials in every condition make a reference; fewer are shown, but not compared with.
 ENOUGH_PER_CONDITION = 5
 
 
 class Study:
-    """The groups of a database, humans first, and what is computed from their traces once.
+    """The groups of a database, humans first, and what is computed of them once.
 
     ``played`` are those of drivers, and ``models`` the ones of them that something is concluded
     from, as ``unjudged`` are the others; ``asked`` and ``unjudged_asked`` are the same of drivers
-    that were only asked what they do first, each marked so by its name. ``findings`` say what to
-    know of imported humans. ``state`` is that of the results before they were read: rows may be
-    stored meanwhile.
+    that were only asked what they do first, each marked so by its name. ``state`` is that of the
+    results before they were read: rows may be stored meanwhile.
     """
 
-    def __init__(
-        self,
-        db: Path | str = DEFAULT_DB,
-        models: Sequence[str] | None = None,
-        where: Mapping[str, Sequence[str]] | None = None,
-        file: str | None = None,
-        by: str | None = None,
-        without_fallbacks: bool = False,
-        sweep: str = "",
-        condition: str = "",
-    ) -> None:
-        """Read the trials; ``models`` keeps these drivers alone, ``where`` these levels of factors.
-
-        ``file`` keeps the trials of this study, and ``by`` is the factor at whose levels the table
-        ``factors`` shows the others. ``without_fallbacks`` leaves out trials in which a decision
-        had no valid plan. ``sweep`` keeps the drivers' trials of this sweep, by its id, and
-        ``condition`` all trials of one condition. Raises UsageError.
-        """
-        self.db = Path(db)
-        self._frames: dict[str, pd.DataFrame] = {}
-        self.by = by
-        self.without_fallbacks = without_fallbacks
-        self.options = options_text(
-            self.db, models=models, where=where, file=file, by=by,
-            without_fallbacks=without_fallbacks, sweep=sweep, condition=condition,
-        )  # fmt: skip
+    def __init__(self, db: Path | str = DEFAULT_DB, selection: Selection = EVERYTHING) -> None:
+        """Read a database; raises UsageError, also where it holds nothing of a selection."""
+        self.db, self.selection = Path(db), selection
         self.state = present_state(self.db)
-        self.studies = read_studies(self.db)
-        self.source = None if file is None else read_study(file)
-        self.file, self.order = _chosen(self.db, self.studies, self.source)
-        self.specs = load_specs(self.db)
-        self._found = load_each(QUERIES, self.db)
-        trials = judged(self.db, trials_with_metrics(self.db))
-        recorded = trials["source"] == HUMAN
-        self.human = humans_of(of_published_pairs(trials[recorded]))
-        self.findings = [*findings(human_trials(self.db))] if recorded.any() else []
-        driven, asked = trials[~recorded], self._found["asked"]
-        if sweep:
-            driven = driven.merge(load(LINKS, self.db).query("sweep_id == @sweep")[KEYS])
-        if condition:
-            driven = driven[driven["condition"] == condition]
-            self.human = self.human.part(lambda rows: rows["condition"] == condition)
-        self._every = pd.concat([trials[SPEC], asked[SPEC]])
-        # Those that were only asked are chosen by the names of their models.
-        played = {group: group.driver for group in self._groups(driven)}
+        self.frames = read_frames(self.db)
+        self.source = None if selection.file is None else read_study(selection.file)
+        self.file, self.order = _chosen(self.db, self.frames.studies, self.source)
+        trials = self.frames.trials
+        self.human = self._part(humans_of(of_published_pairs(trials[trials["source"] == HUMAN])))
+        played = self._groups(self._driven(trials[trials["source"] != HUMAN]))
+        asked = self.frames.asked
         only_asked = self._groups(asked.assign(driver=asked["driver"] + ONLY_ASKED))
-        names = played | {group: group.name.removesuffix(ONLY_ASKED) for group in only_asked}
-        valid = dict.fromkeys([HUMAN, *names.values()])
-        wanted = list(valid) if models is None else models
-        for name in wanted or [""]:
-            if name not in valid:
-                raise unknown_name("driver", name, valid, f"in {self.db}")
-        kept = [group for group, name in names.items() if name in wanted]
-        if where:
-            kept = _at(where, kept, self.db, self.order)
+        wanted = self._wanted([*played, *only_asked])
         self.empty = not played
-        self.played = [group for group in kept if group in played]
+        self.played = [group for group in played if group in wanted]
         self.models = [group for group in self.played if not group.unjudged]
         self.unjudged = [group for group in self.played if group.unjudged]
-        only_asked = [group for group in kept if group not in played]
+        only_asked = [group for group in only_asked if group in wanted]
         self.asked = [group for group in only_asked if not group.unjudged]
         self.unjudged_asked = [group for group in only_asked if group.unjudged]
-        self.groups = [self.human] * (HUMAN in wanted) + self.models
+        with_human = selection.models is None or HUMAN in selection.models
+        self.groups = [self.human] * with_human + self.models
+
+    def _driven(self, trials: pd.DataFrame) -> pd.DataFrame:
+        """Return the chosen ones of drivers' trials, of a run and of a condition."""
+        sweep, condition = self.selection.sweep, self.selection.condition
+        if sweep:
+            links = self.frames.studies.trials
+            trials = trials.merge(links.loc[links["sweep_id"] == sweep, KEYS])
+        return trials[trials["condition"] == condition] if condition else trials
+
+    def _part(self, humans: Group) -> Group:
+        condition = self.selection.condition
+        return humans.part(lambda rows: rows["condition"] == condition) if condition else humans
 
     def _groups(self, trials: pd.DataFrame) -> list[Group]:
-        """The groups of these trials that were played for the study, if one was chosen."""
+        """Return the groups of these trials that were played for the study, if one was chosen."""
+        frames = self.frames
         if self.file:
-            trials = trials[self.studies.holds(self.file, trials)]
-        trials = trials.merge(self._found["traces"], on=KEYS, how="left")
-        return [
-            self._kept_trials(replace(group, levels=levels_of_group(self._found["levels"], group)))
-            for group in groups_of(trials, self.specs, self._found["decisions"])
-        ]
+            trials = trials[frames.studies.holds(self.file, trials)]
+        groups = groups_of(trials, frames.specs, frames.decisions, frames.levels)
+        return [*map(self._kept_trials, groups)]
 
     def _kept_trials(self, group: Group) -> Group:
-        """The group, perhaps without its trials that had a fallback; it is judged by all."""
-        if not self.without_fallbacks:
+        """Return the group, perhaps without its trials that had a fallback; all judge it."""
+        if not self.selection.without_fallbacks:
             return group
-        calls = of_trials(self.calls, group.trials)
+        calls = self.frames.calls
         fallen = _keys(calls[calls["fallback"] > 0])
         kept = group.part(lambda trials: pd.Series(~_keys(trials).isin(fallen), trials.index))
         if kept.trials.empty:
             return replace(group, unjudged=group.unjudged or "every trial had a fallback")
         return kept
 
+    def _wanted(self, groups: list[Group]) -> list[Group]:
+        """Return the groups of the chosen drivers, at the chosen levels of factors.
+
+        Those that were only asked are chosen by the names of their models.
+        """
+        names = {
+            group: group.name.removesuffix(ONLY_ASKED)
+            if group.name.endswith(ONLY_ASKED)
+            else group.driver
+            for group in groups
+        }
+        valid = dict.fromkeys([HUMAN, *names.values()])
+        wanted = [*valid] if self.selection.models is None else self.selection.models
+        for name in wanted or [""]:
+            if name not in valid:
+                raise unknown_name("driver", name, valid, f"in {self.db}")
+        kept = [group for group, name in names.items() if name in wanted]
+        where = self.selection.where
+        return _at(where, kept, self.db, self.order) if where else kept
+
+    @property
+    def options(self) -> str:
+        """What its tables depend on besides the results."""
+        return self.selection.key(self.db)
+
+    @cached_property
+    def findings(self) -> list[str]:
+        """What to know of imported humans."""
+        trials, specs = self.frames.trials, self.frames.specs
+        recorded = trials[trials["source"] == HUMAN]
+        of_pages = [specs.get(name, {}).get("origin") == VELOCITY_PAGES
+                    for name in recorded["spec_hash"]]  # fmt: skip
+        return [*findings(recorded.assign(of_pages=of_pages))] if len(recorded) else []
+
     def holds_more(self, group: Group) -> bool:
         """Whether the database has other trials with the specs and the prompt of a group."""
-        alike = self._every["spec_hash"].isin(group.trials["spec_hash"])
+        every = pd.concat([rows[SPEC] for rows in (self.frames.trials, self.frames.asked)])
+        alike = every["spec_hash"].isin(group.trials["spec_hash"])
         if group.setting:
-            alike &= self._every["variant"] == group.setting
+            alike &= every["variant"] == group.setting
         return int(alike.sum()) > len(group.trials)
 
     @property
@@ -209,16 +191,10 @@ class Study:
         """The groups whose speeds are known: all, but for humans before an import."""
         return [group for group in self.groups if group.measured]
 
+    @remembered
     def read(self, sql: str) -> pd.DataFrame:
-        """The rows of a query of ours, by trial or vehicle; it is run once."""
-        if sql not in self._frames:
-            self._frames[sql] = load(sql, self.db)
-        return self._frames[sql]
-
-    @cached_property
-    def calls(self) -> pd.DataFrame:
-        """What became of the calls, by trial."""
-        return load_calls(self.db)
+        """Return the rows of a query that a single table or figure needs, which is run once."""
+        return load(sql, self.db)
 
 
 def _keys(trials: pd.DataFrame) -> pd.MultiIndex:
@@ -229,7 +205,7 @@ def _keys(trials: pd.DataFrame) -> pd.MultiIndex:
 @remembered
 def in_one_study(study: Study, *groups: Group) -> bool:
     """Whether one study was played with all trials of these groups of drivers."""
-    known = study.studies
+    known = study.frames.studies
     return len(known.orders) < 2 or any(
         all(known.holds(name, group.trials).all() for group in groups) for name in known.orders
     )

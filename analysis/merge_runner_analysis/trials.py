@@ -10,17 +10,18 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from math import ceil, hypot
-from pathlib import Path
+from typing import Any
 
+import duckdb
 import pandas as pd
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
+from merge_runner.results.frames import frame
 from merge_runner.scenarios.merge.collision import rectangles_overlap
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.vehicle import advance
 from merge_runner.text_safety import first_line, quoted
-from merge_runner_analysis.frames import TRIALS, load_each, load_specs
 from merge_runner_analysis.metrics import JUDGED, LEFT_FIRST, METRICS, Metric
 from merge_runner_analysis.published import human_outcomes
 
@@ -45,30 +46,32 @@ FROM (
 Sample = tuple[int, float, float, float, float, float]
 
 
-def trials_with_metrics(db: Path) -> pd.DataFrame:
-    """The rows of ``load_trials`` with a column for each metric that is not JUDGED.
+def with_metrics(connection: duckdb.DuckDBPyConnection, trials: str) -> pd.DataFrame:
+    """Return the rows of a query of trials with a column for each metric that is not JUDGED.
 
-    Raises UsageError, also where the SQL of a metric fails.
+    Raises UsageError where the SQL of a metric fails.
     """
-    chosen = [metric for metric in METRICS.values() if metric.value not in JUDGED]
-    types = {metric.column: "boolean" if metric.rate else "float" for metric in chosen}
+    metrics = [metric for metric in METRICS.values() if metric.value not in JUDGED]
+    types = {metric.column: "boolean" if metric.rate else "float" for metric in metrics}
     try:
-        return _selected(db, chosen).astype(types)
-    except UsageError:
-        for metric in chosen:
+        return _selected(connection, trials, metrics).astype(types)
+    except duckdb.Error:
+        for metric in metrics:
             try:
-                _selected(db, [metric])
-            except UsageError as exc:
-                reason = first_line(exc.__cause__ or exc)
+                _selected(connection, trials, [metric])
+            except duckdb.Error as exc:
+                reason = first_line(exc)
                 raise UsageError(f"the SQL of the metric {metric.name} fails: {reason}") from exc
         raise
 
 
-def _selected(db: Path, metrics: list[Metric]) -> pd.DataFrame:
+def _selected(
+    connection: duckdb.DuckDBPyConnection, trials: str, metrics: list[Metric]
+) -> pd.DataFrame:
     columns = ", ".join(metric.selected for metric in metrics)
     # Subqueries of the metrics may have changed the order.
-    sql = f"SELECT *, {columns} FROM ({TRIALS}) AS trials ORDER BY trial_id, spec_hash"  # noqa: S608 # ours
-    return load_each({"trials": sql}, db)["trials"]
+    sql = f"SELECT *, {columns} FROM ({trials}) AS trials ORDER BY trial_id, spec_hash"  # noqa: S608 # ours
+    return frame(connection.execute(sql))
 
 
 def outcomes_with_metrics() -> pd.DataFrame:
@@ -78,23 +81,26 @@ def outcomes_with_metrics() -> pd.DataFrame:
     return outcomes.assign(**{LEFT_FIRST.column: left.where(outcomes["status"] == "finished")})
 
 
-def judged(db: Path, trials: pd.DataFrame) -> pd.DataFrame:
-    """The trials with whether they collided, by two rules; NA where that is undecided.
+def judged(
+    connection: duckdb.DuckDBPyConnection,
+    trials: pd.DataFrame,
+    specs: Mapping[str, Mapping[str, Any]],
+) -> pd.DataFrame:
+    """Return the trials with whether they collided, by two rules; NA where that is undecided.
 
     ``collided``: by the rule of their scenario, looked for at its steps; not of humans.
-    ``collided_boxes``: by the rule of the human experiment. ``trials`` are rows of ``load_trials``.
+    ``collided_boxes``: by the rule of the human experiment. ``trials`` are rows of TRIALS.
     """
     ended, human = trials["status"] != "failed", trials["source"] == "human"
     recorded = trials["status"].eq("collided").astype("boolean").where(ended)
-    specs = load_specs(db)
     tasks = {
         name: ScenarioConfig.model_validate(specs.get(name, {}).get("scenario", {}))
         for name in trials.loc[ended & ~human, "spec_hash"].unique()
     }
     overlapped = {
-        (row.trial_id, row.spec_hash)
-        for row in load_each({"near": _near(tasks)}, db)["near"].itertuples()
-        if _overlap(tasks[row.spec_hash], row.near)
+        (trial_id, spec_hash)
+        for trial_id, spec_hash, near in connection.execute(_near(tasks)).fetchall()
+        if _overlap(tasks[spec_hash], near)
     }
     keys = pd.MultiIndex.from_frame(trials[["trial_id", "spec_hash"]])
     boxes = pd.Series(keys.isin(overlapped), trials.index, dtype="boolean")

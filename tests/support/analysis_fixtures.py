@@ -8,6 +8,7 @@ from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.humans.archive import open_files
 from merge_runner_analysis.humans.load import import_trials, sort_files
+from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables import make_tables
 from tests.support.recordings import drive, write_folder
@@ -65,7 +66,7 @@ def small(tmp_path_factory):
 @pytest.fixture(scope="session")
 def tables(study):
     """All tables of the study by name; the verdicts are of one driver, which takes seconds."""
-    verdicts = make_tables(Study(study.db, ["other"]), ["verdicts"])
+    verdicts = make_tables(Study(study.db, Selection(["other"])), ["verdicts"])
     return {table.name: table for table in [*verdicts, *make_tables(study, QUICK)]}
 
 

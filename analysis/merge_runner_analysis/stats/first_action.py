@@ -93,7 +93,9 @@ def repeats_itself(study: Study, seat: Seat) -> bool:
     rows = _stored(study, seat)
     sat = np.where(rows["ego"] == seat.side, *SIDES)
     known = set(zip(rows["spec_hash"], sat, strict=True))
-    if not seat.side or any(has_chance(study.specs.get(name, {}), [side]) for name, side in known):
+    if not seat.side or any(
+        has_chance(study.frames.specs.get(name, {}), [side]) for name, side in known
+    ):
         return False
     ways = rows.groupby("condition")["first_mps2"]
     return bool((ways.size() > 1).any() and (ways.max() - ways.min() < SAME_MPS2).all())

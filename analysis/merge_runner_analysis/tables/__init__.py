@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from merge_runner.errors import unknown_name
 from merge_runner.registry import in_use_for, using
-from merge_runner_analysis.cache import (
-    finished,
-    keep_finished,
-    options_text,
-    present_state,
-)
+from merge_runner_analysis.cache import finished, keep_finished, present_state
+from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.tables.formats import names_of, value_rows
 from merge_runner_analysis.tables.model import Row, Table, from_text, to_text
 
@@ -98,15 +94,15 @@ def finished_tables(
     db: Path,
     names: Sequence[str] = (),
     study: Study | None = None,
-    options: Mapping[str, Any] | None = None,
+    selection: Selection | None = None,
 ) -> list[Table]:
     """The named tables of a database, or all: read where they are kept, else computed.
 
-    ``options`` are those of a Study; ``study`` stands in their place, if the caller already has it.
+    ``study`` stands in the place of a ``selection``, if the caller already has it.
     Raises UsageError for an unknown name.
     """
-    wanted, options = _valid(names), options or {}
-    chosen = study.options if study else options_text(db, **options)
+    wanted, selection = _valid(names), selection or Selection()
+    chosen = study.options if study else selection.key(db)
     state = study.state if study else present_state(db)
     kept = finished(db, state, chosen, wanted)
     found = {name: from_text(text) for name, text in kept.items()}
@@ -115,7 +111,7 @@ def finished_tables(
     if missing:
         from merge_runner_analysis.study import Study
 
-        study = study or Study(db, **options)
+        study = study or Study(db, selection)
         made = dict(zip(missing, make_tables(study, missing), strict=True))
         # The state is the one before the study was read: trials stored since then outdate it.
         keep_finished(db, study.state, chosen, {name: to_text(made[name]) for name in missing})

@@ -55,7 +55,7 @@ def factors(study: Study) -> Table:
 
     Where the study is shown by a factor, each of its levels has rows of its own, and interactions.
     """
-    by = study.by or ""
+    by = study.selection.by or ""
     shown = require(levels_of(study.models, study.order), "factor", by) if by else [""]
     found = [levels for at in shown for levels in levels_by_factor(study, by, at)]
     rows = [

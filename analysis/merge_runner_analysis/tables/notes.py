@@ -38,11 +38,11 @@ def _of_trials(table: Table, study: Study) -> Iterator[str]:
         yield f"{study.db} holds no trial of a model; `merge-runner sweep baseline` plays some"
     if left_out := [f"{g.id} {g.left_out}" for g in groups if g.left_out != "none"]:
         yield f"trials that did not finish: {'; '.join(left_out)}"
-    if study.without_fallbacks:
+    if study.selection.without_fallbacks:
         yield "trials in which a decision had a fallback are left out (--without-fallbacks)"
     driven = [group.trials for group in groups if group.setting]
     if driven and not study.file:
-        known, trials = study.studies, pd.concat(driven)
+        known, trials = study.frames.studies, pd.concat(driven)
         sizes = {name: int(known.holds(name, trials).sum()) for name in known.orders}
         pooled = [f"{name} ({n} trials)" for name, n in sizes.items() if n]
         if len(pooled) > 1:

@@ -15,7 +15,8 @@ from merge_runner.errors import UsageError
 from merge_runner.results.database import read_database
 from merge_runner.results.store import results_digest
 from merge_runner.text_safety import first_line
-from merge_runner_analysis.cache import finished, keep_finished, options_text, present_state
+from merge_runner_analysis.cache import finished, keep_finished, present_state
+from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.tables.model import from_text, to_text
 from merge_runner_analysis.web.reading import stamp_of
@@ -83,7 +84,7 @@ class Numbers:
 
     def _kept(self, name: str, make: Callable[[], str], options: str = "") -> str:
         """Return what is kept of the present state under a name; else it is made, and kept."""
-        options = options or options_text(self.db)
+        options = options or Selection().key(self.db)
         kept = finished(self.db, self._state, options, [name])
         if not kept:
             kept = {name: make()}
@@ -92,15 +93,15 @@ class Numbers:
 
     def _table(self, name: str, sweep: str = "", condition: str = "") -> str:
         """Return a table of all trials, or of those of a sweep and a condition."""
+        selection = Selection(sweep=sweep, condition=condition)
 
         def make() -> str:
             from merge_runner_analysis.study import Study
 
-            is_part = sweep or condition
-            study = Study(self.db, sweep=sweep, condition=condition) if is_part else self.study
+            study = Study(self.db, selection) if sweep or condition else self.study
             return to_text(make_tables(study, [name])[0])
 
-        return self._kept(name, make, options_text(self.db, sweep=sweep, condition=condition))
+        return self._kept(name, make, selection.key(self.db))
 
     def _audit(self) -> str:
         """Return what the audit of each run found and notes, by its id; nothing is replayed."""

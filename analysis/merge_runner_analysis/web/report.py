@@ -23,7 +23,7 @@ from merge_runner_analysis.cache import finished, keep_finished
 from merge_runner_analysis.explain import Source, sources_of, sql_command
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.figures.gallery import rendered, write_figures
-from merge_runner_analysis.frames import load_each
+from merge_runner_analysis.frames import load
 from merge_runner_analysis.grouping import levels_of
 from merge_runner_analysis.names import BASELINE, DESCRIPTIONS, TableFormat
 from merge_runner_analysis.provenance import Provenance, provenance, tally
@@ -155,11 +155,11 @@ def design(study: Study) -> tuple[list[str], dict[str, list[str]], dict[str, str
     The levels are those of each factor, the conditions and the trials; prompts have by title the
     text of the first one, of variants the lines that differ from the baseline's.
     """
-    found = load_each({"descriptions": DESCRIPTIONS, "prompts": PROMPTS}, study.db)
+    described, shown_to = load(DESCRIPTIONS, study.db), load(PROMPTS, study.db)
     played, levels = study.played, levels_of(study.played, study.order)
     levels.pop("model", None)  # the drivers say it
     specs = {name for group in played for name in group.trials["spec_hash"]}
-    prompts = found["prompts"][found["prompts"]["spec_hash"].isin(specs)]
+    prompts = shown_to[shown_to["spec_hash"].isin(specs)]
     texts = dict(zip(prompts["variant"], prompts["prompt"], strict=True))
     baseline = texts.get(BASELINE)
     shown = {}
@@ -169,7 +169,7 @@ def design(study: Study) -> tuple[list[str], dict[str, list[str]], dict[str, str
             title, text = f"{title}: against the baseline", _changes(baseline, text)
         shown[title] = text
     return (
-        list(found["descriptions"]["description"])
+        list(described["description"])
         if study.source is None
         else [study.source.file.description] * bool(study.source.file.description),
         {

@@ -1,7 +1,9 @@
 """What is kept beside the database: equal to what is computed anew, and renewed when it must be."""
 
+import os
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,14 +11,10 @@ import pytest
 
 from merge_runner.errors import UsageError
 from merge_runner_analysis import cache
-from merge_runner_analysis.cache import (
-    finished,
-    keep_finished,
-    options_text,
-    present_state,
-)
+from merge_runner_analysis.cache import finished, keep_finished, present_state
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.names import TableFormat
+from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables import TABLES, finished_tables
 from merge_runner_analysis.tables.formats import render
@@ -40,7 +38,6 @@ CHANGES = {
     "two trials' outcomes": "UPDATE trials SET merged_first = "
     "if(merged_first = 'left', 'right', 'left') WHERE condition IN ('L_4_0', 'R_-4_0')",
 }
-UNSEEN = ("UPDATE decisions SET prompt = 'other'", "UPDATE calls SET reply = '{}'")
 
 
 @pytest.fixture(scope="module")
@@ -60,17 +57,17 @@ def mark(db, name="attempts"):
     """Make a table, and mark the one that is kept."""
     (table,) = finished_tables(db, [name])
     state = present_state(db)
-    kept = from_text(finished(db, state, options_text(db), [name])[name])
+    kept = from_text(finished(db, state, Selection().key(db), [name])[name])
     assert to_text(kept) == to_text(table)
     kept.notes.append("kept")
     db.with_name(f"{db.name}.derived").unlink()
-    keep_finished(db, state, options_text(db), {name: to_text(kept)})
+    keep_finished(db, state, Selection().key(db), {name: to_text(kept)})
     return state
 
 
-def is_read(db, study=None, **options) -> bool:
+def is_read(db, study=None, **selection) -> bool:
     """Whether the marked table is read, and not made anew."""
-    (table,) = finished_tables(db, ["attempts"], study, options)
+    (table,) = finished_tables(db, ["attempts"], study, Selection(**selection))
     return "kept" in table.notes
 
 
@@ -97,13 +94,12 @@ def test_tables_are_made_once_beside_the_database_and_then_read(db):
     with pytest.raises(UsageError, match="unknown table 'gaps'"):
         finished_tables(db, ["gaps"])
     with pytest.raises(UsageError, match="unknown driver 'o4'"):
-        finished_tables(db, ["attempts"], options={"models": ["o4"]})
+        finished_tables(db, ["attempts"], selection=Selection(["o4"]))
 
 
 def test_after_any_change_of_the_results_tables_are_made_anew(db):
     states = [mark(db)]
     study = Study(db)
-    damage(db, *UNSEEN)
     assert present_state(db) == states[0]
     for change in CHANGES.values():
         damage(db, change)
@@ -112,23 +108,25 @@ def test_after_any_change_of_the_results_tables_are_made_anew(db):
     assert not is_read(db)
     # What was read before the change is not kept for the state after it.
     finished_tables(db, ["criticality"], study)
-    assert finished(db, states[-1], options_text(db), ["criticality"]) == {}
+    assert finished(db, states[-1], Selection().key(db), ["criticality"]) == {}
     # Nor does it take a table of the later state.
     mark(db)
     assert not is_read(db, study)
     assert is_read(db)
 
 
-def test_the_program_is_told_by_its_code_its_values_and_its_libraries(tmp_path, monkeypatch):
+def test_the_program_is_told_by_its_code_and_its_values(tmp_path, monkeypatch):
     program = cache.program.__wrapped__  # it is remembered as long as the process lives
     monkeypatch.setattr(cache, "PACKAGES", (tmp_path,))
-    found = set()
-    for name, text in (("a.py", "x = 1"), ("a.py", "x = 2"), ("b.csv", "1")):
+    found = [program()]
+    for name, text in (("b.csv", "1"), ("a.py", "x = 1"), ("a.py", "x = 2")):
         (tmp_path / name).write_text(text)
-        found.add(program())
-    monkeypatch.setattr(cache, "LIBRARIES", ("pytest",))
-    found.add(program())
-    assert len(found) == 4
+        later_ns = time.time_ns() + 10**9 * len(found)
+        os.utime(tmp_path / name, ns=(later_ns, later_ns))
+        found.append(program())
+    (tmp_path / "b.csv").unlink()
+    found.append(program())
+    assert len({*found}) == 5
 
 
 def test_what_cannot_be_kept_is_made_and_said_once(db, caplog):
@@ -152,7 +150,8 @@ def test_a_warm_table_waits_for_no_heavy_library(db):
     check = (
         "import sys; from merge_runner_analysis.commands import app; "
         "app(['tables', 'gap', '--db', sys.argv[1]], standalone_mode=False); "
-        "heavy = {'pandas', 'scipy', 'statsmodels', 'matplotlib', 'numpy'} & sys.modules.keys(); "
+        "heavy = {'duckdb', 'pandas', 'scipy', 'statsmodels', 'matplotlib', 'numpy'}; "
+        "heavy &= sys.modules.keys(); "
         "assert not heavy, heavy"
     )
     finished_tables(db, ["gap"])

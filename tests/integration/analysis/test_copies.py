@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 
 from merge_runner_analysis.explain import explain
+from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import Study
 from tests.support.studies import changed, write_study, yielding
 from tests.support.tables import by_id, made, notes_with
@@ -44,8 +45,8 @@ def factors(db):
     return made(Study(db), "factors")
 
 
-def rows(name, *args, **options):
-    return by_id(made(Study(*args, **options), name))
+def rows(name, db, *args, **options):
+    return by_id(made(Study(db, Selection(*args, **options)), name))
 
 
 def test_a_level_counts_each_trial_of_a_program_once(db, factors):

@@ -10,6 +10,7 @@ from statsmodels.stats.multitest import multipletests
 from merge_runner.errors import UsageError
 from merge_runner_analysis.commands import drivers
 from merge_runner_analysis.explain import explain
+from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.stats.factors import levels_by_factor
 from merge_runner_analysis.study import Study
 from tests.support.crossed_study import PLUGIN
@@ -78,7 +79,7 @@ def test_two_mean_speeds_of_one_condition_are_never_pooled(copy):
 
 
 def test_where_keeps_the_trials_of_these_levels_and_names_the_valid_ones(played):
-    kept = Study(played.db, where={"temperature": ["0.2"], "model": ["cheap"]})
+    kept = Study(played.db, Selection(where={"temperature": ["0.2"], "model": ["cheap"]}))
     assert [group.driver for group in kept.models] == ["cheap [temperature=0.2]", CHEAP_COLD]
     assert kept.groups[0].id == "human"
     for where, says in (
@@ -87,7 +88,7 @@ def test_where_keeps_the_trials_of_these_levels_and_names_the_valid_ones(played)
         ({"model": ["dear"], "opponent": ["sleepy"]}, "no trial with model=dear and opponent="),
     ):
         with pytest.raises(UsageError, match=says):
-            Study(played.db, where=where)
+            Study(played.db, Selection(where=where))
     for level, other in (("0.2", "1.0"), ("1.0", "0.2")):  # the first is kept, and not shown
         out = played.run("tables", "ablation-quantitative", "--where", f"temperature={level}").out
         assert f"cheap [temperature={level}]" in out
@@ -124,7 +125,7 @@ def test_a_level_is_compared_with_the_reference_of_the_study(played, rows, tmp_p
     (tmp_path / "mine.py").write_text(PLUGIN)
     file = tmp_path / "mine.toml"
     file.write_text('reference = { temperature = 0.2, model = "dear" }\n' + text)
-    chosen = values_of(Study(played.db, file=str(file)), "factors")
+    chosen = values_of(Study(played.db, Selection(file=str(file))), "factors")
     assert rows["temperature=0.2/gap_m"]["difference"] == pytest.approx(
         -chosen["temperature=1.0/gap_m"]["difference"]
     )
@@ -160,7 +161,7 @@ def test_a_comparison_has_one_corrected_p_wherever_it_is_printed(tmp_path):
 
 
 def test_factors_are_shown_at_each_level_of_another_one_with_interactions(played):
-    study = Study(played.db, by="opponent")
+    study = Study(played.db, Selection(by="opponent"))
     table = made(study, "factors")
     rows = {row.id: row.values for row in table.rows}
     at_self, at_sleepy = (rows[f"opponent={n}/temperature=0.2/gap_m"] for n in ("self", "sleepy"))
@@ -185,7 +186,7 @@ def test_an_interaction_is_the_difference_of_the_differences_in_shared_cells(tmp
         "INSERT INTO trial_factors SELECT trial_id, spec_hash, 'mood', "
         "if(rep % 2 = 0, 'late', 'early') FROM trials",
     )
-    rows = values_of(Study(moody.db, by="mood"), "factors")
+    rows = values_of(Study(moody.db, Selection(by="mood")), "factors")
     late, early = (rows[f"mood={m}/prompt=A1/gap_m"]["difference"] for m in ("late", "early"))
     found = rows["mood=late/prompt=A1/interaction/gap_m"]
     assert found["difference"] == pytest.approx(late - early)
@@ -194,7 +195,7 @@ def test_an_interaction_is_the_difference_of_the_differences_in_shared_cells(tmp
     assert low < found["difference"] < high
     assert (found["p"] < 0.05) == (low > 0 or high < 0)
     # By the other factor it is the same.
-    turned = values_of(Study(moody.db, by="prompt"), "factors")
+    turned = values_of(Study(moody.db, Selection(by="prompt")), "factors")
     same = turned["prompt=A1/mood=late/interaction/gap_m"]["difference"]
     assert same == pytest.approx(found["difference"])
 

@@ -8,6 +8,7 @@ import pytest
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.frames import load
 from merge_runner_analysis.provenance import provenance
+from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.tables.formats import value_rows
@@ -52,7 +53,7 @@ def test_a_driver_is_named_by_its_endpoint_unless_that_is_the_providers_own(tmp_
         changed(db, f"UPDATE specs SET spec = '{spec}' WHERE spec_hash = '{name}-baseline'")
     names = {group.driver for group in Study(db).models}
     assert names == {"o3", "a at localhost:8080", "b at gateway.example"}
-    (chosen,) = Study(db, ["a at localhost:8080"]).models
+    (chosen,) = Study(db, Selection(["a at localhost:8080"])).models
     assert chosen.id == "a at localhost:8080/baseline"
 
 

@@ -7,6 +7,7 @@ import pytest
 from merge_runner.audit.checks import not_judged
 from merge_runner.run.stored_replay import audit_database
 from merge_runner_analysis.provenance import provenance
+from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.web.pages.prompts import differences
@@ -64,7 +65,7 @@ def test_tables_show_it_without_a_value_and_the_rest_as_if_it_were_not_there(mix
 
 
 def test_report_and_audit_say_that_it_is_not_judged_and_conclude_nothing(mixed):
-    table = made(Study(mixed, where={"prompt": ["baseline", "A1"]}), "verdicts")
+    table = made(Study(mixed, Selection(where={"prompt": ["baseline", "A1"]})), "verdicts")
     assert "bad" not in table.notes[0]
     ((title, text),) = alarms(Study(mixed), provenance(mixed)).items()
     assert title == "Too few valid decisions"

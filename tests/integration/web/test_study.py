@@ -12,6 +12,7 @@ import pytest
 
 from merge_runner.results.store import query
 from merge_runner_analysis.names import TableFormat
+from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables import formats, make_tables
 from merge_runner_analysis.tables.model import from_text
@@ -151,7 +152,8 @@ def test_the_scope_is_in_the_address_and_every_number_obeys_it(client, db):
     assert collisions["n"] + (collisions["undecided"] or 0) == 2
     assert rows["human"]["collisions"]["n"] == 90
     numbers = [
-        [len(group.trials) for group in Study(db, sweep=s).played] for s in ("sweep-1", "no")
+        [len(group.trials) for group in Study(db, Selection(sweep=s)).played]
+        for s in ("sweep-1", "no")
     ]
     assert numbers == [[21, 11, 11], []]
 

@@ -12,6 +12,7 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.frames import load, load_trials
 from merge_runner_analysis.metrics import BOXES, RMSE, SURROGATES, register
+from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.stats.measures import counts, estimate
 from merge_runner_analysis.study import Study
 from tests.support.studies import Drive, played, write_study, yielding
@@ -197,7 +198,7 @@ def test_the_trials_of_a_share_are_those_that_it_is_found_in(added, imported):
     driven = added(
         name="driven_percent", estimator="proportion", trials="ended", value="end_time_s > 0"
     )
-    human = Study(imported.db, ["human"]).human
+    human = Study(imported.db, Selection(["human"])).human
     assert counts(human, driven) == (66, 66)
     assert counts(human, BOXES) == (28, 990)
 

@@ -12,6 +12,7 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.figures.gallery import figure_of_first_actions
 from merge_runner_analysis.frames import load
+from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.web.catalogue import Catalogue
 from tests.support.studies import Drive, changed, write_study
@@ -176,13 +177,13 @@ def test_who_was_only_asked_has_rows_beside_who_drove_with_the_same_first_action
 
 def test_drivers_and_levels_that_were_only_asked_can_be_chosen(asked):
     db = asked / "t.duckdb"
-    narrowed = made(Study(db, ["emulator"]), "first-action").rows
+    narrowed = made(Study(db, Selection(["emulator"])), "first-action").rows
     assert {row.groups[0] for row in narrowed} == {"emulator/baseline", "emulator [asked]/baseline"}
-    of_model = Study(asked / "grid.duckdb", where={"model": ["projected-order"]})
+    of_model = Study(asked / "grid.duckdb", Selection(where={"model": ["projected-order"]}))
     assert [group.name for group in of_model.asked] == ["projected-order [asked]"]
     assert of_model.models == []
     with pytest.raises(UsageError, match=r"valid: human, emulator, .*projected-order"):
-        Study(db, ["idm"])
+        Study(db, Selection(["idm"]))
 
 
 def test_the_planted_exchange_rate_of_who_was_only_asked_is_found_beside_the_humans(asked):

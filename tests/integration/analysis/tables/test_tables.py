@@ -15,6 +15,7 @@ from merge_runner_analysis.explain import explain
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.metrics import METRICS
 from merge_runner_analysis.names import TableFormat
+from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.stats.indicators import score
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables import TABLES, make_tables
@@ -219,12 +220,12 @@ def test_another_task_leaves_a_baseline_and_its_variants_together(tmp_path):
 def test_models_can_be_chosen_and_an_unknown_one_names_the_valid(tmp_path):
     drives = [yielding(name, reps=1)[0] for name in ("o3", "other")]
     db = write_study(tmp_path / "t.duckdb", drives)
-    assert [group.id for group in Study(db, ["other"]).groups] == ["other/baseline"]
+    assert [group.id for group in Study(db, Selection(["other"])).groups] == ["other/baseline"]
     with pytest.raises(UsageError, match="valid: human, o3, other"):
-        Study(db, ["gpt"])
+        Study(db, Selection(["gpt"]))
     with pytest.raises(UsageError, match="unknown driver"):
-        Study(db, [])
-    assert not notes_with(made(Study(db, ["human"]), "gap"), "holds no trial")
+        Study(db, Selection([]))
+    assert not notes_with(made(Study(db, Selection(["human"])), "gap"), "holds no trial")
 
 
 # Explain

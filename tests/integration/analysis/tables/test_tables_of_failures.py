@@ -9,6 +9,7 @@ import pytest
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.frames import load
 from merge_runner_analysis.provenance import tally
+from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import Study
 from tests.support.studies import Drive, Said, changed, write_study, yielding
 from tests.support.tables import by_id, made, notes_with, values_of
@@ -61,7 +62,7 @@ def test_a_missing_decision_has_a_count_of_its_own_and_is_not_invalid(tmp_path):
     for column, trials in (("no_decision", 2), ("invalid", 1), ("fallback", 1)):
         (source,) = explain(study, table, f"o3/baseline:{column}").sources
         assert len(source.numerator) == trials, column
-    without = Study(study.db, without_fallbacks=True)
+    without = Study(study.db, Selection(without_fallbacks=True))
     assert len(without.models[0].trials) == len(drives) - 1
     # One id may stand under several specs: the copy without the fallback stays.
     changed(
@@ -71,7 +72,7 @@ def test_a_missing_decision_has_a_count_of_its_own_and_is_not_invalid(tmp_path):
             for name in ("trials", "states")
         ),
     )
-    kept = Study(study.db, without_fallbacks=True).models
+    kept = Study(study.db, Selection(without_fallbacks=True)).models
     assert sorted(len(group.trials) for group in kept) == [len(drives) - 1, len(drives)]
 
 
@@ -92,7 +93,7 @@ def biased(tmp_path_factory):
 def test_failures_that_bias_the_outcomes_are_seen_without_them(biased):
     values = {}
     for without in (False, True):
-        study = Study(biased, without_fallbacks=without)
+        study = Study(biased, Selection(without_fallbacks=without))
         indicators = made(study, "indicators")
         rows = by_id(indicators)
         collided = rows["o3/baseline/collided_percent"].values
@@ -106,7 +107,7 @@ def test_failures_that_bias_the_outcomes_are_seen_without_them(biased):
 
 
 def test_a_driver_whose_every_trial_had_a_fallback_has_a_row_that_says_so(study):
-    kept = Study(study.db, without_fallbacks=True)
+    kept = Study(study.db, Selection(without_fallbacks=True))
     sizes = {group.id: len(group.trials) for group in kept.models}
     assert sizes == {"o3/baseline": 110, "o3/A1": 49, "other/baseline": 44}
     assert [group.id for group in kept.unjudged] == ["o3/A2"]
