@@ -15,7 +15,7 @@ import pandas as pd
 from merge_runner.audit.checks import ASKED_DECISIONS
 from merge_runner.paths import DEFAULT_DB
 from merge_runner.results import frames
-from merge_runner.results.database import read_database
+from merge_runner.results.database import limit_memory, read_database
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.served_model import other_models, sql_of
 from merge_runner.study.crossing import MODEL, PROMPT
@@ -133,6 +133,13 @@ def load(sql: str, db: Path | str = DEFAULT_DB) -> pd.DataFrame:
     return frames.load(Path(db), sql)
 
 
+def read(db: Path, sql: str) -> pd.DataFrame:
+    """Return the rows of a query of ours; its lists are arrays. Raises UsageError."""
+    with read_database(db) as connection:
+        limit_memory(connection)
+        return connection.execute(sql).df()
+
+
 def load_trials(db: Path | str = DEFAULT_DB) -> pd.DataFrame:
     """Return one row a trial, as its ``ego`` sees it: condition, outcome and metrics in SI units.
 
@@ -178,6 +185,7 @@ class Frames(NamedTuple):
 def read_frames(db: Path) -> Frames:
     """Read what a study needs, in one opening of the file; raises UsageError."""
     with read_database(db) as connection:
+        limit_memory(connection)
 
         def rows(sql: str) -> pd.DataFrame:
             return frames.frame(connection.execute(sql))

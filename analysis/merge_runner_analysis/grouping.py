@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from math import inf
-from typing import Any
+from typing import Any, NewType
 
 import pandas as pd
 
@@ -24,58 +24,56 @@ from merge_runner_analysis.drivers import (
     stand_in,
     unresponsive,
 )
-from merge_runner_analysis.frames import (
-    KEYS,
-    Order,
-)
+from merge_runner_analysis.frames import KEYS, Order
 from merge_runner_analysis.names import BASELINE, HUMAN
 from merge_runner_analysis.published import HUMAN_TRIALS
 from merge_runner_analysis.trials import outcomes_with_metrics
 
 MEAN_SPEED = "mean_speed_mps"
+Reason = NewType("Reason", str)
+Sentence = NewType("Sentence", str)
 # Factors that every study has, and levels that others are compared with.
 FIRST = (MODEL, PROMPT)
 USUAL = (BASELINE, DEFAULT, SELF)
 NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Group:
-    """Trials of equal drivers, prompts and parameters.
+    """Trials of equal drivers, prompts and parameters."""
 
-    ``trials`` are rows of ``load_trials``; for humans before an import only the outcomes that are
-    published, and ``measured`` is False. ``setting`` is the prompt variant, empty for humans.
-    ``spec_hash`` is that of its trials, or of those at the usual mean speed where a condition has
-    another. ``levels`` are those of its study's factors, and its model and prompt, by factor.
-    ``driver`` is its ``name`` with the ``mark`` that tells it from itself under other settings, and
-    with ``[scripted]`` where a stand-in answered only some of its trials. ``label`` is how tables
-    name the driver, ``models`` are the names that were asked for, the ego's first, an equal one
-    once, ``seats`` are how many of the trials have the ego on the left and on the right, ``posing``
-    is what is said of a scripted stand-in, and ``caution`` of a human who is replayed: such trials
-    are not judged. The ``trials`` of programs are distinct, and ``whole`` is the group with their
-    copies; ``equal`` counts the trials of a language model that went as an earlier one. The column
-    ``way`` is equal in copies: trials of programs that are equal state by state.
-    ``unjudged`` says why nothing is concluded from them, and is empty where something is.
-    ``published_outcomes`` are those of humans, which imported trials do not replace.
-    """
-
-    driver: str
-    setting: str
-    spec_hash: str | None
-    trials: pd.DataFrame
-    label: str
-    models: tuple[str, ...]
     name: str
+    """The driver: a model's, or both of a mixed pair."""
+    driver: str
+    """The name with the mark, and ``[scripted]`` where a stand-in answered only some trials."""
+    label: str
+    """The driver as tables name it, with what is said of it."""
     mark: str = ""
-    seats: tuple[int, int] = (0, 0)
-    measured: bool = True
-    posing: str = ""
-    caution: str = ""
-    whole: Group | None = None
-    equal: int = 0
-    unjudged: str = ""
-    published_outcomes: pd.DataFrame | None = None
+    """``[1a2b3c4d]`` tells a driver from itself under other settings of the task."""
+    models: tuple[str, ...]
+    """The names that were asked for, the ego's first, an equal one once."""
+    setting: str = ""
+    """The prompt variant; empty for humans."""
+    spec_hash: str = ""
+    """That of its trials, or of those at the usual mean speed where a condition has another."""
     levels: Mapping[str, str] = field(default_factory=dict)
+    """By factor the level of its study; model and prompt are the first ones."""
+    trials: pd.DataFrame
+    """Rows of a study's trials, of programs the distinct ones; ``way`` is equal in copies.
+
+    Humans before an import have the published outcomes alone."""
+    whole: Group | None = None
+    """The group with its copies, where it has some."""
+    equal: int = 0
+    """How many trials of a language model went as an earlier one."""
+    published_outcomes: pd.DataFrame | None = None
+    """Those of humans, which imported trials do not replace."""
+    posing: Sentence = Sentence("")
+    """What to say of a scripted stand-in that answered."""
+    caution: Sentence = Sentence("")
+    """What to say of a human who is replayed, whose trials are not judged."""
+    unjudged: Reason = Reason("")
+    """Why nothing is concluded from its trials; empty where something is."""
 
     @property
     def id(self) -> str:
@@ -86,6 +84,17 @@ class Group:
     def said(self) -> str:
         """What is said of a scripted stand-in and of a human who is replayed."""
         return "; ".join(filter(None, (self.posing, self.caution)))
+
+    @property
+    def measured(self) -> bool:
+        """Whether the speeds behind its trials are known: not of humans before an import."""
+        return "trial_id" in self.trials
+
+    @property
+    def seats(self) -> tuple[int, int]:
+        """How many of the stored trials have the ego on the left and on the right."""
+        left, right = (int((self.stored.trials["ego"] == side).sum()) for side in SIDES)
+        return left, right
 
     @property
     def scripted(self) -> bool:
@@ -166,7 +175,7 @@ def _published_humans() -> Group:
     """One object for all studies: what is computed from it is computed once."""
     outcomes = outcomes_with_metrics()
     return Group(
-        HUMAN, "", None, outcomes, HUMAN, models=(HUMAN,), name=HUMAN, measured=False,
+        name=HUMAN, driver=HUMAN, label=HUMAN, models=(HUMAN,), trials=outcomes,
         published_outcomes=outcomes,
     )  # fmt: skip
 
@@ -177,7 +186,7 @@ def humans_of(trials: pd.DataFrame) -> Group:
         return _published_humans()
     n = len(trials)
     label = HUMAN if n >= HUMAN_TRIALS else f"humans ({n} of {HUMAN_TRIALS} imported)"
-    return replace(_published_humans(), trials=trials, label=label, measured=True)
+    return replace(_published_humans(), trials=trials, label=label)
 
 
 def levels_of_group(levels: pd.DataFrame, group: Group) -> dict[str, str]:
@@ -260,7 +269,7 @@ def groups_of(
         counts = of_trials(decisions, rows).groupby("model")[["invalid", "asked"]].sum()
         reasons = (not_judged(row.Index, row.invalid, row.asked) for row in counts.itertuples())
         group = _model_group(trials.loc[rows.index], rows.iloc[0])
-        group = replace(group, unjudged="; ".join(filter(None, reasons)))
+        group = replace(group, unjudged=Reason("; ".join(filter(None, reasons))))
         own = [specs.get(name, {}) for name in rows["spec_hash"].unique()]
         # Of a first decision that was only asked, what follows is not known: draws that differ
         # later may be equal until then.
@@ -279,17 +288,16 @@ def _model_group(rows: pd.DataFrame, first: pd.Series) -> Group:
     posing = stand_in(language_models(models, first["spec"]), sides or SIDES) if scripted else ""
     driver = first["driver"] + first["mark"] + " [scripted]" * (scripted and bool(first["apart"]))
     group = Group(
-        driver,
-        first["variant"],
-        min(rows["spec_hash"].unique(), key=lambda name: (name != first["usual"], name)),
-        rows,
-        label=driver,
-        models=tuple(dict.fromkeys(models.values())),
         name=first["driver"],
+        driver=driver,
+        label=driver,
         mark=first["mark"],
-        seats=(int((rows["ego"] == "left").sum()), int((rows["ego"] == "right").sum())),
-        posing=posing,
-        caution=unresponsive(first["spec"]),
+        models=tuple(dict.fromkeys(models.values())),
+        setting=first["variant"],
+        spec_hash=min(rows["spec_hash"].unique(), key=lambda name: (name != first["usual"], name)),
+        trials=rows,
+        posing=Sentence(posing),
+        caution=Sentence(unresponsive(first["spec"])),
     )
     return replace(group, label=f"{driver} ({group.said})") if group.said else group
 

@@ -16,9 +16,10 @@ from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.study.crossing import PROMPT, listed_levels
 from merge_runner.study.file import StudySource, read_study
 from merge_runner_analysis.cache import present_state
-from merge_runner_analysis.frames import KEYS, Order, Studies, load, read_frames, study_name
+from merge_runner_analysis.frames import KEYS, Order, Studies, read, read_frames, study_name
 from merge_runner_analysis.grouping import (
     Group,
+    Reason,
     groups_of,
     humans_of,
     in_human_conditions,
@@ -97,7 +98,7 @@ class Study:
         fallen = _keys(calls[calls["fallback"] > 0])
         kept = group.part(lambda trials: pd.Series(~_keys(trials).isin(fallen), trials.index))
         if kept.trials.empty:
-            return replace(group, unjudged=group.unjudged or "every trial had a fallback")
+            return replace(group, unjudged=group.unjudged or Reason("every trial had a fallback"))
         return kept
 
     def _wanted(self, groups: list[Group]) -> list[Group]:
@@ -194,7 +195,7 @@ class Study:
     @remembered
     def read(self, sql: str) -> pd.DataFrame:
         """Return the rows of a query that a single table or figure needs, which is run once."""
-        return load(sql, self.db)
+        return read(self.db, sql)
 
 
 def _keys(trials: pd.DataFrame) -> pd.MultiIndex:

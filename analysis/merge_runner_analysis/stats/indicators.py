@@ -29,8 +29,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from merge_runner.text_safety import quoted
-from merge_runner_analysis.frames import KEYS, SPEEDS, load
+from merge_runner_analysis.frames import KEYS, SPEEDS, read
 from merge_runner_analysis.grouping import Group, of_trials
 from merge_runner_analysis.published import published
 from merge_runner_analysis.remember import remembered
@@ -101,9 +100,12 @@ def _judged(fit: Regression, name: str, *, robust: bool) -> Verdict:
 
 def profiles(study: Study, group: Group) -> pd.DataFrame:
     """One row a vehicle of a group: whether it acted, and how far its acceleration is held."""
-    specs = ", ".join(quoted(name) for name in group.trials["spec_hash"].unique())
-    speeds = load(f"FROM ({SPEEDS}) WHERE list_contains([{specs}], spec_hash)", study.db)
-    return measure_profiles(of_trials(speeds, group.trials))
+    return of_trials(_all_profiles(study), group.trials)
+
+
+@remembered
+def _all_profiles(study: Study) -> pd.DataFrame:
+    return measure_profiles(read(study.db, SPEEDS))
 
 
 @remembered

@@ -91,7 +91,7 @@ def _kind(study: Study, group: Group) -> str:
     if group.scripted:
         return MOCK
     models = dict(zip(SIDES, (*group.models, *group.models), strict=False))
-    asked = language_models(models, study.frames.specs.get(group.spec_hash or "", {}))
+    asked = language_models(models, study.frames.specs.get(group.spec_hash, {}))
     return LANGUAGE_MODEL if asked else PROGRAM
 
 

@@ -59,7 +59,9 @@ def drawn(rng: np.random.Generator, trials: int, *, pairs: bool, of_velocity: fl
         collided_boxes=hit,
     )
     found = found.reset_index(drop=True)
-    return Group("copy", "baseline", "copy", found, "copy", models=("copy",), name="copy")
+    return Group(
+        name="copy", driver="copy", label="copy", models=("copy",), setting="baseline", trials=found
+    )
 
 
 @pytest.fixture(scope="module")
