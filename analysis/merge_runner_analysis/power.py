@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -28,6 +27,7 @@ from merge_runner_analysis.stats.indicators import ALPHA, TESTED, fits, verdicts
 from merge_runner_analysis.stats.intervals import POWER
 from merge_runner_analysis.tables.model import Column, Row, Table, Value
 
+COEFFICIENTS = 7  # of a truth: of who merges first, and of the gap
 MULTIPLES = (0.5, 1.0, 2.0, 4.0)
 SEED = 260409609
 HUMANS = "humans"
@@ -53,11 +53,9 @@ COLUMNS = (
 )
 
 
-class Truth(NamedTuple):
-    """Coefficients of who merges first (Table III), of the gap in m (Table IV), collided share.
-
-    Gaps scatter normally by ``gap_sd_m``, and the logit of each trial by ``noise``.
-    """
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """How a driver drives, as it is assumed: coefficients of Tables III and IV, and the rest."""
 
     intercept: float
     projected_headway: float
@@ -67,13 +65,27 @@ class Truth(NamedTuple):
     abs_relative_velocity: float
     headway_x_velocity: float
     gap_sd_m: float
+    """By which gaps scatter normally."""
     collided: float
-    noise: float
+    """The share of trials that end in a collision."""
     name: str
+    noise: float = 0.0
+    """By which the logits of trials scatter."""
+
+    @property
+    def logit(self) -> regressions.Array:
+        """The coefficients of who merges first."""
+        return np.array([self.intercept, self.projected_headway, self.relative_velocity])
+
+    @property
+    def gap(self) -> regressions.Array:
+        """The coefficients of the gap in m."""
+        slopes = (self.abs_projected_headway, self.abs_relative_velocity, self.headway_x_velocity)
+        return np.array([self.gap_m, *slopes])
 
     def plus(self, effect: Effect) -> Truth:
         """Return the truth with an effect."""
-        return self._replace(**{name: getattr(self, name) + added for name, added in effect})
+        return replace(self, **{name: getattr(self, name) + added for name, added in effect})
 
 
 @cache
@@ -86,18 +98,18 @@ def human() -> Truth:
     """Return the humans as they are published."""
     tables = [published(name) for name in ("paper_who_first", "paper_gap")]
     b = pd.concat(table[table["driver"] == "human"]["b"] for table in tables).astype(float)
-    return Truth._make((*b, HUMAN_GAP_SD_M, human_trials()["collided"].mean(), 0.0, "human"))
+    return Truth(*b, HUMAN_GAP_SD_M, float(human_trials()["collided"].mean()), "human")
 
 
 def played(group: Group) -> Truth | None:
     """Return a driver as its trials went; None where these are too few for all coefficients."""
     b = [term.b for fit in (fits(group).firth, fits(group).ols) for term in fit.terms.values()]
-    if len(b) < len(Truth._fields[:7]):
+    if len(b) < COEFFICIENTS:
         return None
     design, gap_m, _ = regressions.gap_data(group.trials)
     scatter = np.linalg.norm(gap_m - design @ b[3:]) / fits(group).ols.freedom ** 0.5
     collided = group.ended["status"].eq("collided").mean()
-    return Truth._make((*b, float(scatter), float(collided), 0.0, f"{group.id} as played"))
+    return Truth(*b, float(scatter), float(collided), f"{group.id} as played")
 
 
 def simulate(
@@ -108,10 +120,10 @@ def simulate(
     h = np.array([CONDITIONS[name].projected_headway_m for name in names])
     dv = np.array([CONDITIONS[name].relative_velocity_mps for name in names])
     collided = rng.random(len(names)) < truth.collided
-    logit = np.column_stack([np.ones(len(names)), h, dv]) @ truth[:3]
+    logit = np.column_stack([np.ones(len(names)), h, dv]) @ truth.logit
     left = rng.random(len(names)) < expit(logit + truth.noise * rng.standard_normal(len(names)))
     scatter_m = truth.gap_sd_m * rng.standard_normal(len(names))
-    gap_m = regressions.gap_design(h, dv) @ truth[3:7] + scatter_m
+    gap_m = regressions.gap_design(h, dv) @ truth.gap + scatter_m
     return pd.DataFrame(
         {
             "condition": names,
@@ -236,8 +248,8 @@ def _truths(plan: Plan, arm: Arm, groups: Sequence[Group]) -> list[Truth]:
         planted = validated(PlantedEffect, fields[0], "what is planted")
         planted = planted.before(typical_prompt(plan, arm))
         # The script aims at gaps from 1.8 to 6.5 m; in 1 of 33 trials two vehicles collide.
-        gap = (4.15 + planted.x_gap_m, 0.0, 0.0, 0.0, 1.36)
-        return [Truth(*planted.coefficients, *gap, 1 / 33, planted.x_noise, "as planted")]
+        gap, sd_m, collided = (4.15 + planted.x_gap_m, 0.0, 0.0, 0.0), 1.36, 1 / 33
+        return [Truth(*planted.coefficients, *gap, sd_m, collided, "as planted", planted.x_noise)]
     named = plan.study.file.effect
     by_setting = {(group.name, group.setting): group for group in reversed(groups)}
     prompts = (BASELINE,) if PROMPT in named else (arm.variant, BASELINE)

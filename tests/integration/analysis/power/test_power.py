@@ -1,5 +1,7 @@
 """What a study can find before it is played."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -36,22 +38,22 @@ add = [{text = "You are late."}]
 
 
 def test_simulated_trials_scatter_about_their_truth():
-    truth = human()._replace(collided=0.1)
+    truth = replace(human(), collided=0.1)
     trials = simulate(truth, list(HUMAN_CONDITIONS), 2000, np.random.default_rng(1))
     assert len(trials) == 22_000
     assert (trials["status"] == "collided").mean() == pytest.approx(0.1, abs=0.01)
     for name, term in who_first_logit(trials).terms.items():
         assert term.b == pytest.approx(getattr(truth, name), abs=4 * term.se)
-    for value, term in zip(truth[3:7], gap_ols(trials).terms.values(), strict=True):
+    for value, term in zip(truth.gap, gap_ols(trials).terms.values(), strict=True):
         assert term.b == pytest.approx(value, abs=4 * term.se)
     # The odds of the emulator are those that the humans are supposed to have.
-    assert PlantedEffect().coefficients == human()[:3]
+    assert PlantedEffect().coefficients == tuple(human().logit)
 
 
 def test_what_is_the_same_has_no_chance_to_be_told_apart():
     assert Case(human(), 10, "first", human(), 10).effects == {}
     assert Case(human(), 10, HUMANS, human()).effects == {}
-    braver = human()._replace(gap_m=9.0, collided=0.5)
+    braver = replace(human(), gap_m=9.0, collided=0.5)
     assert list(Case(braver, 10, HUMANS, human()).effects) == ["collisions"]
 
 

@@ -1,6 +1,7 @@
 """Simulated studies find what studies that are played find, at the stated rate."""
 
 import json
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -67,10 +68,10 @@ def test_twenty_planted_studies_find_the_effect_at_the_stated_rate(of_speed):
 
 def test_the_chance_to_find_nothing_is_that_of_a_false_alarm():
     nothing = 1e-9  # an effect of 0 is no row
-    own = human()._replace(relative_velocity=nothing)
+    own = replace(human(), relative_velocity=nothing)
     assert chance(Case(own, REPS), "I2") < 0.08  # one side of a two-sided test at 5 %
-    own = own._replace(gap_m=own.gap_m + nothing, collided=own.collided + nothing)
-    found = Case(own, REPS, "first", own._replace(gap_m=own.gap_m - 2 * nothing), REPS)
+    own = replace(own, gap_m=own.gap_m + nothing, collided=own.collided + nothing)
+    found = Case(own, REPS, "first", replace(own, gap_m=own.gap_m - 2 * nothing), REPS)
     assert chance(found, "gap") == pytest.approx(0.05, abs=0.06)
 
 
