@@ -27,18 +27,6 @@ CREATE TABLE IF NOT EXISTS finished (
 """
 PACKAGES = (Path(merge_runner_analysis.__file__).parent, Path(merge_runner.__file__).parent)
 COMPUTING = {".py", ".sql", ".csv"}
-# What pages are made of: all but prompts, texts, requests and replies.
-ROWS = {
-    "trials": "trials",
-    "trial_factors": "trial_factors",
-    "states": "states",
-    "decisions": "(FROM decisions SELECT * EXCLUDE (prompt, rationale))",
-    "calls": "(FROM calls SELECT * EXCLUDE (request, reply, error))",
-    "specs": "specs",
-    "sweeps": "sweeps",
-    "sweep_trials": "sweep_trials",
-    "views": "(FROM duckdb_views() SELECT sql WHERE database_name = current_database())",
-}
 PATIENCE_S = 0.5
 LOG = logging.getLogger(__name__)
 

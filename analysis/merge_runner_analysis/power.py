@@ -57,6 +57,13 @@ COLUMNS = (
 class Truth:
     """How a driver drives, as it is assumed: coefficients of Tables III and IV, and the rest."""
 
+    name: str
+    gap_sd_m: float
+    """By which gaps scatter normally."""
+    collided: float
+    """The share of trials that end in a collision."""
+    noise: float
+    """By which the logits of trials scatter."""
     intercept: float
     projected_headway: float
     relative_velocity: float
@@ -64,13 +71,6 @@ class Truth:
     abs_projected_headway: float
     abs_relative_velocity: float
     headway_x_velocity: float
-    gap_sd_m: float
-    """By which gaps scatter normally."""
-    collided: float
-    """The share of trials that end in a collision."""
-    name: str
-    noise: float = 0.0
-    """By which the logits of trials scatter."""
 
     @property
     def logit(self) -> regressions.Array:
@@ -98,7 +98,8 @@ def human() -> Truth:
     """Return the humans as they are published."""
     tables = [published(name) for name in ("paper_who_first", "paper_gap")]
     b = pd.concat(table[table["driver"] == "human"]["b"] for table in tables).astype(float)
-    return Truth(*b, HUMAN_GAP_SD_M, float(human_trials()["collided"].mean()), "human")
+    collided = float(human_trials()["collided"].mean())
+    return Truth("human", HUMAN_GAP_SD_M, collided, 0.0, *b)
 
 
 def played(group: Group) -> Truth | None:
@@ -109,7 +110,7 @@ def played(group: Group) -> Truth | None:
     design, gap_m, _ = regressions.gap_data(group.trials)
     scatter = np.linalg.norm(gap_m - design @ b[3:]) / fits(group).ols.freedom ** 0.5
     collided = group.ended["status"].eq("collided").mean()
-    return Truth(*b, float(scatter), float(collided), f"{group.id} as played")
+    return Truth(f"{group.id} as played", float(scatter), float(collided), 0.0, *b)
 
 
 def simulate(
@@ -248,8 +249,8 @@ def _truths(plan: Plan, arm: Arm, groups: Sequence[Group]) -> list[Truth]:
         planted = validated(PlantedEffect, fields[0], "what is planted")
         planted = planted.before(typical_prompt(plan, arm))
         # The script aims at gaps from 1.8 to 6.5 m; in 1 of 33 trials two vehicles collide.
-        gap, sd_m, collided = (4.15 + planted.x_gap_m, 0.0, 0.0, 0.0), 1.36, 1 / 33
-        return [Truth(*planted.coefficients, *gap, sd_m, collided, "as planted", planted.x_noise)]
+        gap = (4.15 + planted.x_gap_m, 0.0, 0.0, 0.0)
+        return [Truth("as planted", 1.36, 1 / 33, planted.x_noise, *planted.coefficients, *gap)]
     named = plan.study.file.effect
     by_setting = {(group.name, group.setting): group for group in reversed(groups)}
     prompts = (BASELINE,) if PROMPT in named else (arm.variant, BASELINE)

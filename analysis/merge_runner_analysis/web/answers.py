@@ -15,11 +15,10 @@ from merge_runner.errors import UsageError
 from merge_runner.results.database import read_database
 from merge_runner.results.store import results_digest
 from merge_runner.text_safety import first_line
-from merge_runner_analysis.cache import finished, keep_finished, present_state
+from merge_runner_analysis.cache import finished, keep_finished, present_state, stamp_of
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.tables.model import from_text, to_text
-from merge_runner_analysis.web.reading import stamp_of
 
 if TYPE_CHECKING:
     from merge_runner_analysis.study import Study

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from merge_runner.errors import StoreError
+from merge_runner_analysis.cache import stamp_of
 from merge_runner_analysis.tables.model import Table, from_text
 from merge_runner_analysis.web.answers import Request
 from merge_runner_analysis.web.computing import Job
-from merge_runner_analysis.web.reading import stamp_of
 from merge_runner_analysis.web.site import NotThere, Site
 
 # What is kept comes within this time; what takes longer is asked for again.

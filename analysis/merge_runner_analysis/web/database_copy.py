@@ -16,7 +16,8 @@ from pathlib import Path
 import duckdb
 
 from merge_runner.errors import StoreLocked, UsageError
-from merge_runner_analysis.web.reading import PATIENCE_S, reading, stamp_of
+from merge_runner_analysis.cache import stamp_of
+from merge_runner_analysis.web.reading import PATIENCE_S, reading
 
 # The database comes after its logs: a process that closes a file loses all its locks on it.
 FILES = (".wal", ".wal.checkpoint", ".wal.recovery", "")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -43,17 +43,3 @@ def records(
 ) -> list[Row]:
     """The rows of a query, by the names of their columns."""
     return list(by_name(connection.execute(sql, values)))
-
-
-def stamp_of(db: Path) -> tuple[int, ...]:
-    """What changes when a database does; raises UsageError where there is none."""
-    try:
-        stats = [db.stat()]
-    except FileNotFoundError:
-        raise UsageError(
-            f"there is no database {db}; `merge-runner sweep baseline` makes one, --db names "
-            "another"
-        ) from None
-    with suppress(FileNotFoundError):
-        stats.append(db.with_name(f"{db.name}.wal").stat())
-    return tuple(n for of in stats for n in (of.st_ino, of.st_mtime_ns, of.st_size))

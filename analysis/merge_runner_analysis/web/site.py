@@ -17,13 +17,13 @@ from starlette.responses import Response
 
 from merge_runner.errors import MergeRunnerError
 from merge_runner.paths import DEFAULT_DB
+from merge_runner_analysis.cache import stamp_of
 from merge_runner_analysis.metrics import METRICS
 from merge_runner_analysis.web.catalogue import Catalogue
 from merge_runner_analysis.web.computing import Computing
 from merge_runner_analysis.web.display_text import MINUS, shown_number, visible, with_minus
 from merge_runner_analysis.web.notes import LONGEST_TEXT, Notes
 from merge_runner_analysis.web.queries import Queries
-from merge_runner_analysis.web.reading import stamp_of
 from merge_runner_analysis.web.search import Words
 from merge_runner_analysis.web.urls import HOME, Links
 from merge_runner_analysis.web.views import clock, condition_text

@@ -18,6 +18,7 @@ from merge_runner.errors import UsageError
 from merge_runner.registry import use
 from merge_runner.results.store import results_digest
 from merge_runner.study.parts import load_study
+from merge_runner_analysis.cache import stamp_of
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.figures.gallery import MAKERS
@@ -26,7 +27,6 @@ from merge_runner_analysis.tables.model import from_text
 from merge_runner_analysis.web import computing as computing_module
 from merge_runner_analysis.web.answers import answer, numbers
 from merge_runner_analysis.web.computing import Computing
-from merge_runner_analysis.web.reading import stamp_of
 from tests.support.cases import cases
 from tests.support.gate import HANGS_S
 from tests.support.serving import Page, client_of, in_process, listed

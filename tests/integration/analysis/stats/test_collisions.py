@@ -8,14 +8,13 @@ import pytest
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner_analysis.frames import load_trials
+from merge_runner_analysis.frames import read_frames
 from merge_runner_analysis.metrics import BOXES, COLLISIONS
 from merge_runner_analysis.published import human_counts
 from merge_runner_analysis.stats.intervals import wilson
 from merge_runner_analysis.stats.measures import counts
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables import make_tables
-from merge_runner_analysis.trials import judged
 from tests.support.studies import Drive, changed, write_study
 
 # So strong vehicles reach the end of the track within one plan.
@@ -104,7 +103,7 @@ def chance_drives():
 def judged_by(path, drives, **scenario):
     """The trials as driven under such a scenario, by repetition."""
     db = write_study(path, drives, ScenarioConfig(**scenario))
-    return judged(db, load_trials(db)).set_index("rep").sort_index()
+    return read_frames(db).trials.set_index("rep").sort_index()
 
 
 @pytest.mark.parametrize("length_m", [4.5, 7.0])
