@@ -145,6 +145,11 @@ def test_errors_have_the_stated_size_and_fade_at_the_stated_pace():
         assert fmean(products) / sd**2 == pytest.approx(wanted, abs=0.05)
 
 
+def test_errors_that_hardly_fade_have_the_stated_size_too():
+    values = [error_process((seed,), 0.5, 1e9)(0.0) for seed in range(2000)]
+    assert pstdev(values) == pytest.approx(0.5, rel=0.03)
+
+
 def test_without_autocorrelation_each_instant_has_an_error_of_its_own():
     error = error_process(("x",), 1.0, 0.0)
     values = [error(k / 20) for k in range(2000)]

@@ -436,9 +436,13 @@ async def test_a_failing_server_makes_only_its_own_call_wait(make):
 
 
 async def test_a_limit_longer_than_the_deadline_ends_the_run_and_an_outage_its_call(make):
-    for status, raised in ((503, CallFailed), (429, QuotaExhausted)):
-        client = make(error(status, "come back tomorrow", retry_after="86400"), answer())
-        with pytest.raises(raised, match=r"86400 s.*come back tomorrow"):
+    for status, wait_s, raised in (
+        (503, 86400, CallFailed),
+        (503, 1200, CallFailed),
+        (429, 86400, QuotaExhausted),
+    ):
+        client = make(error(status, "come back tomorrow", retry_after=f"{wait_s}"), answer())
+        with pytest.raises(raised, match=rf"wait {wait_s} s.*come back tomorrow"):
             await client.ask("prompt", slot())
         assert (len(client.transport.sent), now_s()) == (1, 0)
 

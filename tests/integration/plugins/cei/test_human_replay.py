@@ -18,7 +18,7 @@ from merge_runner.trial import play_trial
 from merge_runner_analysis.humans.load import import_trials, sort_files
 from merge_runner_analysis.web.app import explorer
 from merge_runner_analysis.web.site import Site
-from merge_runner_cei.human_replay import HUMAN_REPLAY
+from merge_runner_cei.human_replay import HUMAN_REPLAY, SAMPLE_S
 from tests.support.recordings import drive, file
 
 HUMAN = '\nrepetitions = 1\nconditions = ["L_4_0"]\n[scenario]\nresistance = "human"\n'
@@ -159,6 +159,21 @@ def test_a_trial_that_was_imported_in_two_ways_is_replayed_once(db, plan_of):
                 f"INSERT INTO {table} SELECT * REPLACE ('another' AS spec_hash) FROM {table}"
             )
     assert humans_of(plan_of(HUMAN_REPLAY)).trials == once
+
+
+@pytest.mark.parametrize(("late_samples", "is_replayed"), [(0.4, True), (0.6, False)])
+def test_a_trial_of_another_clock_than_the_recorders_is_left_out(
+    db, plan_of, late_samples, is_replayed
+):
+    before = humans_of(plan_of(HUMAN_REPLAY)).trials
+    with duckdb.connect(str(db)) as connection:
+        connection.execute(
+            "UPDATE states SET time_s = time_s + ? WHERE trial_id = 'human/pair1/L_4_0/iter001' "
+            "AND step = (SELECT max(step) FROM states WHERE trial_id = 'human/pair1/L_4_0/iter001')",
+            [late_samples * SAMPLE_S],
+        )
+    after = humans_of(plan_of(HUMAN_REPLAY)).trials
+    assert len(before) - len(after) == (not is_replayed)
 
 
 def test_what_a_vehicle_cannot_do_is_not_replayed(db, plan_of):

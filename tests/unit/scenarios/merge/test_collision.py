@@ -28,6 +28,11 @@ def test_rectangles_overlap_in_the_known_intervals_without_a_hole_and_nowhere_be
     assert overlaps(90.616)
 
 
+def test_long_outlines_that_only_an_axis_across_tells_apart_do_not_overlap():
+    assert not rectangles_overlap(TRACK, 100.0, 108.6, 9.0, 0.5)
+    assert rectangles_overlap(TRACK, 100.0, 108.4, 9.0, 0.5)
+
+
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("control_start", ["both_exits", "own_exit"])
 def test_every_condition_collides_at_constant_speed_and_not_at_once(rule, control_start):
