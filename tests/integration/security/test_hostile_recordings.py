@@ -15,6 +15,7 @@ import pytest
 from merge_runner.errors import MergeRunnerError, RecordingError
 from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.records import Attempt, Slot, call_key
+from merge_runner.results.parquet import group_bytes
 from merge_runner.results.recording import (
     COLUMNS,
     export_recording,
@@ -302,6 +303,13 @@ def test_a_small_file_that_unpacks_to_much_is_refused_in_little_memory():
     *said, grown_mb = done.splitlines()
     assert all(says in line for says, line in zip(BOMBS.values(), said, strict=True)), said
     assert int(grown_mb) < 200
+
+
+def test_a_dictionary_counts_beside_the_pages_that_refer_to_it():
+    """The one of a text counts for 131 bytes, 64 of them for its entry."""
+    file = DATA / "a-dictionary-of-one.parquet"
+    with duckdb.connect() as connection:
+        assert [*group_bytes(file, quoted(str(file)), connection)] == [131]
 
 
 @pytest.mark.parametrize("name", ["empty-texts", "a-dictionary-of-one"])

@@ -48,11 +48,13 @@ def test_a_change_of_mind_is_marked_once():
     for decision in decisions:
         at = decision["decision"]
         decision["tactical"] = ("Y", "M", "M")[at] if decision["side"] == "left" else "M"
+        decision["fallback"] = (decision["side"], at) == ("right", 1)
     found = account(course, decisions, {"account": "both insisted"})
     assert found.marks == [
         Mark(0.0, "left", "choice", "chooses to yield"),
         Mark(0.0, "right", "choice", "chooses to merge"),
         Mark(1.0, "left", "choice", "chooses to merge"),
+        Mark(1.0, "right", "invalid", "no valid plan"),
         Mark(1.6, "left", "last chance", "last moment to brake"),
         Mark(2.0, "right", "last chance", "last moment to brake"),
     ]

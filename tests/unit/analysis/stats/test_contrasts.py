@@ -77,6 +77,7 @@ def test_an_interaction_of_rates_is_excluded_at_the_level_of_its_p():
     low, high = intervals.newcombe(rates, stats.norm.isf(found.p / 2))
     assert min(abs(low), abs(high)) == pytest.approx(0, abs=1e-9)
     assert difference_of_rates([*one.rates, *reversed(one.rates)]).p == 1
+    assert 0 < difference_of_rates([(1.0, 1_000_000), (0.0, 1_000_000)]).p < 1e-190
 
 
 def test_which_outcomes_fishers_test_rejects_is_known_beforehand():

@@ -378,6 +378,7 @@ async def test_results_that_never_come_are_waited_for_an_hour_and_unreadable_one
         yield "", None
 
     service.results = results
+    service.states = [BatchStatus(["batch-0"], results=1 if broken else 0)] * 999
     (reply,) = await run.ask()
     assert outcomes(reply) == [("no_result", "batch-0"), ("ok", None)]
     assert [each.cost_usd for each in reply.attempts] == [None, pytest.approx(ONE_USD)]
