@@ -86,6 +86,13 @@ def test_without_a_choice_tables_say_what_they_pool_and_test_nothing_across_stud
     assert not any("/A1/baseline/" in name for name in by_id(made(study, "contrasts")))
 
 
+def test_two_studies_are_pooled_with_a_note_too(copy):
+    newest = "WHERE sweep_id = (SELECT max_by(sweep_id, started_at) FROM sweeps)"
+    study = changed(copy, f"DELETE FROM sweep_trials {newest}", f"DELETE FROM sweeps {newest}")
+    (note,) = notes_with(made(study, "factors"), "trials of several studies")
+    assert all(named in note for named in ("baseline (44 trials)", "mood (16 trials)"))
+
+
 def test_a_second_study_changes_no_reference(copy):
     levels = {"perception": ["perfect", "foggy"], "prompt": ["A1"], "model": ["human-odds"]}
     study = changed(

@@ -1,5 +1,6 @@
 """What a study can find before it is played."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -126,4 +127,7 @@ def test_power_sends_and_makes_nothing_and_says_where_a_price_is_unknown(prepare
     run = prepare(tmp_path, "power", "baseline", *few)
     assert run.code == 0, run.err
     assert "2 trials, an unknown price; 20 simulated studies" in run.out
+    told = json.loads(prepare(tmp_path, "power", "baseline", *few, "--json").out)
+    assert (told["study"], told["trials"], told["cost_usd"]) == ("baseline", 2, None)
+    assert {row["trials"] for row in told["chances"]} == {2}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["experiments"]

@@ -168,9 +168,9 @@ def test_a_trial_of_another_clock_than_the_recorders_is_left_out(
     before = humans_of(plan_of(HUMAN_REPLAY)).trials
     with duckdb.connect(str(db)) as connection:
         connection.execute(
-            "UPDATE states SET time_s = time_s + ? WHERE trial_id = 'human/pair1/L_4_0/iter001' "
-            "AND step = (SELECT max(step) FROM states WHERE trial_id = 'human/pair1/L_4_0/iter001')",
-            [late_samples * SAMPLE_S],
+            "UPDATE states SET time_s = time_s + $1 WHERE trial_id = $2 "
+            "AND step = (SELECT max(step) FROM states WHERE trial_id = $2)",
+            [late_samples * SAMPLE_S, "human/pair1/L_4_0/iter001"],
         )
     after = humans_of(plan_of(HUMAN_REPLAY)).trials
     assert len(before) - len(after) == (not is_replayed)
