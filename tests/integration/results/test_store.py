@@ -18,7 +18,13 @@ from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import StoreLocked, UsageError
 from merge_runner.records import TrialRecord
 from merge_runner.results.database import Instance, in_thread, open_database
-from merge_runner.results.store import Store, query, results_digest, sweep_facts
+from merge_runner.results.store import (
+    Store,
+    query,
+    recorded_sweeps,
+    results_digest,
+    sweep_facts,
+)
 from merge_runner.run.local_runner import Flusher
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.trial import play_trial
@@ -264,3 +270,10 @@ def test_an_instance_that_is_dropped_leaves_the_connections_of_others_open():
         assert of_another_thread.execute("SELECT 1").fetchall() == [(1,)]
     with instance.cursor() as again:
         assert again.execute("SELECT 1").fetchall() == [(1,)]
+
+
+def test_the_newest_sweep_is_meant_where_none_is_named(golden):
+    db = golden / "golden.duckdb"
+    sweeps, _ = recorded_sweeps(db, [])
+    newest = query(db, "SELECT max_by(sweep_id, started_at) FROM sweeps")[1]
+    assert [(sweep["sweep_id"],) for sweep in sweeps] == newest
