@@ -18,7 +18,8 @@ FILE_WAIT_S = 300.0
 
 def computed(site: Site, request: Request, wait_s: float = AT_ONCE_S) -> Job:
     """Ask for something, and wait for it for a moment; raises NotThere where no table holds it."""
-    job = site.computing.ask(request, stamp_of(site.db), wait_s)
+    # What is written to files once waits for all of it.
+    job = site.computing.ask(request, stamp_of(site.db), None if site.is_still else wait_s)
     if job.content is not None and "absent" in job.content:
         raise NotThere(job.content["absent"])
     return job

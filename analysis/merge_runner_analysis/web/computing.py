@@ -87,8 +87,8 @@ class Computing:
         self._jobs: dict[Request, Job] = {}
         self._executor: Executor | None = None
 
-    def ask(self, request: Request, state: tuple[int, ...], wait_s: float = 0.0) -> Job:
-        """Return a computation, waiting at most ``wait_s`` for its answer.
+    def ask(self, request: Request, state: tuple[int, ...], wait_s: float | None = 0.0) -> Job:
+        """Return a computation, waiting at most ``wait_s`` for its answer, or as long as it takes.
 
         ``state`` is the present one. An answer of an earlier state is given while a newer one is
         computed, but what was absent then may be there now, and no failure stays.

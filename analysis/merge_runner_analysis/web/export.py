@@ -13,13 +13,14 @@ from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager, suppress
 from fnmatch import fnmatchcase
-from functools import cache, lru_cache, partial
-from html import unescape
+from functools import cache, lru_cache
+from html import escape
 from itertools import chain, count
 from pathlib import Path, PurePosixPath
 from urllib.parse import parse_qsl, unquote, urlsplit
 
 import httpx
+from markupsafe import Markup
 
 from merge_runner.errors import UsageError
 from merge_runner.paths import refuse_another_kind
@@ -29,11 +30,11 @@ from merge_runner_analysis.web.computing import processes
 from merge_runner_analysis.web.guard import LOOPBACK
 from merge_runner_analysis.web.leaks import refuse_leaks
 from merge_runner_analysis.web.listing import FACTOR
-from merge_runner_analysis.web.offline import offline, page_of_trials
+from merge_runner_analysis.web.offline import linked, page_of_trials, site_of_a_page
 from merge_runner_analysis.web.pages.trial import trial_page
 from merge_runner_analysis.web.reading import Row
-from merge_runner_analysis.web.site import SCOPE, STATIC, NotThere, Site
-from merge_runner_analysis.web.urls import query_of
+from merge_runner_analysis.web.site import SCOPE, NotThere, Site
+from merge_runner_analysis.web.urls import Links, query_of
 
 MOST = 1_000  # trials of drivers; of humans there are at most 990
 # The pages of an export by the first part of their path, and what their addresses ask for. They
@@ -56,9 +57,7 @@ POLICY = (
 HTML = b"<!doctype html"
 OURS = f'{HTML.decode()}>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'.encode()
 INDEX, FILES = "index.html", "files"
-SERVED = ("htmx*", "lost.js", "notes.js", "single.js")  # scripts that need a server, or one page
-BUSY, POLL_S = 'class="computing"', 0.1
-_FILE_LINKS = re.compile(r'href="(/(?:tables|figures)/[^"]+\.(?:csv|tex|svg))"')
+MARK = "\0"  # stands before and after an address until its file is known
 _ODD = re.compile(r"[^A-Za-z0-9_.]+")
 LONGEST_NAME = 120
 
@@ -83,22 +82,24 @@ def export_folder(
     if files.exists() and not index.exists():
         raise UsageError(f"{files} is there, and is no exported study's: name another folder")
     begin, heads = ("/trials", OF_TRIALS) if wanted else ("/", tuple(FOLLOWED))
-    with _opened(db, wanted) as (site, rows), _staged(folder) as stage:
+    site = Site(db, _links(heads), policy=POLICY)
+    with _opened(site, wanted) as rows, _staged(folder) as stage:
         if wanted:
             site.catalogue.keep([row["number"] for row in rows])
-        (stage / FILES).mkdir()
         try:
             asyncio.run(_crawl(site, begin, heads, stage, told))
         except BrokenProcessPool:
             raise UsageError("nothing was written: a process that helped was ended") from None
-        shutil.copytree(STATIC, stage / FILES / "static", ignore=shutil.ignore_patterns(*SERVED))
     return index
 
 
 def export_page(db: Path, file: Path, wanted: Sequence[str]) -> Path:
     """Write one page with the wanted trials; returns its path. Raises UsageError."""
     refuse_another_kind(file, HTML, "page of HTML")
-    with _opened(db, wanted) as (site, rows), _staged(file.parent) as stage:
+    held: set[tuple[str, str]] = set()
+    site = site_of_a_page(db, held)
+    with _opened(site, wanted) as rows, _staged(file.parent) as stage:
+        held.update((row["trial_id"], row["spec_hash"]) for row in rows)
         (stage / file.name).write_text(page_of_trials(site, rows), encoding="utf-8")
     return file
 
@@ -106,54 +107,55 @@ def export_page(db: Path, file: Path, wanted: Sequence[str]) -> Path:
 async def _crawl(
     site: Site, begin: str, heads: tuple[str, ...], stage: Path, told: Callable[[int], object]
 ) -> None:
-    """Save the pages to which links lead, as they are served, with links from file to file."""
+    """Save the pages to which links lead."""
     files, waiting = {begin: INDEX}, deque([begin])
+    names = {INDEX}
     # Most pages are of trials, and most of the time they are what is waited for.
     rendering: dict[str, Future[str]] = {}
     helpers = processes(min(os.cpu_count() or 1, MOST_HELPERS))
-
-    def leads(root: str, address: str) -> str:
-        """The way to the file of an address; empty where there is none."""
-        page, moment = _page_of(address, heads)
-        if page and page not in files:
-            files[page] = _file_of(page, files.values())
-            waiting.append(page)
-            if page.startswith(OF_A_TRIAL):
-                rendering[page] = helpers.submit(_trial_page, site.db, page)
-        return f"{root}{files[page]}{moment}" if files.get(page) else ""
-
     transport = httpx.ASGITransport(explorer(site), raise_app_exceptions=False)
     plain = {"accept-encoding": "identity"}
     client = httpx.AsyncClient(transport=transport, base_url=f"http://{LOOPBACK}", headers=plain)
+
+    async def file_of(address: str) -> str:
+        """Return the file of an address, with the moment that it shows; empty for none."""
+        page, moment = _page_of(address, heads)
+        if page not in files:
+            files[page] = name = _name_of(page, names)
+            names.add(name.lower())
+            if page.startswith(OF_A_TRIAL):
+                rendering[page] = helpers.submit(_trial_page, site.db, heads, page)
+            elif name.endswith(".html"):
+                waiting.append(page)
+            else:  # a style, a script, a table; a figure that cannot be drawn has no file
+                file = await client.get(page)
+                files[page] = "" if file.is_error else name
+                if not file.is_error:
+                    refuse_leaks(site.db, name, file.text)
+                    (stage / name).parent.mkdir(parents=True, exist_ok=True)
+                    (stage / name).write_bytes(file.content)
+        return files[page] and files[page] + moment
+
     with ExitStack() as ends:
         ends.callback(helpers.shutdown, cancel_futures=True)
-        while waiting:
-            address = waiting.popleft()
-            text = await asyncio.wrap_future(rendering.pop(address)) if address in rendering else ""
-            text = text or await _served(client, address)
-            if BUSY in text:
-                waiting.append(address)
-                await asyncio.sleep(POLL_S)
-                continue
-            # Files come before the pages that link to them: a figure that cannot be drawn has none.
-            links = {unescape(href) for href in _FILE_LINKS.findall(text)}
-            for link in sorted(links - files.keys()):
-                if page := _page_of(link, heads)[0]:
-                    file = await client.get(page)
-                    files[page] = "" if file.is_error else _file_of(page, files.values())
-                    if files[page]:
-                        refuse_leaks(site.db, page, file.text)
-                        (stage / files[page]).write_bytes(file.content)
-            root = "" if address == begin else "../"
-            text = offline(text, site.db.name, POLICY, partial(leads, root))
-            text = text.replace('="/static/', f'="{root}{FILES}/static/')
-            refuse_leaks(site.db, files[address], text)
-            (stage / files[address]).write_text(text, encoding="utf-8")
-            told(len(files) - len(waiting))
+        while waiting or rendering:
+            page = next(iter(rendering), "")
+            if waiting and not (page and rendering[page].done()):
+                page = waiting.popleft()
+            text = await asyncio.wrap_future(rendering.pop(page)) if page in rendering else ""
+            text = text or await _served(client, page)
+            refuse_leaks(site.db, files[page], text)
+            root = "" if page == begin else "../"
+            parts = text.split(MARK)
+            for place in range(1, len(parts), 2):
+                file = await file_of(parts[place])
+                parts[place] = escape(root + file) if file else ""
+            (stage / files[page]).write_text(linked("".join(parts)), encoding="utf-8")
+            told(len(files) - len(waiting) - len(rendering))
 
 
 async def _served(client: httpx.AsyncClient, address: str) -> str:
-    """A page as it is served, also one that says what is not there; raises UsageError."""
+    """Return a page, also one that says what is not there; raises UsageError."""
     reply = await client.get(address)
     if reply.is_error and reply.status_code != httpx.codes.NOT_FOUND:
         raise UsageError(
@@ -163,21 +165,31 @@ async def _served(client: httpx.AsyncClient, address: str) -> str:
     return reply.text
 
 
+def _links(heads: tuple[str, ...]) -> Links:
+    """Return links to the pages of an export, between marks: the crawl puts a file for each."""
+
+    def leads(address: str) -> str:
+        # Markup, so that the marks stay; no page holds this character otherwise.
+        return Markup(f"{MARK}{address}{MARK}") if _page_of(address, heads)[0] else ""  # noqa: S704
+
+    return Links(leads)
+
+
 @lru_cache(1)
-def _still(db: Path) -> Site:
-    """The site of a process that helps."""
-    site = Site(db, is_still=True)
+def _still(db: Path, heads: tuple[str, ...]) -> Site:
+    """Return the site of a process that helps."""
+    site = Site(db, _links(heads), policy=POLICY, is_still=True)
     site.catalogue.refresh()
     site.catalogue.ask("SET threads = 1")  # there are several of these
     return site
 
 
-def _trial_page(db: Path, page: str) -> str:
-    """The page of a trial, as it is served; empty where it is not there."""
+def _trial_page(db: Path, heads: tuple[str, ...], page: str) -> str:
+    """Return the page of a trial; empty where it is not there."""
     parts = urlsplit(page)
     name = unquote(parts.path.removeprefix(OF_A_TRIAL))
     with suppress(NotThere):
-        return trial_page(_still(db), name, dict(parse_qsl(parts.query)))
+        return trial_page(_still(db, heads), name, dict(parse_qsl(parts.query)))
     return ""
 
 
@@ -186,7 +198,9 @@ def _page_of(address: str, heads: tuple[str, ...]) -> tuple[str, str]:
     """Split an address into a page and the moment it shows; two empty texts for other pages."""
     parts = urlsplit(address)
     head = parts.path.removeprefix("/").partition("/")[0]
-    if head not in heads or parts.netloc or not parts.path.startswith("/"):
+    if head == "static":
+        return address, ""
+    if head not in heads:
         return "", ""
     known, asked = FOLLOWED[head], dict(parse_qsl(parts.query))
     moment = query_of({name: asked.pop(name) for name in MOMENT if name in asked})
@@ -194,26 +208,27 @@ def _page_of(address: str, heads: tuple[str, ...]) -> tuple[str, str]:
     kept = {n: asked[n] for n in sorted(asked) if n in known or n.startswith(FACTOR)}
     if parts.path.endswith(".png") or asked.keys() - kept.keys() - {*SCOPE}:
         return "", ""
-    return parts.path + query_of(kept), moment + (f"#{parts.fragment}" if parts.fragment else "")
+    return parts.path + query_of(kept), moment
 
 
-def _file_of(page: str, taken: Collection[str]) -> str:
+def _name_of(page: str, taken: Collection[str]) -> str:
     """Return a name for the file of a page that no other one has, whatever the page is called."""
     parts = urlsplit(page)
     path = PurePosixPath(unquote(parts.path))
+    if page.startswith("/static/"):
+        return f"{FILES}{path}"
     suffix = path.suffix if page.startswith(("/tables/", "/figures/")) else ""
     asked = [part for pair in parse_qsl(parts.query) if pair[0] != "spec" for part in pair]
     words = "-".join([str(path).removesuffix(suffix), *asked])
     name = f"{FILES}/{_ODD.sub('-', words).strip('-')[:LONGEST_NAME]}"
-    others = {file.lower() for file in taken}
     named = (f"{name}{end}{suffix or '.html'}" for end in chain([""], map("-{}".format, count(2))))
-    return next(file for file in named if file.lower() not in others)
+    return next(file for file in named if file.lower() not in taken)
 
 
 @contextmanager
-def _opened(db: Path, wanted: Sequence[str]) -> Iterator[tuple[Site, list[Row]]]:
-    """Give a site and the wanted trials, by name; raises UsageError for none or too many."""
-    site = Site(db)
+def _opened(site: Site, wanted: Sequence[str]) -> Iterator[list[Row]]:
+    """Give the wanted trials of a site, by name; raises UsageError for none or too many."""
+    db = site.db
     site.refresh()
     site.is_still = True  # so that all pages are of the same trials
     rows = [
@@ -231,7 +246,7 @@ def _opened(db: Path, wanted: Sequence[str]) -> Iterator[tuple[Site, list[Row]]]
             f"{db.name}`"
         )
     try:
-        yield site, rows
+        yield rows
     finally:
         site.close()
 

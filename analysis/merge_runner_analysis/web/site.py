@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import shlex
 import threading
+from collections.abc import Mapping
 from contextvars import copy_context
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -105,6 +106,10 @@ class Site:
     """Who writes notes."""
     is_still: bool = False
     """Whether no news is taken in."""
+    policy: str = ""
+    """What a page without a server may load: each says so itself."""
+    inlined: Mapping[str, str] = field(default_factory=dict)
+    """The styles and scripts of a page that holds them itself, by name."""
 
     def __post_init__(self) -> None:
         self._first_reading: threading.Thread | None = None
@@ -143,7 +148,9 @@ class Site:
             share=self.share,
             program=self.program,
             styles=STYLES,
-            study=str(self.db),
+            study=str(self.db) if self.at.served else self.db.name,
+            policy=self.policy,
+            inlined=self.inlined,
             carried={},
             scope_names=SCOPE,
             clock=clock,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partialmethod
 from typing import Any
 from urllib.parse import quote, urlencode
@@ -12,14 +12,21 @@ HOME = "index"
 
 
 class Links:
-    """Addresses of the pages."""
+    """Addresses of the pages, as they are ``served``.
+
+    Where no server is, ``leads`` turns an address into that of a file; empty where there is none.
+    """
+
+    def __init__(self, leads: Callable[[str], str] | None = None) -> None:
+        self.served = leads is None
+        self._leads = leads or str
 
     def to(self, name: str, /, **state: object) -> str:
         """A page of its own: ``trials``, ``sql``."""
-        return f"/{'' if name == HOME else name}" + query_of(state)
+        return self._leads(f"/{'' if name == HOME else name}" + query_of(state))
 
     def _named(self, kind: str, name: str, /, **state: object) -> str:
-        return f"/{kind}/{quote(name)}" + query_of(state)
+        return self._leads(f"/{kind}/{quote(name)}" + query_of(state))
 
     # What has a name. A table and a figure with a suffix is the file.
     table = partialmethod(_named, "tables")

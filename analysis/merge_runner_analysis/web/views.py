@@ -241,11 +241,10 @@ def account_of(row: Row, trial: Trial) -> Account | None:
     return account(course, trial.decisions, row)
 
 
-def replay_data(row: Row, trial: Trial, account: Account | None, page: str) -> dict[str, Any]:
-    """What the replay draws: samples, the track, the bounds of a collision; and the address."""
+def replay_data(row: Row, trial: Trial, account: Account | None) -> dict[str, Any]:
+    """What the replay draws: samples, the track, the bounds of a collision."""
     scenario = trial.scenario
     return {
-        "page": page,
         "spec": row["spec_hash"],
         "outcome": visible(outcome_text(row)),
         "label": visible(

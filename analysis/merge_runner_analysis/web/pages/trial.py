@@ -57,12 +57,14 @@ ORDER BY avg((told.headway_m - mine.headway_m) ** 2), told.trial_id, told.spec_h
 """
 
 
-def trial_page(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
-    """Return a trial with all of its decisions."""
+def trial_page(
+    site: Site, trial_id: str, asked: Mapping[str, str], template: str = "trial.html"
+) -> str:
+    """Return a trial with all of its decisions, as a page or by another template."""
     row, trial = found(site, trial_id, asked)
     account = views.account_of(row, trial)
     return site.render(
-        "trial.html",
+        template,
         here="trials",
         scripts=REPLAY,
         panels=panels(site, row, trial),
@@ -71,7 +73,7 @@ def trial_page(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
         facts=views.facts(row),
         judged=views.judged_text(trial.scenario),
         view_box=views.VIEW_BOX,
-        data=views.replay_data(row, trial, account, site.at.trial(row)) if trial.states else None,
+        data=views.replay_data(row, trial, account) if trial.states else None,
         account=account,
         reply_of=REPLY,
         samples=SAMPLES.format(quoted(row["trial_id"]), quoted(row["spec_hash"])),
@@ -181,7 +183,8 @@ def _laid(site: Site, row: Row) -> dict[str, Any] | None:
     if not trial.states:
         return None
     return {
-        **views.replay_data(row, trial, views.account_of(row, trial), site.at.trial(row)),
+        **views.replay_data(row, trial, views.account_of(row, trial)),
+        "page": site.at.trial(row),
         "ribbons": site.render("_ribbons.html", row=row, trial_decisions=trial.by_side),
         "panels": "".join(panels(site, row, trial)),
     }
