@@ -48,8 +48,8 @@ from merge_runner_analysis.web.pages import (
     words,
 )
 from merge_runner_analysis.web.reading import reading
+from merge_runner_analysis.web.rendering import STATIC
 from merge_runner_analysis.web.site import (
-    STATIC,
     NothingNew,
     NotThere,
     Site,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from urllib.parse import parse_qsl, unquote, urlsplit
@@ -13,7 +11,8 @@ from markupsafe import Markup
 from merge_runner_analysis.web.leaks import refuse_leaks
 from merge_runner_analysis.web.pages.trial import trial_page
 from merge_runner_analysis.web.reading import Row
-from merge_runner_analysis.web.site import REPLAY, STATIC, STYLES, Site
+from merge_runner_analysis.web.rendering import STYLES, inlined_texts, policy_of
+from merge_runner_analysis.web.site import REPLAY, Site
 from merge_runner_analysis.web.urls import Links, query_of
 
 SCRIPTS = ["lists.js", "keys.js", *REPLAY, "single.js"]
@@ -52,20 +51,3 @@ def page_of_trials(site: Site, rows: Sequence[Row]) -> str:
         )
     refuse_leaks(site.db, "the page", page)
     return linked(page)
-
-
-def inlined_texts(names: Sequence[str]) -> dict[str, Markup]:
-    """Return the texts of styles and scripts of ours, which no page has to load."""
-    return {name: Markup((STATIC / name).read_text(encoding="utf-8")) for name in names}  # noqa: S704
-
-
-def policy_of(inlined: dict[str, Markup]) -> str:
-    """Return the policy of a page that lets these styles and scripts alone run."""
-    hashes = " ".join(
-        f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
-        for text in inlined.values()
-    )
-    return (
-        f"default-src 'none'; img-src data:; script-src {hashes}; style-src {hashes}; "
-        "base-uri 'none'; form-action 'none'"
-    )

@@ -8,9 +8,7 @@ from datetime import datetime
 from difflib import unified_diff
 from importlib.metadata import version
 from pathlib import Path
-from typing import NamedTuple
 
-import jinja2
 import pandas as pd
 from pandas.api.types import is_string_dtype
 
@@ -34,6 +32,8 @@ from merge_runner_analysis.tables.against import FILES, against
 from merge_runner_analysis.tables.formats import render, table_view
 from merge_runner_analysis.tables.model import Column, Row, Table
 from merge_runner_analysis.tables.verdicts import verdicts
+from merge_runner_analysis.web.rendering import STYLES, environment, inlined_texts, policy_of
+from merge_runner_analysis.web.urls import Links
 from merge_runner_analysis.wording import TABLE, sentences
 
 # What each variant asks first: of all of them in the same condition, as far as that was played.
@@ -111,23 +111,17 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
     # Rows with equal sources share a number.
     numbers: dict[tuple[Source, ...], int] = {}
 
-    def number(table: Table, row: Row, _column: Column) -> int:
-        return numbers.setdefault(sources_of(study, table, row), len(numbers) + 1)
+    def number(table: Table, row: Row, _column: Column) -> str:
+        return f"#source-{numbers.setdefault(sources_of(study, table, row), len(numbers) + 1)}"
 
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).with_name("templates")),
-        autoescape=True,
-        # A misspelt name fails the report rather than leaving a blank in it.
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     origin = provenance(study.db)
     finished = next((table for table in tables if table.name == TABLE), None)
     descriptions, levels, prompts = design(study)
     headline, *others = sentences((finished or verdicts(study)).rows)
     beside = (against(table, study) if table.name in FILES else table for table in tables)
-    return environment.get_template("report.html").render(
+    inlined = inlined_texts(STYLES)
+    templates = environment(Links(lambda _: ""), policy_of(inlined), inlined)
+    return templates.get_template("report.html").render(
         study=study,
         descriptions=descriptions,
         levels=levels,
@@ -138,7 +132,7 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
         figures=[(name, FIGURES[name].caption, data) for name, data in figures.items()],
         tables=[table_view(table, number) for table in beside],
         numbers=numbers,
-        listed=LISTED,
+        most=LISTED,
         command=sql_command(study),
         libraries=", ".join(f"{name} {version(name)}" for name in LIBRARIES),
         origin=origin,
@@ -188,24 +182,19 @@ def _changes(baseline: str, prompt: str) -> str:
     return "\n".join(line for line in lines if not line.startswith(("---", "+++", "@@")))
 
 
-class PlainColumn(NamedTuple):
-    """A column of rows of the database as a reader sees it; only ``text`` may be wrapped."""
-
-    name: str
-    text: bool
-    cells: list[str]
-
-
-def _plain(rows: pd.DataFrame) -> list[PlainColumn]:
+def _plain(rows: pd.DataFrame) -> tuple[list[str], list[list[str]]]:
+    """Return rows of the database as a reader sees them; # stands before the names of numbers."""
     found = rows.convert_dtypes()
-    return [
-        PlainColumn(
-            str(name).replace("_usd", " (USD)").replace("_", " "),
-            is_string_dtype(found[name]),
-            ["" if pd.isna(value) else _shown(value) for value in found[name]],
-        )
+    names = [
+        ("" if is_string_dtype(found[name]) else "#")
+        + str(name).replace("_usd", " (USD)").replace("_", " ")
         for name in found
     ]
+    cells = [
+        ["" if pd.isna(value) else _shown(value) for value in row]
+        for row in found.itertuples(index=False)
+    ]
+    return names, cells
 
 
 def _shown(value: object) -> str:

@@ -10,10 +10,7 @@ from collections.abc import Mapping
 from contextvars import copy_context
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar
 
-import jinja2
-from jinja2.bccache import Bucket
 from starlette.responses import Response
 
 from merge_runner.errors import MergeRunnerError
@@ -22,16 +19,14 @@ from merge_runner_analysis.cache import stamp_of
 from merge_runner_analysis.metrics import METRICS
 from merge_runner_analysis.web.catalogue import Catalogue
 from merge_runner_analysis.web.computing import Computing
-from merge_runner_analysis.web.display_text import MINUS, shown_number, visible, with_minus
 from merge_runner_analysis.web.notes import LONGEST_TEXT, Notes
 from merge_runner_analysis.web.queries import Queries
+from merge_runner_analysis.web.rendering import environment
 from merge_runner_analysis.web.search import Words
 from merge_runner_analysis.web.urls import HOME, Links
 from merge_runner_analysis.web.views import clock, condition_text
 from merge_runner_analysis.wording import MEASURES, TABLE
 
-TEMPLATES, STATIC = (Path(__file__).with_name(name) for name in ("templates", "static"))
-STYLES = [f"styles/{name}.css" for name in ("base", "answers", "trial", "pages")]
 # What draws and moves a trial, in the order in which it is loaded.
 _PARTS = "moment track charts ribbons panel clock comparison start"
 REPLAY = [f"replay/{part}.js" for part in _PARTS.split()]
@@ -44,27 +39,10 @@ PAGES = {
     "Runs": "sweeps",
     "SQL": "sql",
 }
-# What all templates call, without a word of where it is.
-MACROS = ("scope", "words", "computed", "mark", "conditions", "trust", "notes")
 # The parts of a scope in an address; the list of trials filters by the same names.
 SCOPE = ("sweep", "model", "variant", "condition")
 # What hangs under these, each with one list of all.
 LISTS = {"Tables and figures": "tables", "Notes": "notes"}
-
-
-class Compiled(jinja2.BytecodeCache):
-    """Templates that this process has compiled, for every study that it shows."""
-
-    kept: ClassVar[dict[str, bytes]] = {}
-
-    def load_bytecode(self, bucket: Bucket) -> None:
-        """Take a template from what is kept, if it is there."""
-        if bucket.key in self.kept:
-            bucket.bytecode_from_string(self.kept[bucket.key])
-
-    def dump_bytecode(self, bucket: Bucket) -> None:
-        """Keep a template."""
-        self.kept[bucket.key] = bucket.bytecode_to_string()
 
 
 class NotThere(Exception):
@@ -119,26 +97,10 @@ class Site:
         self.computing = Computing(self.db)
         self.words = Words(self.catalogue)
         self.notes = Notes(self.db, self.reader)
-        self._environment = jinja2.Environment(
-            loader=jinja2.FileSystemLoader(TEMPLATES),
-            autoescape=True,
-            auto_reload=False,
-            bytecode_cache=Compiled(),
-            undefined=jinja2.StrictUndefined,
-            # Whatever a page says shows itself; what a form sends back is escaped before.
-            finalize=lambda value: visible(value) if type(value) is str else value,
-            trim_blocks=True,
-            lstrip_blocks=True,
-        )
-        # Jinja's own format makes markup of its pattern, and escapes number by number.
-        self._environment.filters.update(
-            format=lambda text, *values: (str(text) % values).replace("-", MINUS),
-            num=shown_number,
-            whole="{:,}".format,
-            minus=lambda text: with_minus(str(text)),
-        )
-        self._environment.globals.update(
-            at=self.at,
+        self._environment = environment(
+            self.at,
+            self.policy,
+            self.inlined,
             metrics=METRICS,
             notes=self.notes,
             longest_note=LONGEST_TEXT,
@@ -147,19 +109,13 @@ class Site:
             lists=LISTS,
             share=self.share,
             program=self.program,
-            styles=STYLES,
             study=str(self.db) if self.at.served else self.db.name,
-            policy=self.policy,
-            inlined=self.inlined,
             carried={},
             scope_names=SCOPE,
             clock=clock,
             condition_text=condition_text,
             in_words=self.in_words,
         )
-        for name in MACROS:
-            macros = vars(self._environment.get_template(f"_{name}.html").module)
-            self._environment.globals |= {k: v for k, v in macros.items() if k[0] != "_"}
 
     def begin(self) -> None:
         """Read the trials and make the first page's table, before anything is asked."""

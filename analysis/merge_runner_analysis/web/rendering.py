@@ -1,0 +1,87 @@
+"""The templates: of pages, of pages without a server, and of the report."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import ClassVar
+
+import jinja2
+from jinja2.bccache import Bucket
+from markupsafe import Markup
+
+from merge_runner_analysis.web.display_text import MINUS, shown_number, visible, with_minus
+from merge_runner_analysis.web.urls import Links
+
+TEMPLATES, STATIC = (Path(__file__).with_name(name) for name in ("templates", "static"))
+STYLES = [f"styles/{name}.css" for name in ("base", "answers", "trial", "pages")]
+# What all templates call, without a word of where it is.
+MACROS = ("scope", "words", "computed", "mark", "conditions", "trust", "notes", "table")
+
+
+class Compiled(jinja2.BytecodeCache):
+    """Templates that this process has compiled, for every study that it shows."""
+
+    kept: ClassVar[dict[str, bytes]] = {}
+
+    def load_bytecode(self, bucket: Bucket) -> None:
+        """Take a template from what is kept, if it is there."""
+        if bucket.key in self.kept:
+            bucket.bytecode_from_string(self.kept[bucket.key])
+
+    def dump_bytecode(self, bucket: Bucket) -> None:
+        """Keep a template."""
+        self.kept[bucket.key] = bucket.bytecode_to_string()
+
+
+def environment(
+    at: Links, policy: str = "", inlined: Mapping[str, str] | None = None, **shared: object
+) -> jinja2.Environment:
+    """Return the templates with what they share.
+
+    Without a server, a page says its ``policy`` itself: what it may load. ``inlined`` has, by name,
+    the styles and scripts of one that holds them.
+    """
+    made = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(TEMPLATES),
+        autoescape=True,
+        auto_reload=False,
+        bytecode_cache=Compiled(),
+        # A misspelt name fails the page rather than leaving a blank in it.
+        undefined=jinja2.StrictUndefined,
+        # Whatever a page says shows itself; what a form sends back is escaped before.
+        finalize=lambda value: visible(value) if type(value) is str else value,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    # Jinja's own format makes markup of its pattern, and escapes number by number.
+    made.filters.update(
+        format=lambda text, *values: (str(text) % values).replace("-", MINUS),
+        num=shown_number,
+        whole="{:,}".format,
+        minus=lambda text: with_minus(str(text)),
+    )
+    made.globals.update(at=at, policy=policy, inlined=inlined or {}, styles=STYLES, **shared)
+    for name in MACROS:
+        macros = vars(made.get_template(f"_{name}.html").module)
+        made.globals |= {k: v for k, v in macros.items() if k[0] != "_"}
+    return made
+
+
+def inlined_texts(names: Sequence[str]) -> dict[str, Markup]:
+    """Return the texts of styles and scripts of ours, by name, for a page that holds them."""
+    return {name: Markup((STATIC / name).read_text(encoding="utf-8")) for name in names}  # noqa: S704
+
+
+def policy_of(inlined: Mapping[str, str]) -> str:
+    """Return the policy of a page that lets these styles and scripts alone run."""
+    hashes = " ".join(
+        f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+        for text in inlined.values()
+    )
+    return (
+        f"default-src 'none'; img-src data:; script-src {hashes}; style-src {hashes}; "
+        "base-uri 'none'; form-action 'none'"
+    )
