@@ -86,6 +86,15 @@ def test_without_a_choice_tables_say_what_they_pool_and_test_nothing_across_stud
     assert not any("/A1/baseline/" in name for name in by_id(made(study, "contrasts")))
 
 
+def test_a_trial_may_have_factors_of_another_study_beside_its_own(copy, prepare, tmp_path):
+    changed(
+        copy,
+        "INSERT INTO trial_factors SELECT trial_id, spec_hash, 'weather', 'rain' FROM trials",
+    )
+    audit = prepare(tmp_path, "audit", "--db", copy)
+    assert audit.code == 0, audit.out
+
+
 def test_two_studies_are_pooled_with_a_note_too(copy):
     newest = "WHERE sweep_id = (SELECT max_by(sweep_id, started_at) FROM sweeps)"
     study = changed(copy, f"DELETE FROM sweep_trials {newest}", f"DELETE FROM sweeps {newest}")
