@@ -118,8 +118,8 @@ def test_trials_of_a_stand_in_are_never_pooled_with_those_of_the_model(db):
 def test_trials_whose_prompt_was_changed_are_a_group_of_their_own(db):
     study = changed(
         db,
-        """UPDATE specs SET spec = '{"prompt_blocks": ["usual"]}' WHERE spec_hash = 'o3-baseline'""",
-        """INSERT INTO specs VALUES ('changed', '{"prompt_blocks": ["other"]}')""",
+        """UPDATE specs SET spec = '{"prompt_blocks": ["a"]}' WHERE spec_hash = 'o3-baseline'""",
+        """INSERT INTO specs VALUES ('changed', '{"prompt_blocks": ["b"]}')""",
         *(
             f"UPDATE {table} SET spec_hash = 'changed' WHERE trial_id LIKE 'o3/%/rep01'"
             for table in ("trials", "decisions", "states")
