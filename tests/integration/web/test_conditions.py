@@ -7,6 +7,7 @@ import pytest
 
 from merge_runner_analysis.web.pages import conditions
 from merge_runner_analysis.web.pages.conditions import BAND, PANELS, TRACES
+from merge_runner_analysis.web.scope import scope_of
 from tests.support.serving import Page, client_of, in_process, never
 from tests.support.studies import Drive, as_humans, write_study, yielding
 
@@ -36,6 +37,15 @@ def query(client):
             return [dict(zip(names, row, strict=True)) for row in found.fetchall()]
 
         yield rows
+
+
+def test_a_driver_is_looked_at_with_the_prompts_that_it_was_given(client):
+    client.site.refresh()
+    chosen = {name: scope_of(client.site, {}, name).prompts for name in ("o3", "o4")}
+    assert {name: [prompt for prompt, _ in prompts] for name, prompts in chosen.items()} == {
+        "o3": ["A1", "baseline"],
+        "o4": ["baseline"],
+    }
 
 
 def traces(text):
