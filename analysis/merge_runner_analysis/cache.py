@@ -1,7 +1,7 @@
-"""Tables and figures that a file beside the database keeps until the results change.
+"""What is computed once: of a study in memory, tables and figures in a file beside the database.
 
-A table is kept as JSON, a figure as SVG in Base64. Where the file cannot be written, as on a
-read-only disk, nothing is kept, and the next run computes them again.
+The file keeps a table as JSON, a figure as SVG in Base64, until the results change. Where it cannot
+be written, as on a read-only disk, nothing is kept, and the next run computes them again.
 """
 
 from __future__ import annotations
@@ -9,11 +9,12 @@ from __future__ import annotations
 import json
 import logging
 import sqlite3
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing, suppress
-from functools import cache
+from functools import cache, wraps
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import merge_runner
 import merge_runner_analysis
@@ -29,6 +30,9 @@ PACKAGES = (Path(merge_runner_analysis.__file__).parent, Path(merge_runner.__fil
 COMPUTING = {".py", ".sql", ".csv"}
 PATIENCE_S = 0.5
 LOG = logging.getLogger(__name__)
+Owner = TypeVar("Owner")
+Others = ParamSpec("Others")
+Result = TypeVar("Result")
 
 
 def stamp_of(db: Path) -> tuple[int, ...]:
@@ -99,3 +103,22 @@ def _run(db: Path, sql: str, rows: Sequence[tuple[str, ...]]) -> list[tuple[str,
 def say_once(reason: str) -> None:
     """Log, once for each reason, that nothing is kept."""
     LOG.warning("what was computed is not kept for the next time: %s", reason)
+
+
+def remembered(
+    function: Callable[Concatenate[Owner, Others], Result],
+) -> Callable[Concatenate[Owner, Others], Result]:
+    """Keep a function's results in its first argument, by the other ones.
+
+    A cache of the module would keep every study that was ever read.
+    """
+
+    @wraps(function)
+    def remember(owner: Owner, /, *args: Others.args, **kwargs: Others.kwargs) -> Result:
+        results: dict[Any, Result] = vars(owner).setdefault("_remembered", {})
+        key = (function, args, *kwargs.items())
+        if key not in results:
+            results[key] = function(owner, *args, **kwargs)
+        return results[key]
+
+    return remember

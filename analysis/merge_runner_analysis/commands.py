@@ -109,13 +109,7 @@ def tables(
     from merge_runner_analysis.tables.formats import render
 
     study = None
-    selection = Selection(
-        models=drivers(models),
-        where=cli.levels(where or (), "--where") or None,
-        file=study_file,
-        by=by,
-        without_fallbacks=without_fallbacks,
-    )
+    selection = _selection(models, where, study_file, by, without_fallbacks=without_fallbacks)
     if against is not None:
         from merge_runner_analysis.study import Study
         from merge_runner_analysis.tables.against import PAPER
@@ -145,7 +139,7 @@ def explain(
     as_json: cli.JsonOption = False,
 ) -> None:
     """Explain a row of a table: its query and its trials."""
-    study = _study(db, None, where, study_file, by, trust=trust)
+    study = _study(db, _selection(where=where, file=study_file, by=by), trust=trust)
     from merge_runner_analysis.explain import explain as explain_cell
     from merge_runner_analysis.tables import finished_tables
 
@@ -185,8 +179,15 @@ def power(
     from merge_runner_analysis.study import Study
     from merge_runner_analysis.tables.formats import render
 
-    parts, wanted = (listed(conditions), listed(variants)), cli.levels(only or (), "--only")
-    plan = make_plan(study, model or (), reps, *parts, only=wanted, trust=trust)
+    plan = make_plan(
+        study,
+        models=model or (),
+        repetitions=reps,
+        conditions=listed(conditions),
+        variants=listed(variants),
+        only=cli.levels(only or (), "--only"),
+        trust=trust,
+    )
     use(plan.parts.catalogue)
     expected = asyncio.run(unsent(plan, Options(db=db, cache=cache), say=say, whole=True))
     cost_usd = 0.0 if expected.free else expected.cost_usd
@@ -214,7 +215,7 @@ def figures(
     trust: TrustOption = False,
 ) -> None:
     """Draw all figures as PDF and PNG."""
-    study = _study(db, models, where, study_file, trust=trust)
+    study = _study(db, _selection(models, where, study_file), trust=trust)
     from merge_runner_analysis.figures.gallery import write_figures
 
     deque(write_figures(study, out), maxlen=0)
@@ -251,7 +252,7 @@ def report(
 ) -> None:
     """Write conclusions, tables and figures as one HTML file."""
     refuse_another_kind(out, HTML, "page of HTML")
-    study = _study(db, models, where, study_file, trust=trust)
+    study = _study(db, _selection(models, where, study_file), trust=trust)
     from merge_runner_analysis.web.report import write_report
 
     deque(write_report(study, out, files), maxlen=0)
@@ -259,20 +260,23 @@ def report(
     print_out(f"wrote {out}{also}")
 
 
-def _study(
-    db: Path,
-    models: str | None,
-    where: Sequence[str] | None,
-    file: str | None,
+def _selection(
+    models: str | None = None,
+    where: Sequence[str] | None = None,
+    file: str | None = None,
     by: str | None = None,
     *,
-    trust: bool,
-) -> Study:
-    use_study(file, trust=trust)
+    without_fallbacks: bool = False,
+) -> Selection:
+    levels = cli.levels(where or (), "--where") or None
+    return Selection(drivers(models), levels, file, by, without_fallbacks)
+
+
+def _study(db: Path, selection: Selection, *, trust: bool) -> Study:
+    use_study(selection.file, trust=trust)
     from merge_runner_analysis.study import Study
 
-    levels = cli.levels(where or (), "--where") or None
-    return Study(db, Selection(models=drivers(models), where=levels, file=file, by=by))
+    return Study(db, selection)
 
 
 def drivers(text: str | None) -> list[str] | None:

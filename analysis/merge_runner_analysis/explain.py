@@ -10,11 +10,11 @@ import duckdb
 from merge_runner.paths import DEFAULT_DB
 from merge_runner.registry import require
 from merge_runner.text_safety import quoted
+from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.frames import KEYS
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.names import HUMAN
 from merge_runner_analysis.published import citation
-from merge_runner_analysis.remember import remembered
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.formats import shown_value
 from merge_runner_analysis.tables.model import Column, Row, Table

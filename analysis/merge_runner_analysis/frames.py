@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import duckdb
 import pandas as pd
 
 from merge_runner.audit.checks import ASKED_DECISIONS
@@ -125,6 +126,7 @@ SELECT sweep_id, name, coalesce('-' || nullif(config->>'$.seat', ''), '') AS sea
 FROM sweeps ORDER BY started_at DESC, sweep_id
 """
 LINKS = "SELECT DISTINCT trial_id, spec_hash, sweep_id FROM sweep_trials"
+MANY_STATES = 1_500_000
 Order = Mapping[str, list[str]]
 
 
@@ -136,8 +138,15 @@ def load(sql: str, db: Path | str = DEFAULT_DB) -> pd.DataFrame:
 def read(db: Path, sql: str) -> pd.DataFrame:
     """Return the rows of a query of ours; its lists are arrays. Raises UsageError."""
     with read_database(db) as connection:
-        limit_memory(connection)
+        _limit(connection)
         return connection.execute(sql).df()
+
+
+def _limit(connection: duckdb.DuckDBPyConnection) -> None:
+    """Let DuckDB cache little of the file, unless lists of the states need more: 40 B for each."""
+    [(states,)] = connection.execute("SELECT count(*) FROM states").fetchall()
+    if states < MANY_STATES:
+        limit_memory(connection)
 
 
 def load_trials(db: Path | str = DEFAULT_DB) -> pd.DataFrame:
@@ -185,7 +194,7 @@ class Frames(NamedTuple):
 def read_frames(db: Path) -> Frames:
     """Read what a study needs, in one opening of the file; raises UsageError."""
     with read_database(db) as connection:
-        limit_memory(connection)
+        _limit(connection)
 
         def rows(sql: str) -> pd.DataFrame:
             return frames.frame(connection.execute(sql))

@@ -15,7 +15,7 @@ from merge_runner.registry import require
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.study.crossing import PROMPT, listed_levels
 from merge_runner.study.file import StudySource, read_study
-from merge_runner_analysis.cache import present_state
+from merge_runner_analysis.cache import present_state, remembered
 from merge_runner_analysis.frames import KEYS, Order, Studies, read, read_frames, study_name
 from merge_runner_analysis.grouping import (
     Group,
@@ -28,7 +28,6 @@ from merge_runner_analysis.grouping import (
 from merge_runner_analysis.humans.imported import VELOCITY_PAGES, findings, of_published_pairs
 from merge_runner_analysis.names import BASELINE, HUMAN
 from merge_runner_analysis.published import HUMAN_TRIALS
-from merge_runner_analysis.remember import remembered
 from merge_runner_analysis.selection import Selection
 
 ONLY_ASKED = " [asked]"  # ends the name of a driver that was only asked

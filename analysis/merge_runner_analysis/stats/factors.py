@@ -9,9 +9,9 @@ from math import isnan
 import pandas as pd
 
 from merge_runner.text_safety import quoted
+from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.grouping import Group, levels_of
 from merge_runner_analysis.metrics import Metric
-from merge_runner_analysis.remember import remembered
 from merge_runner_analysis.stats.contrasts import trials_by_cell
 from merge_runner_analysis.study import Study
 

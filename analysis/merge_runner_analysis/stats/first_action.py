@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from merge_runner.records import SIDES
+from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.drivers import has_chance
 from merge_runner_analysis.grouping import Group, of_trials
 from merge_runner_analysis.published import human_outcomes
-from merge_runner_analysis.remember import remembered
 from merge_runner_analysis.stats.intervals import LEVEL, Estimate, estimate
 from merge_runner_analysis.stats.regressions import Array, unfit_for_logit, who_first_data
 from merge_runner_analysis.study import Study

@@ -29,10 +29,10 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.frames import KEYS, SPEEDS, read
 from merge_runner_analysis.grouping import Group, of_trials
 from merge_runner_analysis.published import published
-from merge_runner_analysis.remember import remembered
 from merge_runner_analysis.stats.held import measure_profiles
 from merge_runner_analysis.stats.intervals import Estimate, difference, mean
 from merge_runner_analysis.stats.regressions import (

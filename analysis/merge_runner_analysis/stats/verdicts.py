@@ -25,6 +25,7 @@ import numpy as np
 import pandas as pd
 
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.metrics import BOXES, GAP
 from merge_runner_analysis.published import (
@@ -33,7 +34,6 @@ from merge_runner_analysis.published import (
     human_outcomes,
     published,
 )
-from merge_runner_analysis.remember import remembered
 from merge_runner_analysis.stats import intervals
 from merge_runner_analysis.stats.contrasts import (
     corrected,
