@@ -32,8 +32,8 @@ from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, refuse_another_kind
 from merge_runner.text_safety import say
 from merge_runner_analysis.humans.commands import human_app
-from merge_runner_analysis.names import TableFormat
 from merge_runner_analysis.selection import Selection
+from merge_runner_analysis.table_format import TableFormat
 
 if TYPE_CHECKING:
     from merge_runner_analysis.study import Study

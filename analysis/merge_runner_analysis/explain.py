@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import re
 from typing import NamedTuple
 
-import duckdb
+import pandas as pd
 
 from merge_runner.paths import DEFAULT_DB
 from merge_runner.registry import require
@@ -13,16 +12,19 @@ from merge_runner.text_safety import quoted
 from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.frames import KEYS
 from merge_runner_analysis.grouping import Group
-from merge_runner_analysis.names import HUMAN
-from merge_runner_analysis.published import citation
+from merge_runner_analysis.provenance import call_counts
+from merge_runner_analysis.published import HUMAN, citation
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.formats import shown_value
-from merge_runner_analysis.tables.model import Column, Row, Table
+from merge_runner_analysis.tables.model import ENDED, FINISHED, STORED, Column, Row, Table
 
 SEE_NOTES = "see the notes of the table"
-ACCOUNTS = "attempts"  # the table that counts repetitions of deterministic drivers, too
-# What no column of the database holds: the analysis finds it out of each trial.
-FOUND_OUT = re.compile(r"\b(counted_|collided\b|collided_boxes\b)")
+QUERY = (
+    "SELECT trials.trial_id, condition, status, merged_first, "
+    "trial_metrics.* EXCLUDE (trial_id, spec_hash) FROM trials "
+    "JOIN trial_metrics USING (trial_id, spec_hash) "
+    "WHERE trials.spec_hash IN ({specs}) AND trials.trial_id IN ({trials}) ORDER BY ALL"
+)
 
 
 class Source(NamedTuple):
@@ -97,63 +99,54 @@ def sources_of(
         return (Source(HUMAN, resampled),)
     known = (*study.groups, *study.asked, *study.unjudged, *study.unjudged_asked)
     groups = [group for group in known if group.id in row.groups]
-    if table.name == ACCOUNTS:
-        groups = [group.stored for group in groups]
-    condition = column.counts if column else ""
-    predicate = " AND ".join(filter(None, (row.counts, column.trials if column else "")))
+    rests_on = (column.rests_on if column else "") or row.rests_on
     return tuple(
-        _source(study, group, predicate, condition)
-        if row.counts and group.measured
+        _source(
+            study, group.stored if rests_on == STORED else group, rests_on, row.conditions,
+            row.copies, column.counts if column else "",
+        )
+        if rests_on and group.measured
         else Source(group.id, f"published, not from traces: {row.note or SEE_NOTES}")
         for group in groups
-    )
+    )  # fmt: skip
 
 
 @remembered
-def _source(study: Study, group: Group, predicate: str, condition: str) -> Source:
-    rows = _trials(study, group).sql(
-        f"SELECT trial_id, {condition or 'NULL'} FROM trials WHERE {predicate} ORDER BY trial_id"  # noqa: S608 # ours
-    )
-    found = dict(rows.fetchall())
-    trials = tuple(found)
-    numerator = tuple(trial for trial, counts in found.items() if counts)
+def _source(
+    study: Study,
+    group: Group,
+    rests_on: str,
+    conditions: tuple[str, ...],
+    copies: tuple[tuple[str, str], ...],
+    counts: str,
+) -> Source:
+    rows = {STORED: group.trials, ENDED: group.ended, FINISHED: group.finished}.get(rests_on)
+    if rows is None:
+        rows = group.trials[group.trials[rests_on].notna()]
+    if conditions:
+        rows = rows[rows["condition"].isin(conditions)]
+    if copies:
+        rows = rows[~pd.MultiIndex.from_frame(rows[KEYS]).isin(copies)]
+    trials = tuple(rows["trial_id"])
+    numerator: tuple[str, ...] = ()
+    if counts:
+        values = rows.get(counts)
+        if values is None:  # a failure that never occurred has no column
+            values = call_counts(study, group).get(counts, pd.Series(False, rows.index))
+        numerator = tuple(rows.loc[values.fillna(False).astype(bool), "trial_id"])
     outcomes = group.published_outcomes
-    said = (
+    parts = (
         f"{len(trials)} of {len(group.trials)} trials; not finished: {group.left_out}",
         group.said,
         f"collisions and who merged first are those of {len(outcomes)} published outcomes: "
         f"{citation('human_outcomes')}"
         if outcomes is not None
         else "",
-        f"the value counts {len(numerator)} of them" if condition else "",
+        f"the value counts {len(numerator)} of them" if counts else "",
     )
-    text = "; ".join(filter(None, said))
-    return Source(group.id, text, _query(study, group, predicate, trials), trials, numerator)
-
-
-def _query(study: Study, group: Group, predicate: str, trials: tuple[str, ...]) -> str:
-    """The query that lists these trials of a group, which a predicate is true of."""
-    if not trials:
-        return ""
-    specs = ", ".join(map(quoted, sorted(group.trials["spec_hash"].unique())))
-    conditions = [f"trials.spec_hash IN ({specs})"]
-    if group.setting:
-        conditions.append(f"variant = {quoted(group.setting)}")
-    # The database does not know mirrored trials by their images either.
-    if study.holds_more(group) or group.seats[1] or FOUND_OUT.search(predicate):
-        predicate = f"trials.trial_id IN ({', '.join(map(quoted, trials))})"
-    conditions.append(predicate)
-    return (
-        "SELECT trials.trial_id, condition, status, merged_first, "  # noqa: S608 # ours
-        "trial_metrics.* EXCLUDE (trial_id, spec_hash) FROM trials "
-        f"JOIN trial_metrics USING (trial_id, spec_hash) WHERE {' AND '.join(conditions)} "
-        "ORDER BY ALL"
+    query = QUERY.format(
+        specs=", ".join(map(quoted, sorted(group.trials["spec_hash"].unique()))),
+        trials=", ".join(map(quoted, trials)),
     )
-
-
-@remembered
-def _trials(study: Study, group: Group) -> duckdb.DuckDBPyConnection:
-    """A connection in which ``trials`` are those of a group, with what became of their calls."""
-    connection = duckdb.connect()
-    connection.register("trials", group.trials.merge(study.frames.calls, "left", KEYS))
-    return connection
+    text = "; ".join(filter(None, parts))
+    return Source(group.id, text, query if trials else "", trials, numerator)

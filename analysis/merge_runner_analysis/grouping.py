@@ -17,6 +17,7 @@ from merge_runner.audit.checks import not_judged
 from merge_runner.records import SIDES, Side, canonical_json, spec_hash
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.study.crossing import DEFAULT, MODEL, PROMPT, SELF
+from merge_runner.study.file import BASELINE
 from merge_runner_analysis.drivers import (
     has_chance,
     language_models,
@@ -25,8 +26,7 @@ from merge_runner_analysis.drivers import (
     unresponsive,
 )
 from merge_runner_analysis.frames import KEYS, Order
-from merge_runner_analysis.names import BASELINE, HUMAN
-from merge_runner_analysis.published import HUMAN_TRIALS
+from merge_runner_analysis.published import HUMAN, HUMAN_TRIALS
 from merge_runner_analysis.trials import outcomes_with_metrics
 
 MEAN_SPEED = "mean_speed_mps"

@@ -95,11 +95,6 @@ class Metric:
         return self.value if self.value in JUDGED else f"counted_{self.name}"
 
     @property
-    def counts(self) -> str:
-        """The predicate of the trials that count, where they have its column."""
-        return f"{self.column} IS NOT NULL"
-
-    @property
     def selected(self) -> str:
         """Its column as an expression of SQL over ``trials JOIN trial_metrics``."""
         typed = f"({self.value})::{'BOOLEAN' if self.rate else 'DOUBLE'}"

@@ -15,8 +15,8 @@ from merge_runner.records import NO_DECISION, SIDES
 from merge_runner.results import frames
 from merge_runner.results.database import read_database
 from merge_runner.served_model import other_models, sql_of
-from merge_runner_analysis.frames import ANSWERED
-from merge_runner_analysis.grouping import Group, of_trials
+from merge_runner_analysis.frames import ANSWERED, KEYS
+from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.study import Study
 
 SWEEPS = """
@@ -104,8 +104,8 @@ def provenance(db: Path) -> Provenance:
     return Provenance(sweeps, calls, model_costs, mismatches, settings)
 
 
-def tally(study: Study, group: Group) -> Counter[str]:
-    """Count a group's trials, calls, attempts, decisions, and what went wrong with them.
+def call_counts(study: Study, group: Group) -> pd.DataFrame:
+    """Return of each trial of a group the counts of its calls, and of what went wrong with them.
 
     A call is asked at one decision, in one or more attempts. ``retried`` attempts were followed by
     another, ``lost`` calls ended without an answer; of the ``answers``, ``invalid`` ones have no
@@ -113,16 +113,21 @@ def tally(study: Study, group: Group) -> Counter[str]:
     lack the tactical decision asked for. ``fallback`` counts the ``decisions`` that were driven
     from an older plan, or none.
     """
-    trials = of_trials(study.frames.calls, group.trials)
-    counts = {name: int(trials[name].sum()) for name in trials.select_dtypes("number")}
-    found = Counter("\n".join(trials["failures"].dropna()).splitlines())
-    counts |= {
-        "trials": len(group.trials),
-        "failed": len(group.trials) - len(group.ended),
-        "answers": counts["calls"] - counts["lost"],
-        "invalid": found.total() - found[NO_DECISION],
-    }
-    return Counter({**found, **counts})
+    trials = group.trials[KEYS].merge(study.frames.calls, how="left", on=KEYS)
+    trials = trials.set_axis(group.trials.index).drop(columns=KEYS)
+    reasons = trials.pop("failures").dropna().str.split("\n").explode()
+    failures = pd.crosstab(reasons.index, reasons).reindex(trials.index, fill_value=0)
+    return trials.join(failures).assign(
+        trials=1,
+        failed=group.trials["status"] == "failed",
+        answers=trials["calls"] - trials["lost"],
+        invalid=failures.drop(columns=NO_DECISION, errors="ignore").sum(axis=1),
+    )
+
+
+def tally(study: Study, group: Group) -> Counter[str]:
+    """Return the sums of ``call_counts`` over a group's trials."""
+    return Counter({name: int(n) for name, n in call_counts(study, group).sum().items()})
 
 
 def _settings(spec: Mapping[str, Any]) -> Iterator[str]:

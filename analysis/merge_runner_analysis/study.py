@@ -14,7 +14,7 @@ from merge_runner.paths import DEFAULT_DB
 from merge_runner.registry import require
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.study.crossing import PROMPT, listed_levels
-from merge_runner.study.file import StudySource, read_study
+from merge_runner.study.file import BASELINE, StudySource, read_study
 from merge_runner_analysis.cache import present_state, remembered
 from merge_runner_analysis.frames import KEYS, Order, Studies, read, read_frames, study_name
 from merge_runner_analysis.grouping import (
@@ -26,13 +26,11 @@ from merge_runner_analysis.grouping import (
     levels_of,
 )
 from merge_runner_analysis.humans.imported import VELOCITY_PAGES, findings, of_published_pairs
-from merge_runner_analysis.names import BASELINE, HUMAN
-from merge_runner_analysis.published import HUMAN_TRIALS
+from merge_runner_analysis.published import HUMAN, HUMAN_TRIALS
 from merge_runner_analysis.selection import Selection
 
 ONLY_ASKED = " [asked]"  # ends the name of a driver that was only asked
 EVERYTHING = Selection()
-SPEC = ["spec_hash", "variant"]
 # So many human trials in every condition make a reference; fewer are shown, but not compared with.
 ENOUGH_PER_CONDITION = 5
 
@@ -133,14 +131,6 @@ class Study:
         of_pages = [specs.get(name, {}).get("origin") == VELOCITY_PAGES
                     for name in recorded["spec_hash"]]  # fmt: skip
         return [*findings(recorded.assign(of_pages=of_pages))] if len(recorded) else []
-
-    def holds_more(self, group: Group) -> bool:
-        """Whether the database has other trials with the specs and the prompt of a group."""
-        every = pd.concat([rows[SPEC] for rows in (self.frames.trials, self.frames.asked)])
-        alike = every["spec_hash"].isin(group.trials["spec_hash"])
-        if group.setting:
-            alike &= every["variant"] == group.setting
-        return int(alike.sum()) > len(group.trials)
 
     @property
     def reference(self) -> str:

@@ -10,7 +10,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from merge_runner_analysis.names import BASELINE
+from merge_runner.study.file import BASELINE
+from merge_runner_analysis.metrics import BOXES, GAP, LEFT_FIRST
 
 TABLE = "verdicts"
 # Kinds of drivers: language models are in the headline, scripts that pose as one are not.
@@ -28,19 +29,20 @@ Values = Mapping[str, Any]
 class Measure:
     """One thing that a driver is compared with the humans by.
 
-    ``trait`` names what humans do, ``label`` and ``unit`` head a column, ``counts`` is the SQL
-    predicate of its trials and ``rule`` says how its state is set. ``told`` is the sentence of a
-    difference, with the fields ``of`` (driver) and ``humans``, each a value with its interval, and
-    ``decimals`` are those of its values there. ``says`` has by state the driver's part of a
-    sentence, with the values of its row as fields, its ``rate`` and ``more`` or less. ``ends`` are
-    those of its axis. ``margin``: so far from 0, where the humans are, it still is alike.
+    ``trait`` names what humans do, ``label`` and ``unit`` head a column, ``rests_on`` is the column
+    in which its trials have a value, or "finished", and ``rule`` says how its state is set.
+    ``told`` is the sentence of a difference, with the fields ``of`` (driver) and ``humans``, each a
+    value with its interval, and ``decimals`` are those of its values there. ``says`` has by state
+    the driver's part of a sentence, with the values of its row as fields, its ``rate`` and ``more``
+    or less. ``ends`` are those of its axis. ``margin``: so far from 0, where the humans are, it
+    still is alike.
     """
 
     name: str
     trait: str
     label: str
     unit: str
-    counts: str
+    rests_on: str
     rule: str
     told: str
     ends: tuple[float, float]
@@ -59,9 +61,6 @@ def _trait(does: str, does_not: str) -> dict[str, str]:
     }
 
 
-MERGED = "status = 'finished' AND merged_first IS NOT NULL"
-DECIDED = "collided_boxes IS NOT NULL"
-WITH_GAP = "status = 'finished' AND gap_m IS NOT NULL"
 MEASURES = {
     measure.name: measure
     for measure in (
@@ -70,7 +69,7 @@ MEASURES = {
             "The one who is ahead goes first (I1)",
             "who goes first by headway",
             "log-odds per m",
-            MERGED,
+            LEFT_FIRST.column,
             "Firth's fit: above 0, likelihood-ratio test at 5 %",
             "gains {of} log-odds of going first per m of headway, humans {humans}",
             (-0.25, 2.5),
@@ -81,7 +80,7 @@ MEASURES = {
             "The faster one yields (I2)",
             "who goes first by relative velocity",
             "log-odds per m/s",
-            MERGED,
+            LEFT_FIRST.column,
             "Firth's fit: below 0, likelihood-ratio test at 5 %",
             "changes its log-odds of going first by {of} per m/s of relative velocity, humans by "
             "{humans}",
@@ -93,7 +92,7 @@ MEASURES = {
             "Collisions by the humans' rule",
             "collisions",
             "% of trials",
-            DECIDED,
+            BOXES.column,
             "corrected p below .05",
             "collides in {of} % of trials, humans in {humans} %",
             (0.0, 30.0),
@@ -104,7 +103,7 @@ MEASURES = {
             "Gap at the merge point",
             "mean gap",
             "m",
-            WITH_GAP,
+            GAP.column,
             "corrected p below .05",
             "leaves a gap of {of} m, humans {humans} m",
             (0.0, 8.0),
@@ -115,7 +114,7 @@ MEASURES = {
             "More headway, more gap (I3)",
             "gap by headway",
             "m per m",
-            WITH_GAP,
+            GAP.column,
             "HC3 errors: above 0 at 5 %",
             "leaves {of} m more per m of headway, humans {humans} m",
             (-0.6, 1.0),
@@ -131,7 +130,7 @@ MEASURES = {
             "Relative velocity leaves the gap as it is (I4)",
             "gap moved by relative velocity",
             "m at most",
-            WITH_GAP,
+            GAP.column,
             "HC3 errors: largest difference of predicted gaps within 1 m, two one-sided tests at "
             "5 %; unlike: corrected p of being within below .05",
             "moves its gap by up to {of} m by relative velocity alone, humans by up to {humans} m",
@@ -144,7 +143,7 @@ MEASURES = {
             "Accelerations are held, then jump (I5)",
             "accelerations held",
             "SD from humans",
-            "status = 'finished'",
+            "finished",
             "within 0.5 SD, two one-sided tests at 5 %; unlike: corrected p of being within below "
             ".05",
             "holds its accelerations {of} human SD more than humans do",

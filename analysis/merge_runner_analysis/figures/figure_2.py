@@ -19,8 +19,7 @@ from merge_runner.prompts.blocks import title_of
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner_analysis.grouping import Group, of_trials
 from merge_runner_analysis.metrics import Bounded
-from merge_runner_analysis.names import HUMAN
-from merge_runner_analysis.published import published
+from merge_runner_analysis.published import HUMAN, published
 from merge_runner_analysis.stats.intervals import Estimate, mean, proportion
 from merge_runner_analysis.stats.regressions import gap_design
 from merge_runner_analysis.study import Study

@@ -11,6 +11,7 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from merge_runner.errors import UsageError
+from merge_runner.study.file import BASELINE
 from merge_runner_analysis.figures.figure_2 import (
     COLUMN_IN,
     LINE_IN,
@@ -23,7 +24,6 @@ from merge_runner_analysis.figures.figure_2 import (
     style,
     wrapped,
 )
-from merge_runner_analysis.names import BASELINE
 from merge_runner_analysis.published import published
 from merge_runner_analysis.stats.first_action import Seat, first_actions, mean, seats
 from merge_runner_analysis.stats.intervals import Estimate, interval

@@ -19,6 +19,7 @@ DATA = Path(__file__).parent
 # Standard deviation in m of the human gaps about their regression: what the four standard errors of
 # arXiv 2604.09609 (Table IV, human rows, n = 962) imply.
 HUMAN_GAP_SD_M = 1.82
+HUMAN = "human"  # the driver of every trial of the human experiment
 HUMAN_TRIALS = 990
 # The experiments whose pairs the publications number 1 to 9.
 PAIRS = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -10,8 +11,9 @@ from itertools import combinations
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy import optimize, stats
+from scipy import optimize, special, stats
 
+from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.metrics import Metric
 from merge_runner_analysis.stats.intervals import (
@@ -89,12 +91,14 @@ def weighted(
 
 def shared_cells(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Cells | None:
     """Return the rates of two groups in the conditions that both have; None where there is none."""
-    one, other = (
-        each.dropna(subset=[measure]).astype({measure: bool}).groupby("condition")[measure]
-        for each in (first, second)
-    )
-    both = pd.concat([one.sum(), one.size(), other.sum(), other.size()], axis=1, join="inner")
-    return Cells(*both.to_numpy(int).T) if len(both) else None
+    counts = []
+    for frame in (first, second):
+        known = frame.loc[frame[measure].notna(), ["condition", measure]]
+        hits = known.loc[known[measure].astype(bool), "condition"]
+        counts += [Counter(hits), Counter(known["condition"])]
+    shared = sorted(counts[1].keys() & counts[3].keys())
+    both = (np.array([count[cell] for cell in shared], dtype=int) for count in counts)
+    return Cells(*both) if shared else None
 
 
 def contrast_cells(both: Cells) -> Difference:
@@ -141,9 +145,13 @@ def detectable_rate(n: int, m: int, rate: float) -> float | None:
 def rejected(n: int, m: int) -> NDArray[np.bool_]:
     """Of all outcomes, successes of n by successes of m, those with a Fisher's p below .05."""
     found = np.empty((n + 1, m + 1), dtype=bool)
+    ways = [-special.betaln(np.arange(k + 1) + 1, k + 1 - np.arange(k + 1)) for k in (n, m)]
     for total in range(n + m + 1):
         a = np.arange(max(0, total - m), min(n, total) + 1)
-        p = stats.hypergeom.pmf(a, n + m, total, n)
+        # The hypergeometric distribution: but for constants, the ways to choose both.
+        logarithms = ways[0][a] + ways[1][total - a]
+        p = np.exp(logarithms - logarithms.max())
+        p /= p.sum()
         order = np.argsort(p)
         # As likely but for rounding is as likely.
         last = np.searchsorted(p[order], p * (1 + 1e-7), side="right") - 1
@@ -160,30 +168,28 @@ def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> D
     freedom (Bell and McCaffrey 2002, of two variances). In one condition it is the test of Welch
     (1947). None where the groups share no condition, or a single trial is all of one.
     """
-    shared = {*first.dropna(subset=[measure])["condition"]}
-    shared &= {*second.dropna(subset=[measure])["condition"]}
-    both = pd.concat([first.assign(_first=1.0), second.assign(_first=0.0)]).dropna(subset=[measure])
-    both = both[both["condition"].isin(shared)]
-    both = both.assign(_value=both[measure].astype(float))
-    if both.empty:
+    known = [frame.loc[frame[measure].notna(), ["condition", measure]] for frame in (first, second)]
+    shared = {*known[0]["condition"]} & {*known[1]["condition"]}
+    if not shared:
         return None
-    conditions = both.groupby("condition")[["_first", "_value"]]
+    one, other = (frame[frame["condition"].isin(shared)] for frame in known)
+    cells, conditions = pd.factorize(pd.concat([one["condition"], other["condition"]]))
+    belongs = np.repeat([1.0, 0.0], [len(one), len(other)])
+    values = np.concatenate([one[measure], other[measure]]).astype(float)
+    trials = np.bincount(cells)[cells]
     # Of what is left of both within conditions, the slope is that of the whole model (Frisch and
     # Waugh 1933; Lovell 1963).
-    group, value = (both[["_first", "_value"]] - conditions.transform("mean")).to_numpy(float).T
+    group, value = (each - np.bincount(cells, each)[cells] / trials for each in (belongs, values))
     weight = float(group @ group)
-    trials = both.groupby("condition")["_first"].transform("size").to_numpy(float)
     left_over = 1 - 1 / trials - group**2 / weight
     if left_over.min() < LEVERAGE:
         return None
     slope = float(group @ value) / weight
     squared = (value - slope * group) ** 2 / left_over
     se = float(np.sqrt((group**2 * squared).sum())) / weight
-    belongs = both["_first"].to_numpy(float)
-    variances = [float(squared[belongs == one].mean()) for one in (0.0, 1.0)]
-    freedom = float(len(both) - conditions.ngroups - 1)
+    variances = [float(squared[belongs == of].mean()) for of in (0.0, 1.0)]
+    freedom = float(len(cells) - len(conditions) - 1)
     if se > ROUNDING:
-        cells = pd.factorize(both["condition"])[0]
         freedom = _freedom(cells, belongs, group, left_over, np.array(variances))
     return tested(slope, se, freedom)
 
@@ -252,14 +258,17 @@ def trials_by_cell(
     """
     if not in_one_study(study, *groups) or any(undecided(group, metric) for group in groups):
         return []
-    every = [trials_of(group, metric).dropna(subset=[metric.column]) for group in groups]
-    every = [frame.assign(condition=frame[cell]) for frame in every]
+    every = [
+        pd.DataFrame({"condition": trials[cell], metric.column: trials[metric.column]}).dropna()
+        for trials in (trials_of(group, metric) for group in groups)
+    ]
     kept = (set.intersection if shared else set.union)(*(set(one["condition"]) for one in every))
-    kept -= copied_cells(groups, cell)
+    kept -= copied_cells(study, tuple(groups), cell)
     return [frame[frame["condition"].isin(kept)] for frame in every]
 
 
-def copied_cells(groups: Sequence[Group], cell: str) -> set[Cell]:
+@remembered
+def copied_cells(study: Study, groups: tuple[Group, ...], cell: str) -> set[Cell]:
     """The cells of programs that do not heed what the groups differ in.
 
     With the same other levels, all trials of one of two groups are copies of the other's there, in
@@ -267,7 +276,7 @@ def copied_cells(groups: Sequence[Group], cell: str) -> set[Cell]:
     can be tested. Conditions are never left out one by one: which of them stay would depend on
     what happened there.
     """
-    ways = [group.ended.groupby(cell)["way"].agg(set).to_dict() for group in groups]
+    ways = [_ways(study, group, cell) for group in groups]
     copied: set[Cell] = set()
     for one, other in combinations(ways, 2):
         shared = one.keys() & other.keys()
@@ -280,15 +289,24 @@ def copied_cells(groups: Sequence[Group], cell: str) -> set[Cell]:
     return copied
 
 
+@remembered
+def _ways(study: Study, group: Group, cell: str) -> dict[Cell, set[object]]:
+    """The ways in which the trials of each cell went."""
+    ways: dict[Cell, set[object]] = {}
+    for name, way in zip(group.ended[cell], group.ended["way"], strict=True):
+        ways.setdefault(name, set()).add(way)
+    return ways
+
+
 def _other_levels(cell: Cell) -> Sequence[str]:
     """Those of a cell of factors; a condition alone has none."""
     return () if isinstance(cell, str) else cell[1:]
 
 
-def copied_of_shared(groups: Sequence[Group], cell: str) -> tuple[int, int]:
+def copied_of_shared(study: Study, groups: tuple[Group, ...], cell: str) -> tuple[int, int]:
     """How many of the cells that groups share are copied ones, and how many they share."""
     shared = set.intersection(*({*group.ended[cell]} for group in groups))
-    return len(shared & copied_cells(groups, cell)), len(shared)
+    return len(shared & copied_cells(study, groups, cell)), len(shared)
 
 
 def corrected(p: list[float]) -> list[float]:

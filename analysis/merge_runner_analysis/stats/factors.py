@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from math import isnan
 
 import pandas as pd
 
-from merge_runner.text_safety import quoted
 from merge_runner_analysis.cache import remembered
+from merge_runner_analysis.frames import KEYS
 from merge_runner_analysis.grouping import Group, levels_of
 from merge_runner_analysis.metrics import Metric
 from merge_runner_analysis.stats.contrasts import trials_by_cell
@@ -39,21 +40,17 @@ class Level:
         """``temperature=0.2``, or ``opponent=idm/temperature=0.2``."""
         return f"{self.at}/" * bool(self.at) + f"{self.factor}={self.name}{self.mark}"
 
-    @property
+    @cached_property
     def cells(self) -> set[tuple[str, ...]]:
         """The cells of its trials that ended."""
         return {*self.pooled.ended["cell"]}
 
-    @property
-    def predicate(self) -> str:
-        """SQL that is true of the trials of its groups but for copies; empty where none is one."""
-        whole = self.pooled.stored.trials
-        copies = whole.drop(index=self.pooled.trials.index)
-        named = [
-            f"({quoted(row.trial_id)}, {quoted(row.spec_hash)})"
-            for row in copies[copies["group"].isin(self.groups)].itertuples()
-        ]
-        return f"(trial_id, spec_hash) NOT IN ({', '.join(named)})" if named else ""
+    @cached_property
+    def copies(self) -> tuple[tuple[str, str], ...]:
+        """The trials of its groups that are left out as copies (trial_id, spec_hash)."""
+        copies = self.pooled.stored.trials.drop(index=self.pooled.trials.index)
+        left_out = copies.loc[copies["group"].isin(self.groups), KEYS]
+        return tuple(left_out.itertuples(index=False, name=None))
 
 
 @remembered

@@ -5,7 +5,7 @@ Every test against Student's t is made here; one with infinite degrees of freedo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import cycle
 from math import hypot, inf, sqrt
@@ -102,23 +102,24 @@ def melded(
     ``p``, so that the interval excludes 0 exactly where ``p`` is below 1 - ``level``.
     """
     alpha = 1 - level
-    tails = [_at_most(one, other, 0.0), _at_most(other, one, 0.0)]
+    less, more = _at_most(one, other), _at_most(other, one)
+    tails = [less(0.0), more(0.0)]
     near = min(tails)
     wanted = min(alpha * near / max(p, TINY), (1 + near) / 2)
     part = max(alpha / 2, wanted) if p < alpha else min(alpha / 2, wanted)
     parts = [part if place == tails.index(near) else alpha / 2 for place in (0, 1)]
-    return _lower(one, other, parts[0]), -_lower(other, one, parts[1])
+    return _lower(less, parts[0]), -_lower(more, parts[1])
 
 
-def _lower(one: tuple[float, float], other: tuple[float, float], part: float) -> float:
+def _lower(at_most: Callable[[float], float], part: float) -> float:
     """The lower end of the melded interval of a difference, which leaves this part out."""
-    if _at_most(one, other, -1.0) >= part:
+    if at_most(-1.0) >= part:
         return -1.0
-    return float(optimize.brentq(lambda at: _at_most(one, other, at) - part, -1.0, 1.0))
+    return float(optimize.brentq(lambda at: at_most(at) - part, -1.0, 1.0))
 
 
-def _at_most(one: tuple[float, float], other: tuple[float, float], at: float) -> float:
-    """The chance that one rate at its lowest exceeds another at its highest by at most this.
+def _at_most(one: tuple[float, float], other: tuple[float, float]) -> Callable[[float], float]:
+    """The chance that one rate at its lowest exceeds another at its highest by at most so much.
 
     They are the lower and the upper beta distribution of Clopper and Pearson (1934). At 0 it is the
     p of Fisher's exact test that the first rate is not the larger.
@@ -126,9 +127,11 @@ def _at_most(one: tuple[float, float], other: tuple[float, float], at: float) ->
     (rate, n), (share, m) = one, other
     k, missed = rate * n, m - share * m
     if k < ROUNDING:
-        return 1.0 if missed < ROUNDING else 1 - float(_beta(share * m + 1, missed, -at))
+        if missed < ROUNDING:
+            return lambda _: 1.0
+        return lambda at: 1 - float(_beta(share * m + 1, missed, -at))
     most = special.betaincinv(share * m + 1, missed, NODES) if missed > ROUNDING else 1 + 0 * NODES
-    return float(WEIGHTS @ _beta(k, n - k + 1, most + at))
+    return lambda at: float(WEIGHTS @ _beta(k, n - k + 1, most + at))
 
 
 def _beta(a: float, b: float, x: float | NDArray[np.float64]) -> NDArray[np.float64]:

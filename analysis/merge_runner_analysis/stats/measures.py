@@ -55,10 +55,11 @@ def mean_of(trials: pd.DataFrame, column: str, shares: pd.Series | None = None) 
     Trials of human pairs hang together: there the error is a jackknife over the pairs, with t on a
     degree of freedom less than there are.
     """
-    trials = trials.dropna(subset=[column])
-    pairs = trials["pair"].dropna().unique() if "pair" in trials else ()
+    known = trials[column].notna()
+    pairs = trials.loc[known, "pair"].dropna().unique() if "pair" in trials else ()
     if not len(pairs):
-        return mean(trials[column].to_numpy(float))
+        return mean(trials.loc[known, column].to_numpy(float))
+    trials = trials.loc[known, ["condition", "pair", column]]
     if shares is None:
         shares = trials["condition"].value_counts()
     whole = _weighted_mean(trials, column, shares)

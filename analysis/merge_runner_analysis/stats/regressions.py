@@ -72,7 +72,7 @@ class Counts:
                 there = self._penalised(b + step)
             b, here = b + step, there
             if is_last and here:
-                return Fit(self, b, here.likelihood)
+                return Fit(self, b, here)
         return None
 
     def infinite(self) -> NDArray[np.bool_]:
@@ -87,11 +87,6 @@ class Counts:
         )
         return np.asarray(np.abs(found.x) > 1e-4)
 
-    def information(self, b: Array) -> Array:
-        """Return Fisher's information, (terms, terms)."""
-        p = expit(self.design @ b)
-        return np.asarray((self.design.T * (self.n * p * (1 - p))) @ self.design)
-
     def _penalised(self, b: Array) -> Penalised | None:
         """Return the log-likelihood of ``b`` with Firth's penalty; None where that is singular.
 
@@ -99,43 +94,54 @@ class Counts:
         Firth's score adds to each residual the leverage times (1/2 - p): as if each trial were
         split, and half of its leverage had gone either way (Heinze and Schemper 2002).
         """
-        design, linear, information = self.design, self.design @ b, self.information(b)
+        design, linear = self.design, self.design @ b
+        p = expit(linear)
+        weights = self.n * p * (1 - p)
+        information = (design.T * weights) @ design
         sign, log_determinant = np.linalg.slogdet(information)
         if sign <= 0 or log_determinant < SINGULAR:
             return None
         likelihood = self.chosen @ linear - self.n @ np.logaddexp(0, linear) + log_determinant / 2
-        p = expit(linear)
-        weighted = design * np.sqrt(self.n * p * (1 - p))[:, None]
+        weighted = design * np.sqrt(weights)[:, None]
         hat = weighted @ np.linalg.inv(information) @ weighted.T
         leverage = np.diag(hat)
         score = (self.chosen - self.n * p + leverage * (0.5 - p)) @ design
         turned = design * (1 - 2 * p)[:, None]  # as the weights change with the linear predictor
         second = (design.T * (leverage * (1 - 6 * p * (1 - p)))) @ design
         penalty = (second - turned.T @ hat**2 @ turned) / 2
-        return Penalised(float(likelihood), score, information - penalty)
+        return Penalised(float(likelihood), score, information - penalty, information)
 
 
 @dataclass(frozen=True, slots=True)
 class Penalised:
-    """A penalised log-likelihood, its gradient (terms,) and less its Hessian, (terms, terms)."""
+    """A penalised log-likelihood, its gradient (terms,) and less its Hessian, (terms, terms).
+
+    ``information`` is Fisher's, (terms, terms), without the penalty.
+    """
 
     likelihood: float
     score: Array
     curvature: Array
+    information: Array
 
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """The coefficients ``b`` (terms,) where the penalised log-likelihood ``best`` is maximal."""
+    """The coefficients ``b`` (terms,) where the penalised log-likelihood is maximal."""
 
     counts: Counts
     b: Array
-    best: float
+    top: Penalised
+
+    @property
+    def best(self) -> float:
+        """The penalised log-likelihood."""
+        return self.top.likelihood
 
     @property
     def errors(self) -> Array:
         """Wald's standard errors, (terms,)."""
-        return np.sqrt(np.diag(np.linalg.inv(self.counts.information(self.b))))
+        return np.sqrt(np.diag(np.linalg.inv(self.top.information)))
 
     def p(self, term: int) -> float:
         """Return the p-value of the penalised likelihood ratio against a coefficient of 0."""

@@ -54,4 +54,4 @@ def _group_row(study: Study, group: Group) -> Row:
         values |= verdict_values(found, name, f"{name.lower()}_")
     values |= verdict_values(found, SCORE, "score_") | ceiling_values(group, found, SCORE)
     remarks = reasons(found, *INDICATORS), no_ceiling(group), outcomes_note(group)
-    return row_of(group, values, *remarks, counts=ENDED)
+    return row_of(group, values, *remarks, rests_on=ENDED)

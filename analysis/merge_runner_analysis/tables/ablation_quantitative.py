@@ -45,14 +45,14 @@ def metric_table(name: str, groups: list[Group], place: str, *notes: str) -> Tab
     for one in metrics:
         kind: Kind = "percent" if one.rate else "number"
         counts = one.column if one.rate else ""
-        meaning, trials = one.meaning, ""
+        meaning, rests_on = one.meaning, ""
         if one.estimator == "median":
-            of, trials = f"{one.trials} trials that have the measure", one.counts
+            of, rests_on = f"{one.trials} trials that have the measure", one.column
             meaning = f"median over the {of}: {meaning}"
-            columns.append(Optional(f"{one.name}_n", "n", "count", 0, of, trials=trials))
+            columns.append(Optional(f"{one.name}_n", "n", "count", 0, of, rests_on=rests_on))
         columns += [
-            Column(one.name, one.heading, kind, one.decimals, meaning, counts, trials=trials),
-            interval(f"{one.name}_ci", f"of {one.label}", one.decimals, trials),
+            Column(one.name, one.heading, kind, one.decimals, meaning, counts, rests_on=rests_on),
+            interval(f"{one.name}_ci", f"of {one.label}", one.decimals, rests_on),
         ]
     rows = []
     for group in groups:
@@ -65,7 +65,7 @@ def metric_table(name: str, groups: list[Group], place: str, *notes: str) -> Tab
             if one.estimator == "median" and isinstance(estimate := found.get(one.name), Estimate)
         }
         cells = {"n": len(group.ended_outcomes), **sizes, **values, **intervals}
-        rows.append(row_of(group, cells, *remarks, counts=ENDED))
+        rows.append(row_of(group, cells, *remarks, rests_on=ENDED))
     return Table(name, columns, rows, (f"intervals: {INTERVALS}", *notes))
 
 

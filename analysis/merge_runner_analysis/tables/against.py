@@ -8,8 +8,7 @@ from dataclasses import replace
 from merge_runner.drivers.registry import MOCKS
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.metrics import shown_in
-from merge_runner_analysis.names import HUMAN
-from merge_runner_analysis.published import citation, printed_value, published
+from merge_runner_analysis.published import HUMAN, citation, printed_value, published
 from merge_runner_analysis.stats.indicators import INDICATORS
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.model import Optional, Row, Table, Value

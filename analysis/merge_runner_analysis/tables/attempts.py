@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections import Counter
 
 from merge_runner.records import NO_DECISION
-from merge_runner.text_safety import quoted
 from merge_runner_analysis.provenance import tally
 from merge_runner_analysis.study import Study
-from merge_runner_analysis.tables.model import GROUP_COLUMNS, Column, Table, row_of
+from merge_runner_analysis.tables.model import GROUP_COLUMNS, STORED, Column, Table, row_of
 
 NO_CALLS = "no call: this driver asks no model, or its calls are not in the database"
 # Failures with a share of the answers beside their number; the others are malformed answers, and
@@ -48,7 +47,7 @@ def attempts(study: Study) -> Table:
         "attempts",
         (*GROUP_COLUMNS, *columns),
         [
-            row_of(group, _values(columns, counts), _note(counts), counts="true")
+            row_of(group, _values(columns, counts), _note(counts), rests_on=STORED)
             for group, counts in found.items()
         ],
         (
@@ -61,20 +60,11 @@ def attempts(study: Study) -> Table:
 
 def _columns(name: str) -> list[Column]:
     """A column of counts, and one of their shares."""
-    meaning, counts = MEANINGS.get(name, f"answers without a valid plan: {name}"), _condition(name)
+    meaning = MEANINGS.get(name, f"answers without a valid plan: {name}")
+    counts = "" if name == "trials" else FAILURES.get(name, name)
     count = Column(name, name.replace("_", " "), "count", 0, meaning, counts)
     share = Column(f"{name}_percent", "(%)", "percent", 2, f"share of {meaning}", counts)
     return [count, share] if name in SHARES else [count]
-
-
-def _condition(name: str) -> str:
-    """Which trials have what a column counts, by the columns of ``Study.calls``."""
-    if name in {*FAILURES, NO_DECISION} or name not in MEANINGS:
-        failure = quoted(FAILURES.get(name, name))
-        return f"list_contains(string_split(failures, chr(10)), {failure})"
-    invalid = f"NOT list_has_all([{quoted(NO_DECISION)}], string_split(failures, chr(10)))"
-    own = {"trials": "", "failed": "status = 'failed'", "invalid": invalid}
-    return own.get(name, f"{name} > 0")
 
 
 def _values(columns: list[Column], counts: Counter[str]) -> dict[str, int | float | None]:

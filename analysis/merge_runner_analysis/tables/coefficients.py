@@ -19,7 +19,6 @@ TERM_NAMES = {
     "abs_relative_velocity": "Abs. relative velocity",
     "headway_x_velocity": "Headway : relative velocity",
 }
-WITH_GAP = "gap_m IS NOT NULL"
 TESTED_ELSEWHERE = (
     "whether two drivers differ cannot be read off their p-values: for drivers and humans the "
     "table verdicts tests it"
@@ -38,8 +37,8 @@ Fit = tuple[str, str, dict[str, Regression]]
 BY_PAIR = ", errors by pair"
 
 
-def row_of_term(group: Group, term: str, fit: Fit, counts: str, note: str = "") -> Row:
-    """The row of a term by one of a group's fits, of the trials that ``counts`` says in SQL."""
+def row_of_term(group: Group, term: str, fit: Fit, rests_on: str, note: str = "") -> Row:
+    """The row of a term by one of a group's fits, of the trials with a value in this column."""
     item, label, found = fit
     values: dict[str, Value] = {
         "term": TERM_NAMES[term],
@@ -58,7 +57,7 @@ def row_of_term(group: Group, term: str, fit: Fit, counts: str, note: str = "") 
         values["equivalence_p"] = found["hc3_"].equivalence_p
         values["velocity_p"] = found["hc3_"].velocity_p
     remarks = dict.fromkeys(text for one in found.values() for text in (one.problem, one.remark))
-    return row_of(group, values, *remarks, note, item=item + term, counts=counts)
+    return row_of(group, values, *remarks, note, item=item + term, rests_on=rests_on)
 
 
 def mixed_note(study: Study, table: str, model: str) -> Iterator[str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from math import isinf
 
-from merge_runner.text_safety import quoted
 from merge_runner_analysis.metrics import RULES_NOTE, Metric, shown_in
 from merge_runner_analysis.stats.contrasts import (
     contrast,
@@ -76,7 +75,7 @@ def _same_as_reference(study: Study) -> Iterator[str]:
         other = own.get(group.driver)
         if other in (None, group):
             continue
-        if copied_of_shared((group, other), "condition")[0]:
+        if copied_of_shared(study, (group, other), "condition")[0]:
             same.append(group.id)
     if same:
         yield f"{', '.join(same)}, beside {study.reference}: {SAME_TRIALS}"
@@ -98,7 +97,6 @@ def _family(study: Study, driver: str, metric: Metric) -> Iterator[Row]:
             frame["condition"]
             for frame in trials_by_cell(study, (group, other), metric, "condition", shared=True)
         )
-        named = ", ".join(quoted(name) for name in sorted({*first}))
         factor, least = 100 if metric.rate else 1, difference.detectable
         values: dict[str, Value] = {
             "driver": group.label,
@@ -120,5 +118,6 @@ def _family(study: Study, driver: str, metric: Metric) -> Iterator[Row]:
             (group.id, other.id),
             values,
             few if least is None else "",
-            f"{metric.counts} AND condition IN ({named})",
+            metric.column,
+            tuple(sorted({*first})),
         )

@@ -37,9 +37,9 @@ NO_INTERACTION = (
 )
 
 
-def _left_out(level: Level, first: Level) -> str:
+def _left_out(study: Study, level: Level, first: Level) -> str:
     """What is not compared, since programs play the same trials at both levels."""
-    copies, shared = copied_of_shared((level.pooled, first.pooled), "cell")
+    copies, shared = copied_of_shared(study, (level.pooled, first.pooled), "cell")
     if not copies:
         return ""
     if copies == shared:
@@ -134,13 +134,10 @@ def _level_row(study: Study, level: Level, first: Level, metric: Metric) -> Row:
     elif level is not first:
         cells |= _difference(study, metric, level, first)
     nothing = "" if found.n or found.bounds() else f"{metric.heading}: no trial with this measure"
-    same = "" if level is first else _left_out(level, first)
+    same = "" if level is first else _left_out(study, level, first)
     note = "; ".join(filter(None, (nothing, undecided_note(level.pooled, metric), same)))
-    return Row(f"{level.id}/{metric.name}", level.groups, cells, note, _counts(level, metric))
-
-
-def _counts(level: Level, metric: Metric) -> str:
-    return " AND ".join(filter(None, (metric.counts, level.predicate)))
+    row_id = f"{level.id}/{metric.name}"
+    return Row(row_id, level.groups, cells, note, metric.column, copies=level.copies)
 
 
 def _cells(level: Level, metric: Metric) -> dict[str, Value]:
@@ -194,4 +191,4 @@ def _interaction(
     }
     note = "" if different else f"{metric.heading}: {NO_INTERACTION}"
     row_id = f"{level.id}/interaction/{metric.name}"
-    return Row(row_id, level.groups, cells, note, _counts(level, metric))
+    return Row(row_id, level.groups, cells, note, metric.column, copies=level.copies)

@@ -110,7 +110,7 @@ def _first_rows(study: Study, group: Group) -> Iterator[Row]:
             UNBOUNDED if len(rows) and rate and rate.low is None else "",
             ONLY_ASKED.format(trials=len(group.ended)) if group in study.asked else "",
         )
-        yield row_of(group, values, *remarks, item=seat.side, counts=ENDED)
+        yield row_of(group, values, *remarks, item=seat.side, rests_on=ENDED)
 
 
 def _published_row(group: Group) -> Row:
@@ -129,7 +129,7 @@ def _published_row(group: Group) -> Row:
         "slope_ci": (float(known["low"]), float(known["high"])),
         **_estimate("exchange_rate", human_exchange_rate()),
     }
-    return row_of(group, values, f"published ({citation(FIRST_FILE)})", counts="")
+    return row_of(group, values, f"published ({citation(FIRST_FILE)})", rests_on="")
 
 
 def _estimate(name: str, estimate: Estimate | None) -> dict[str, Value]:

@@ -14,7 +14,7 @@ from itertools import accumulate, takewhile
 
 from merge_runner.prompts.blocks import title_of
 from merge_runner.text_safety import csv_writer, in_spreadsheet
-from merge_runner_analysis.names import TableFormat
+from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables.model import Column, Row, Table, Value
 
 MISSING = "–"
@@ -248,7 +248,7 @@ def table_view(table: Table, link: Callable[[Table, Row, Column], object]) -> di
         cells = []
         for column in columns:
             value, left = row.values.get(column.name), column.kind == "text"
-            linked = row.counts and not left and (value if column.counts else value is not None)
+            linked = row.rests_on and not left and (value if column.counts else value is not None)
             cells.append(
                 {
                     "text": shown_value(column, value),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from merge_runner_analysis.grouping import Group
+from merge_runner_analysis.metrics import GAP
 from merge_runner_analysis.published import citation, printed_value, published
 from merge_runner_analysis.stats.indicators import fits
 from merge_runner_analysis.stats.regressions import GAP_MARGIN_M, GAP_TERMS, by_pairs, gap_ols
@@ -12,7 +13,6 @@ from merge_runner_analysis.tables.coefficients import (
     KEYS,
     TERM_NAMES,
     TESTED_ELSEWHERE,
-    WITH_GAP,
     Fit,
     P,
     mixed_note,
@@ -41,7 +41,7 @@ def gap(study: Study) -> Table:
             for term in GAP_TERMS
             for group in study.groups
             for row in (
-                [row_of_term(group, term, fit, WITH_GAP) for fit in found[group]]
+                [row_of_term(group, term, fit, GAP.column) for fit in found[group]]
                 if group in found
                 else [_published(group, term)]
             )

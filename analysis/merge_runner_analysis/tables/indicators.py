@@ -117,8 +117,8 @@ def _metric_row(group: Group, metric: Metric) -> Row:
         values |= {"value": one.value, "interval": one.bounds()}
     if isinstance(one, Estimate):
         values["n"] = one.n
-    counts = metric.counts if isinstance(one, Estimate) else FINISHED
-    return row_of(group, values, *remarks, item=metric.name, counts=counts)
+    rests_on = metric.column if isinstance(one, Estimate) else FINISHED
+    return row_of(group, values, *remarks, item=metric.name, rests_on=rests_on)
 
 
 def verdict_values(found: Score, name: str, prefix: str = "") -> dict[str, Value]:

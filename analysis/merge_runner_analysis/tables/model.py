@@ -18,19 +18,18 @@ if TYPE_CHECKING:
 
 Kind = Literal["text", "count", "number", "percent", "p", "verdict", "interval"]
 Value = str | int | float | bool | tuple[float, float] | None
-# Which trials a row rests on, in SQL over the trials of its groups.
-FINISHED = "status = 'finished'"
-ENDED = "status <> 'failed'"
+# The trials of a group that a row may rest on, beside those with a value in some column of theirs.
+STORED, ENDED, FINISHED = "stored", "ended", "finished"
 
 
 @dataclass(frozen=True, slots=True)
 class Column:
     """One column.
 
-    ``meaning`` describes its values in words. Both are SQL conditions beside the row's: ``trials``
-    of the trials that its values rest on, where these are not all of the row's, and ``counts`` of
-    those that a share or a count counts. If ``optional``, a value may be missing without a
-    note. One that is ``noted`` stands in the values alone: the notes say it to a reader.
+    ``meaning`` describes its values in words. ``counts`` is the column of the trials, or of their
+    calls, that a share or a count counts, and ``rests_on`` is as of a row, where its values rest on
+    other trials. If ``optional``, a value may be missing without a note. One that is ``noted``
+    stands in the values alone: the notes say it to a reader.
     """
 
     name: str
@@ -41,29 +40,33 @@ class Column:
     counts: str = ""
     optional: bool = False
     noted: bool = False
-    trials: str = ""
+    rests_on: str = ""
 
 
 Optional = partial(Column, optional=True)
 
 
-def interval(name: str, meaning: str, digits: int = 2, trials: str = "") -> Column:
+def interval(name: str, meaning: str, digits: int = 2, rests_on: str = "") -> Column:
     """The column of a 95 % interval."""
-    return Optional(name, "95 % CI", "interval", digits, meaning, trials=trials)
+    return Optional(name, "95 % CI", "interval", digits, meaning, rests_on=rests_on)
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
     """One row: its readable id, the groups whose trials it rests on, values by column, a note.
 
-    ``counts`` is the SQL predicate for its trials, empty where it rests on none.
+    ``rests_on`` says which of these: STORED, ENDED, FINISHED, or the column in which they have a
+    value; empty where it rests on none. They are in these ``conditions``, if there are any, and
+    not among the ``copies`` of others (trial_id, spec_hash).
     """
 
     id: str
     groups: tuple[str, ...]
     values: Mapping[str, Value]
     note: str = ""
-    counts: str = FINISHED
+    rests_on: str = FINISHED
+    conditions: tuple[str, ...] = ()
+    copies: tuple[tuple[str, str], ...] = ()
 
 
 GROUP_COLUMNS = (Column("driver", "driver"), Column("setting", "setting"))
@@ -74,7 +77,7 @@ def row_of(
     values: Mapping[str, Value],
     *remarks: str,
     item: str = "",
-    counts: str = FINISHED,
+    rests_on: str = FINISHED,
 ) -> Row:
     """A group's row with its GROUP_COLUMNS, named ``o3/A2/item``; its note joins the remarks.
 
@@ -85,7 +88,7 @@ def row_of(
         (group.id,),
         {"driver": group.label, "setting": group.setting, **values},
         "; ".join(filter(None, remarks)),
-        counts if group.measured else "",
+        rests_on if group.measured else "",
     )
 
 

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from merge_runner.records import SIDES
 from merge_runner_analysis.drivers import language_models
 from merge_runner_analysis.grouping import Group
-from merge_runner_analysis.names import HUMAN
-from merge_runner_analysis.published import HUMAN_TRIALS
+from merge_runner_analysis.metrics import BOXES
+from merge_runner_analysis.published import HUMAN, HUMAN_TRIALS
 from merge_runner_analysis.stats.verdicts import Comparison, Known, compared, of_humans
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Value, interval
@@ -31,7 +31,7 @@ VERDICT_COLUMNS = (
     Column("kind", "kind", meaning="language model, program or mock model"),
     Optional("measure", "measure"),
     Optional("n", "n", "count", 0, "trials that the estimate rests on"),
-    Optional("k", "k", "count", 0, "trials that collided", "collided_boxes"),
+    Optional("k", "k", "count", 0, "trials that collided", BOXES.column),
     Optional("undecided", "undecided", "count", 0, "ended by another rule"),
     Column("estimate", "estimate", "number", 2, "in the unit of the measure"),
     Optional("ci", "CI", "interval", 2, "95 %; with a margin (I4, I5) at the level of the row"),
@@ -115,7 +115,7 @@ def _compared(group: Group, kind: str, found: Comparison) -> Row:
         "state": found.state or None,
         "rule": measure.rule,
     }
-    return Row(f"{group.id}/{measure.name}", (group.id,), values, found.note, measure.counts)
+    return Row(f"{group.id}/{measure.name}", (group.id,), values, found.note, measure.rests_on)
 
 
 def _human_rows(study: Study) -> Iterator[Row]:
@@ -123,8 +123,10 @@ def _human_rows(study: Study) -> Iterator[Row]:
         values = _driver(study.human, HUMANS) | {"measure": name, **_known(found)}
         note = "; ".join(filter(None, (found.problem, found.remark)))
         # What is published rests on no trials here.
-        counts = "" if found.remark or not study.human.measured else MEASURES[name].counts
-        yield Row(f"{HUMAN}/{name}", (HUMAN,), values, note, counts)
+        rests_on = MEASURES[name].rests_on
+        if found.remark or not study.human.measured:
+            rests_on = ""
+        yield Row(f"{HUMAN}/{name}", (HUMAN,), values, note, rests_on)
 
 
 def _known(found: Known) -> dict[str, Value]:

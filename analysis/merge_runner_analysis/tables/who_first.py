@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from merge_runner_analysis.grouping import Group
+from merge_runner_analysis.metrics import LEFT_FIRST
 from merge_runner_analysis.stats.indicators import fits
 from merge_runner_analysis.stats.measures import outcomes_note
 from merge_runner_analysis.stats.regressions import WHO_FIRST_TERMS, by_pairs, who_first_logit
@@ -17,8 +18,6 @@ from merge_runner_analysis.tables.coefficients import (
     row_of_term,
 )
 from merge_runner_analysis.tables.model import Column, Optional, Table
-
-WITH_MERGER = "status = 'finished' AND merged_first IS NOT NULL"
 
 
 def who_first(study: Study) -> Table:
@@ -35,7 +34,7 @@ def who_first(study: Study) -> Table:
             Optional("firth_p", "LR p", "p", 3, "its likelihood-ratio test"),
         ),
         [
-            row_of_term(group, term, fit, WITH_MERGER, "" if fit[1] else outcomes_note(group))
+            row_of_term(group, term, fit, LEFT_FIRST.column, "" if fit[1] else outcomes_note(group))
             for term in WHO_FIRST_TERMS
             for group in study.groups
             for fit in found[group]

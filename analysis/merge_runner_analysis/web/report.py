@@ -17,22 +17,24 @@ from merge_runner.errors import UsageError
 from merge_runner.prompts.blocks import title_of
 from merge_runner.records import NO_DECISION
 from merge_runner.results.provenance import program
+from merge_runner.study.file import BASELINE
 from merge_runner_analysis.cache import finished, keep_finished
 from merge_runner_analysis.explain import Source, sources_of, sql_command
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.figures.gallery import rendered, write_figures
 from merge_runner_analysis.frames import load
 from merge_runner_analysis.grouping import levels_of
-from merge_runner_analysis.names import BASELINE, DESCRIPTIONS, TableFormat
 from merge_runner_analysis.provenance import Provenance, provenance, tally
 from merge_runner_analysis.published import published
 from merge_runner_analysis.study import Study
+from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import finished_tables
 from merge_runner_analysis.tables.against import FILES, against
 from merge_runner_analysis.tables.formats import render, table_view
 from merge_runner_analysis.tables.model import Column, Row, Table
 from merge_runner_analysis.tables.verdicts import verdicts
 from merge_runner_analysis.web.rendering import STYLES, environment, inlined_texts, policy_of
+from merge_runner_analysis.web.scope import DESCRIPTIONS
 from merge_runner_analysis.web.urls import Links
 from merge_runner_analysis.wording import TABLE, sentences
 

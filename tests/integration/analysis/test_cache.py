@@ -13,9 +13,9 @@ from merge_runner.errors import UsageError
 from merge_runner_analysis import cache
 from merge_runner_analysis.cache import finished, keep_finished, present_state
 from merge_runner_analysis.figures import FIGURES
-from merge_runner_analysis.names import TableFormat
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import Study
+from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import TABLES, finished_tables
 from merge_runner_analysis.tables.formats import render
 from merge_runner_analysis.tables.model import from_text, to_text

@@ -11,9 +11,9 @@ from html import unescape
 import pytest
 
 from merge_runner.results.store import query
-from merge_runner_analysis.names import TableFormat
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import Study
+from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import formats, make_tables
 from merge_runner_analysis.tables.model import from_text
 from merge_runner_analysis.web.answers import answer

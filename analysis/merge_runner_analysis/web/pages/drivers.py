@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from merge_runner_analysis.names import HUMAN
+from merge_runner_analysis.published import HUMAN
 from merge_runner_analysis.tables.formats import printed
 from merge_runner_analysis.web.computed import computed_table
 from merge_runner_analysis.web.computing import Job

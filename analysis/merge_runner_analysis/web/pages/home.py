@@ -7,14 +7,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from merge_runner_analysis.names import DESCRIPTIONS, HUMAN
-from merge_runner_analysis.published import human_counts
+from merge_runner_analysis.published import HUMAN, human_counts
 from merge_runner_analysis.tables.model import Table
 from merge_runner_analysis.web.computed import computed_table
 from merge_runner_analysis.web.marks import Cell, band, cells
 from merge_runner_analysis.web.pages.sweep import standing_of
 from merge_runner_analysis.web.reading import Row
-from merge_runner_analysis.web.scope import Bar, Scope, carried, scope_of, unmarked
+from merge_runner_analysis.web.scope import DESCRIPTIONS, Bar, Scope, carried, scope_of, unmarked
 from merge_runner_analysis.web.site import Site, news_of
 from merge_runner_analysis.web.views import ordered
 from merge_runner_analysis.wording import (

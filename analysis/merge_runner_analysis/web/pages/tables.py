@@ -9,7 +9,7 @@ from importlib import metadata
 from starlette.responses import Response
 
 from merge_runner_analysis.figures import FIGURES
-from merge_runner_analysis.names import TableFormat
+from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import TABLES
 from merge_runner_analysis.tables.formats import render, shown_columns, table_view
 from merge_runner_analysis.tables.model import from_text
