@@ -17,7 +17,7 @@ from merge_runner_analysis.published import (
     human_outcomes,
     published,
 )
-from merge_runner_analysis.stats.indicators import verdicts
+from merge_runner_analysis.stats.indicators import judge
 from merge_runner_analysis.stats.regressions import (
     gap_design,
     gap_ols,
@@ -55,8 +55,8 @@ def shares(n: int, first: int = DATA_SETS) -> dict[tuple[str, str], float]:
     passed: dict[tuple[str, str], int] = {}
     for _, trials in zip(range(first), data_sets(n), strict=False):
         rules = {
-            "paper": verdicts(who_first_logit(trials), gap_ols(trials), robust=False),
-            "robust": verdicts(who_first_firth(trials), gap_ols(trials, robust=True), robust=True),
+            "paper": judge(who_first_logit(trials), gap_ols(trials), robust=False),
+            "robust": judge(who_first_firth(trials), gap_ols(trials, robust=True), robust=True),
         }
         for rule, judged in rules.items():
             each = {name: verdict.passed is True for name, verdict in judged.items()}

@@ -24,28 +24,6 @@ INTERVALS = "Wilson for rates, Student's t for means, order statistics for media
 JUDGED = ("collided", "collided_boxes")
 
 
-@dataclass(frozen=True, slots=True)
-class Bounded:
-    """A value with its 95 % interval; None where there is none."""
-
-    value: float | None
-    low: float | None
-    high: float | None
-
-    def bounds(self, factor: float = 1.0) -> tuple[float, float] | None:
-        """Both ends of the interval, in units of 1 / ``factor``."""
-        if self.low is None or self.high is None:
-            return None
-        return factor * self.low, factor * self.high
-
-
-@dataclass(frozen=True, slots=True)
-class HumanReference(Bounded):
-    """A published human value in the unit of its metric, which ``source`` cites."""
-
-    source: str
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Metric:
     """A number of each trial, and what is made of it.

@@ -22,7 +22,7 @@ from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.published import HUMAN_GAP_SD_M, human_outcomes, published
 from merge_runner_analysis.stats import regressions
 from merge_runner_analysis.stats.contrasts import contrast_means, shared_cells
-from merge_runner_analysis.stats.indicators import ALPHA, TESTED, fits, verdicts
+from merge_runner_analysis.stats.indicators import ALPHA, TESTED, fits, judge
 from merge_runner_analysis.stats.intervals import POWER
 from merge_runner_analysis.tables.model import Column, Row, Table, Value
 
@@ -141,12 +141,15 @@ def findings(own: pd.DataFrame, other: pd.DataFrame | None) -> dict[str, bool]:
     """Return by question what trials show at p < .05: the indicators, or how two groups differ."""
     if other is None:
         gap = regressions.gap_ols(own, robust=True)
-        judged = verdicts(regressions.who_first_firth(own), gap, robust=True)
-        return {name: verdict.passed is True for name, verdict in judged.items()}
+        judged = judge(regressions.who_first_firth(own), gap, robust=True)
+        return {name: judgement.passed is True for name, judgement in judged.items()}
     slopes = regressions.who_first_firth(own, less=other).terms
     gaps, cells = contrast_means(own, other, "gap_m"), shared_cells(own, other, "collided")
     p = {name.replace("_", " "): slope.p for name, slope in slopes.items()}
-    p |= {"gap": gaps.p if gaps else 1.0, "collisions": cells.p if cells else 1.0}
+    p |= {
+        "gap": 1.0 if gaps is None or gaps.p is None else gaps.p,
+        "collisions": cells.p if cells else 1.0,
+    }
     return {question: value < ALPHA for question, value in p.items()}
 
 

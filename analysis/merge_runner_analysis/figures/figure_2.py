@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from merge_runner.prompts.blocks import title_of
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner_analysis.grouping import Group, of_trials
-from merge_runner_analysis.metrics import Bounded
 from merge_runner_analysis.published import HUMAN, published
-from merge_runner_analysis.stats.intervals import Estimate, mean, proportion
+from merge_runner_analysis.stats.estimate import Estimate
+from merge_runner_analysis.stats.intervals import mean, proportion
 from merge_runner_analysis.stats.regressions import gap_design
 from merge_runner_analysis.study import Study
 
@@ -32,7 +32,7 @@ BREAK = "\u200b"  # a zero-width space
 # The palette of Okabe and Ito (2008), safe for the colour-blind.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
 MARKERS = "v^sDPX"
-Points = list[tuple[float, Bounded]]  # estimates at their places on an axis
+Points = list[tuple[float, Estimate]]  # estimates at their places on an axis
 Array = NDArray[np.float64]
 # Laid out by hand, in inches: many rows of equal panels need no solver.
 LABEL_IN, ROW_IN, LINE_IN = 1.15, 0.62, 0.12

@@ -25,8 +25,9 @@ from merge_runner_analysis.figures.figure_2 import (
     wrapped,
 )
 from merge_runner_analysis.published import published
+from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.first_action import Seat, first_actions, mean, seats
-from merge_runner_analysis.stats.intervals import Estimate, interval
+from merge_runner_analysis.stats.intervals import interval
 from merge_runner_analysis.study import Study
 
 # These settings are fixed, so that equal input gives equal files.

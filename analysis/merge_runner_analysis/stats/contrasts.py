@@ -16,11 +16,11 @@ from scipy import optimize, special, stats
 from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.metrics import Metric
+from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.intervals import (
     LEVEL,
     POWER,
     ROUNDING,
-    Difference,
     difference,
     melded,
     newcombe,
@@ -101,14 +101,15 @@ def shared_cells(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Cel
     return Cells(*both) if shared else None
 
 
-def contrast_cells(both: Cells) -> Difference:
+def contrast_cells(both: Cells) -> Estimate:
     """Two rates within conditions: Fisher's exact test, and the interval that agrees with it."""
     first, second = both.rates
     found = detectable_rate(int(both.n.sum()), int(both.m.sum()), second[0])
-    return Difference(first[0] - second[0], *melded(first, second, both.p), both.p, found)
+    ends = melded(first, second, both.p)
+    return Estimate(first[0] - second[0], *ends, p=both.p, detectable=found)
 
 
-def difference_of_rates(rates: Sequence[tuple[float, float]]) -> Difference:
+def difference_of_rates(rates: Sequence[tuple[float, float]]) -> Estimate:
     """Return a difference of rates, (rate, trials) each, with the interval of ``newcombe``.
 
     Its p is the level at which that interval leaves 0 out.
@@ -123,7 +124,7 @@ def difference_of_rates(rates: Sequence[tuple[float, float]]) -> Difference:
     z = 30.0 if value else 0.0  # the largest; of this quantile p is 0 to 190 digits
     if value and excludes_zero_by(z) <= 0:
         z = float(optimize.brentq(excludes_zero_by, 0.0, z))
-    return Difference(value, low, high, two_sided_p(z), None)
+    return Estimate(value, low, high, p=two_sided_p(z))
 
 
 def detectable_rate(n: int, m: int, rate: float) -> float | None:
@@ -159,7 +160,7 @@ def rejected(n: int, m: int) -> NDArray[np.bool_]:
     return found
 
 
-def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Difference | None:
+def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Estimate | None:
     """Two means, compared within the conditions that both have by Welch's test.
 
     The difference is that of a linear model with a level for each condition, so that another mix of
@@ -224,7 +225,7 @@ def _freedom(
 
 def contrast(
     study: Study, groups: Sequence[Group], metric: Metric, cell: str = "condition"
-) -> Difference | None:
+) -> Estimate | None:
     """The first of two groups minus the second, within the cells that both have.
 
     Of four groups it is how far the difference of the first two differs from that of the others, in

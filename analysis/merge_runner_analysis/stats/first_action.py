@@ -21,7 +21,8 @@ from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.drivers import has_chance
 from merge_runner_analysis.grouping import Group, of_trials
 from merge_runner_analysis.published import human_outcomes
-from merge_runner_analysis.stats.intervals import LEVEL, Estimate, estimate
+from merge_runner_analysis.stats.estimate import Estimate
+from merge_runner_analysis.stats.intervals import LEVEL, estimate
 from merge_runner_analysis.stats.regressions import Array, unfit_for_logit, who_first_data
 from merge_runner_analysis.study import Study
 

@@ -33,8 +33,9 @@ from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.frames import KEYS, SPEEDS, read
 from merge_runner_analysis.grouping import Group, of_trials
 from merge_runner_analysis.published import published
+from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.held import measure_profiles
-from merge_runner_analysis.stats.intervals import Estimate, difference, mean
+from merge_runner_analysis.stats.intervals import difference, mean
 from merge_runner_analysis.stats.regressions import (
     Regression,
     gap_ols,
@@ -64,19 +65,19 @@ TESTED = {
 }
 
 
-class Verdict(NamedTuple):
+class Judgement(NamedTuple):
     """Whether an indicator holds; None where the data cannot tell, for the reason ``why``."""
 
     passed: bool | None
     why: str = ""
 
 
-def disagree(one: Verdict, other: Verdict) -> bool:
+def disagree(one: Judgement, other: Judgement) -> bool:
     """Whether one says that an indicator holds and the other that it does not."""
     return None not in {one.passed, other.passed} and one.passed != other.passed
 
 
-def verdicts(who_first: Regression, gap: Regression, *, robust: bool) -> dict[str, Verdict]:
+def judge(who_first: Regression, gap: Regression, *, robust: bool) -> dict[str, Judgement]:
     """I1 to I4 by the paper's rule, or by the ``robust`` one, for Firth's fit and HC3 errors."""
     return {
         name: _judged(who_first if name in {"I1", "I2"} else gap, name, robust=robust)
@@ -84,18 +85,18 @@ def verdicts(who_first: Regression, gap: Regression, *, robust: bool) -> dict[st
     }
 
 
-def _judged(fit: Regression, name: str, *, robust: bool) -> Verdict:
+def _judged(fit: Regression, name: str, *, robust: bool) -> Judgement:
     if fit.problem:
-        return Verdict(None, fit.problem)
+        return Judgement(None, fit.problem)
     name_of_term, sign = TESTED[name]
     term = fit.terms[name_of_term]
     if sign:
-        return Verdict(sign * term.b > 0 and term.p < ALPHA)
+        return Judgement(sign * term.b > 0 and term.p < ALPHA)
     if not robust:
-        return Verdict(term.p >= ALPHA)
+        return Judgement(term.p >= ALPHA)
     if fit.equivalence_p is None:
-        return Verdict(None, NONE_APART)
-    return Verdict(fit.equivalence_p < ALPHA)
+        return Judgement(None, NONE_APART)
+    return Judgement(fit.equivalence_p < ALPHA)
 
 
 def profiles(study: Study, group: Group) -> pd.DataFrame:
@@ -130,10 +131,10 @@ def less_humans(study: Study, group: Group) -> Estimate | None:
     """
     if group is study.human or not study.calibrated:
         return None
-    return compared(gains(study, group), gains(study, study.human))
+    return likeness(gains(study, group), gains(study, study.human))
 
 
-def compared(driver: pd.DataFrame, human: pd.DataFrame) -> Estimate:
+def likeness(driver: pd.DataFrame, human: pd.DataFrame) -> Estimate:
     """The difference between rows of ``gains``, with Welch's interval over trials and pairs.
 
     The standard deviation is that of human trials within conditions.
@@ -144,10 +145,10 @@ def compared(driver: pd.DataFrame, human: pd.DataFrame) -> Estimate:
     spread = float((human["apart"] ** 2).sum() / max(len(human) - len(usual), 1)) ** 0.5
     apart = (driver["gain"] - driver["condition"].map(usual)).dropna()
     if not spread:
-        return Estimate(None, None, None, len(apart))
+        return Estimate(n=len(apart))
     own, pairs = mean(apart / spread), mean(_independent(human, "apart") / spread)
     if own.value is None or own.se is None or pairs.se is None:
-        return Estimate(own.value, None, None, own.n)
+        return Estimate(own.value, n=own.n)
     found = difference(own, replace(pairs, value=0.0))
     if found is None or found.se is None:  # nothing varies: it is sure
         return Estimate(own.value, own.value, own.value, own.n, 0.0)
@@ -161,14 +162,14 @@ def _independent(trials: pd.DataFrame, column: str) -> pd.Series:
     return pd.concat([trials.loc[~paired, column], means])
 
 
-def piecewise_constant(study: Study, group: Group) -> Verdict:
+def piecewise_constant(study: Study, group: Group) -> Judgement:
     """I5: whether the accelerations of a group are held and jump, rather than move."""
     found = mean_gain(study, group)
     if not found.n:
-        return Verdict(None, NO_ACTION)
+        return Judgement(None, NO_ACTION)
     if found.low is None:
-        return Verdict(None, "a single trial, or a single human pair, with control action")
-    return Verdict(found.low > 0)
+        return Judgement(None, "a single trial, or a single human pair, with control action")
+    return Judgement(found.low > 0)
 
 
 class Fits(NamedTuple):
@@ -193,12 +194,12 @@ def fits(group: Group) -> Fits:
 class Score(NamedTuple):
     """A group's verdicts by both rules, with I5 in both; ``sizes`` are its trials per condition."""
 
-    paper: dict[str, Verdict]
-    robust: dict[str, Verdict]
+    paper: dict[str, Judgement]
+    robust: dict[str, Judgement]
     sizes: tuple[int, ...]
 
     @property
-    def rules(self) -> dict[str, dict[str, Verdict]]:
+    def rules(self) -> dict[str, dict[str, Judgement]]:
         """The verdicts by the name of their rule, as it stands in a sentence."""
         return {"by the paper's test": self.paper, "by the robust tests": self.robust}
 
@@ -224,7 +225,7 @@ def ceiling(sizes: tuple[int, ...]) -> dict[str, dict[str, float]]:
     return shares
 
 
-def total(judged: dict[str, Verdict]) -> str | None:
+def total(judged: dict[str, Judgement]) -> str | None:
     """How many indicators hold by one rule, ``3 of 4``; None where none can be judged."""
     known = [verdict.passed for verdict in judged.values() if verdict.passed is not None]
     return f"{sum(known)} of {len(known)}" if known else None
@@ -234,17 +235,17 @@ def total(judged: dict[str, Verdict]) -> str | None:
 def score(study: Study, group: Group) -> Score:
     """Judge a group's indicators."""
     fit = fits(group)
-    paper = verdicts(fit.logit, fit.ols, robust=False)
-    robust = verdicts(fit.firth, fit.hc3, robust=True)
+    paper = judge(fit.logit, fit.ols, robust=False)
+    robust = judge(fit.firth, fit.hc3, robust=True)
     if not group.measured:
         row = published("paper_ablation_qualitative").query("driver == 'human'").iloc[0]
         for name in ("I3", "I4"):
-            paper[name] = Verdict(bool(row[name.lower()]), PUBLISHED)
-        paper["I5"] = Verdict(bool(row["i5"]), BY_EYE)
-        robust["I5"] = Verdict(None, BY_EYE)
+            paper[name] = Judgement(bool(row[name.lower()]), PUBLISHED)
+        paper["I5"] = Judgement(bool(row["i5"]), BY_EYE)
+        robust["I5"] = Judgement(None, BY_EYE)
     elif group.caution:
-        paper = robust = dict.fromkeys(INDICATORS, Verdict(None, group.caution))
+        paper = robust = dict.fromkeys(INDICATORS, Judgement(None, group.caution))
     else:
         # The paper judged by eye: there is no rule to apply, whatever is driven.
-        paper["I5"], robust["I5"] = Verdict(None), piecewise_constant(study, group)
+        paper["I5"], robust["I5"] = Judgement(None), piecewise_constant(study, group)
     return Score(paper, robust, group.sizes)

@@ -6,7 +6,6 @@ Every test against Student's t is made here; one with infinite degrees of freedo
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from itertools import cycle
 from math import hypot, inf, sqrt
 
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, special, stats
 
-from merge_runner_analysis.metrics import Bounded
+from merge_runner_analysis.stats.estimate import Estimate
 
 LEVEL = 0.95
 POWER = 0.8
@@ -26,37 +25,7 @@ NODES, WEIGHTS = (1 + _POINTS) / 2, _SHARES / 2
 Z = float(stats.norm.ppf((1 + LEVEL) / 2))
 
 
-@dataclass(frozen=True, slots=True)
-class Estimate(Bounded):
-    """A value with its interval and the number it rests on.
-
-    ``se`` is its standard error, and ``freedom`` that of its Student's t. A rate has none of these
-    but a ``weight``: the trials that it is as good as.
-    """
-
-    n: int
-    se: float | None = None
-    freedom: float = inf
-    weight: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Difference(Bounded):
-    """A difference (first minus second) with its interval and a two-sided p-value.
-
-    ``detectable`` is the smallest true difference, in either direction, that one test at 5 % finds
-    with a power of POWER; None where none is. ``se`` is its standard error, and ``freedom`` that of
-    its t test, infinite where the test is another one.
-    """
-
-    value: float
-    p: float
-    detectable: float | None
-    freedom: float = inf
-    se: float | None = None
-
-
-NOTHING = Estimate(None, None, None, 0)
+NOTHING = Estimate()
 
 
 def proportion(successes: int, n: int) -> Estimate:
@@ -144,7 +113,7 @@ def mean(values: Sequence[float] | NDArray[np.float64]) -> Estimate:
     sample = sample[np.isfinite(sample)]
     n = len(sample)
     if n < 2:
-        return replace(NOTHING, value=float(sample[0]) if n else None, n=n)
+        return Estimate(float(sample[0]) if n else None, n=n)
     return estimate(float(sample.mean()), float(sample.std(ddof=1) / sqrt(n)), n - 1, n)
 
 
@@ -166,16 +135,16 @@ def two_sided_p(statistic: float, freedom: float = inf) -> float:
     return float(2 * stats.t.sf(abs(statistic), freedom))
 
 
-def tested(value: float, se: float, freedom: float) -> Difference:
+def tested(value: float, se: float, freedom: float) -> Estimate:
     """A difference with this standard error, against none by Student's t."""
     # Equal but for rounding is equal; where nothing varies, any other difference is sure.
     statistic = 0.0 if abs(value) < ROUNDING else value / se if se else inf
     p = two_sided_p(statistic, freedom)
     ends = interval(value, se, freedom)
-    return Difference(value, *ends, p, detectable(se, freedom), freedom, se)
+    return Estimate(value, *ends, se=se, freedom=freedom, p=p, detectable=detectable(se, freedom))
 
 
-def difference(one: Estimate | Difference, other: Estimate | Difference) -> Difference | None:
+def difference(one: Estimate, other: Estimate) -> Estimate | None:
     """One independent estimate less another.
 
     It is tested as Welch (1947) does, so that the 5 % hold also where the groups differ in size and

@@ -7,9 +7,10 @@ import pandas as pd
 from scipy import stats
 
 from merge_runner_analysis.grouping import Group
-from merge_runner_analysis.metrics import BOXES, JUDGED, HumanReference, Metric
+from merge_runner_analysis.metrics import BOXES, JUDGED, Metric
 from merge_runner_analysis.published import citation, published
-from merge_runner_analysis.stats.intervals import LEVEL, NOTHING, Estimate, mean, wilson
+from merge_runner_analysis.stats.estimate import Estimate
+from merge_runner_analysis.stats.intervals import LEVEL, NOTHING, mean, wilson
 from merge_runner_analysis.stats.intervals import estimate as interval_of
 
 PAPER = "paper_ablation_quantitative"
@@ -64,7 +65,7 @@ def mean_of(trials: pd.DataFrame, column: str, shares: pd.Series | None = None) 
         shares = trials["condition"].value_counts()
     whole = _weighted_mean(trials, column, shares)
     if len(pairs) < 2:
-        return Estimate(whole, None, None, len(trials))
+        return Estimate(whole, n=len(trials))
     parts = [_weighted_mean(trials[trials["pair"] != pair], column, shares) for pair in pairs]
     freedom = len(pairs) - 1
     se = float(((np.array(parts) - whole) ** 2).sum() * freedom / len(pairs)) ** 0.5
@@ -119,12 +120,12 @@ def known(group: Group, metric: Metric) -> bool:
     return metric.column in found and bool(found[metric.column].notna().any())
 
 
-def estimate_or_reference(group: Group, metric: Metric) -> Estimate | HumanReference | None:
+def estimate_or_reference(group: Group, metric: Metric) -> Estimate | None:
     """What a group comes to; of humans without traces what the paper says, None where nothing."""
     if known(group, metric) or not metric.paper_of_humans:
         return estimate(group, metric) if known(group, metric) else None
     row = published(PAPER).query("driver == 'human'").iloc[0]
-    return HumanReference(float(row[metric.paper_of_humans]), None, None, citation(PAPER))
+    return Estimate(float(row[metric.paper_of_humans]), source=citation(PAPER))
 
 
 def no_human_value(metric: Metric) -> str:

@@ -41,15 +41,16 @@ from merge_runner_analysis.stats.contrasts import (
     shared_cells,
     weighted,
 )
+from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.indicators import (
     ALPHA,
     NONE_APART,
     TESTED,
     fits,
+    judge,
     less_humans,
-    verdicts,
 )
-from merge_runner_analysis.stats.intervals import LEVEL, NOTHING, Estimate, melded, wilson
+from merge_runner_analysis.stats.intervals import LEVEL, melded, wilson
 from merge_runner_analysis.stats.measures import (
     counts,
     estimate,
@@ -91,21 +92,6 @@ Ends = tuple[float, float] | None
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
-    """What is known of a measure: an estimate, why there is no value, and what to know of it.
-
-    A rate counts ``k`` trials; with ``undecided`` ones it has no value, and its interval holds
-    whether none or all of them count (Manski 1989).
-    """
-
-    estimate: Estimate
-    problem: str = ""
-    remark: str = ""
-    k: int | None = None
-    undecided: int = 0
-
-
-@dataclass(frozen=True, slots=True)
 class Tested:
     """How a driver's ``own`` value is tested: against the ``human`` one, or against a margin.
 
@@ -133,8 +119,8 @@ class Comparison:
     """
 
     measure: Measure
-    own: Known
-    human: Known
+    own: Estimate
+    human: Estimate
     state: str
     note: str
     difference: float | None = None
@@ -152,11 +138,11 @@ def compared(study: Study, group: Group) -> tuple[Comparison, ...]:
     likeness = less_humans(study, alike) if len(alike.finished) else None
     tests = tests_of(alike, study.human, likeness)
     states, p_holm = decided(tests)
-    levels = levels_of({name: test.p for name, test in tests.items()}, p_holm)
+    levels = holm_levels({name: test.p for name, test in tests.items()}, p_holm)
     why = {
-        name: verdict.why
+        name: judgement.why
         for name, indicator in SLOPES.items()
-        if (verdict := verdicts(fits(alike).firth, fits(alike).hc3, robust=True)[indicator]).why
+        if (judgement := judge(fits(alike).firth, fits(alike).hc3, robust=True)[indicator]).why
     }
     found = []
     for name, measure in MEASURES.items():
@@ -171,14 +157,13 @@ def compared(study: Study, group: Group) -> tuple[Comparison, ...]:
             if measure.margin is None:
                 one = replace(one, difference=test.own - test.human, interval=ends)
             elif ends:
-                at_level = replace(own.estimate, low=ends[0], high=ends[1])
-                one = replace(one, own=replace(own, estimate=at_level))
+                one = replace(one, own=replace(own, low=ends[0], high=ends[1]))
         found.append(one)
     return tuple(found)
 
 
 @remembered
-def of_humans(study: Study) -> dict[str, Known]:
+def of_humans(study: Study) -> dict[str, Estimate]:
     """The humans by measure, over all conditions."""
     return {name: _human(study.human, study.human, name) for name in MEASURES}
 
@@ -192,7 +177,7 @@ def in_human_conditions(group: Group) -> Group:
 
 def tests_of(group: Group, human: Group, likeness: Estimate | None) -> dict[str, Tested]:
     """The tests of a driver's measures; those that cannot be tested are missing."""
-    robust = verdicts(fits(group).firth, fits(group).hc3, robust=True)
+    robust = judge(fits(group).firth, fits(group).hc3, robust=True)
     found = {name: _who_first(group, human, name) for name in WHO_FIRST}
     found["collisions"] = _rates(group, human)
     found["gap"] = _means(_gap(group), human_gap(human, group))
@@ -219,7 +204,7 @@ def decided(tests: Mapping[str, Tested]) -> tuple[dict[str, str], dict[str, floa
     }, p_holm
 
 
-def levels_of(p: Mapping[str, float], p_holm: Mapping[str, float]) -> dict[str, float]:
+def holm_levels(p: Mapping[str, float], p_holm: Mapping[str, float]) -> dict[str, float]:
     """The levels of intervals that exclude no difference where the corrected p are below ALPHA.
 
     Holm tests the smallest of m p-values at ALPHA / m, the next at ALPHA / (m - 1), and so on; all
@@ -263,7 +248,7 @@ def _rates(group: Group, human: Group) -> Tested | None:
     cells = shared_cells(group.ended_outcomes, human.outcomes, BOXES.column)
     if cells is None or undecided(group, BOXES):
         return None
-    (k, n), humans = counts(group, BOXES), _standardised(human, group).estimate
+    (k, n), humans = counts(group, BOXES), _standardised(human, group)
     assert humans.value is not None
     assert humans.weight is not None
     rates, p = ((k / n, n), (humans.value / 100, humans.weight)), cells.p
@@ -277,12 +262,14 @@ def _rates(group: Group, human: Group) -> Tested | None:
     return Tested(100 * k / n, humans.value, p, interval, least)
 
 
-def _means(own: Known, other: Known) -> Tested | None:
+def _means(own: Estimate, other: Estimate) -> Tested | None:
     """Two estimates, by Welch's test."""
-    value, human = own.estimate.value, other.estimate.value
-    apart = intervals.difference(own.estimate, other.estimate)
-    if value is None or human is None or apart is None or apart.se is None:
+    value, human, apart = own.value, other.value, intervals.difference(own, other)
+    if value is None or human is None or apart is None:
         return None
+    assert apart.value is not None
+    assert apart.se is not None
+    assert apart.p is not None
     interval = partial(intervals.interval, apart.value, apart.se, apart.freedom)
     return Tested(value, human, apart.p, interval, apart.detectable)
 
@@ -304,7 +291,7 @@ def _held(likeness: Estimate) -> Tested | None:
     return Tested(value, 0.0, p, interval, within=max(-low, high) < margin)
 
 
-def _own(study: Study, group: Group, name: str, likeness: Estimate | None) -> Known:
+def _own(study: Study, group: Group, name: str, likeness: Estimate | None) -> Estimate:
     """A driver's estimate."""
     if name == "collisions":
         return _collided(group)
@@ -318,17 +305,17 @@ def _own(study: Study, group: Group, name: str, likeness: Estimate | None) -> Kn
         return _moved(fits(group).hc3, group)
     # I5: how far accelerations are held, less the humans, in human standard deviations.
     if likeness is not None and likeness.value is not None:
-        return Known(likeness)
+        return likeness
     why = "no trial acted" if study.calibrated else "too few human recordings are imported"
-    return Known(replace(NOTHING, n=len(group.finished)), f"I5 is not compared: {why}")
+    return Estimate(n=len(group.finished), problem=f"I5 is not compared: {why}")
 
 
-def _human(human: Group, group: Group, name: str) -> Known:
+def _human(human: Group, group: Group, name: str) -> Estimate:
     """The humans' estimate beside a group's, in the same conditions."""
     if name == "collisions":
         return _standardised(human, group)
     if name == "held":
-        return Known(Estimate(0.0, None, None, len(human.finished)))
+        return Estimate(0.0, n=len(human.finished))
     if name in WHO_FIRST:
         return _slope(human, name)
     if name == "gap":
@@ -337,7 +324,7 @@ def _human(human: Group, group: Group, name: str) -> Known:
     found = _headway(fit) if name == "gap-headway" else _moved(fit, group)
     if found.problem:
         return replace(found, problem=f"humans: {found.problem}")
-    return found if _imported(human) else replace(found, remark=PUBLISHED)
+    return found if _imported(human) else replace(found, source=PUBLISHED)
 
 
 def _imported(human: Group) -> bool:
@@ -345,14 +332,14 @@ def _imported(human: Group) -> bool:
     return human.measured and human.finished["pair"].nunique() >= MIN_PAIRS
 
 
-def _gap(group: Group) -> Known:
+def _gap(group: Group) -> Estimate:
     """The mean gap of a driver."""
     found = mean_of(group.finished, GAP.column)
     problem = "a single trial has no error" if found.n else "no trial finished with a gap"
-    return Known(found, problem if found.se is None else "")
+    return replace(found, problem=problem) if found.se is None else found
 
 
-def human_gap(human: Group, group: Group) -> Known:
+def human_gap(human: Group, group: Group) -> Estimate:
     """The humans' mean gap in the conditions of a group's trials with a gap, as these weigh.
 
     The published mean is moved by what the published regression predicts for these conditions. It
@@ -365,12 +352,12 @@ def human_gap(human: Group, group: Group) -> Known:
         there = human.finished.loc[human.finished[GAP.column].notna(), "condition"]
         if shares is not None and (lacking := {*shares.index} - {*there}):
             problem = f"humans: no gap in {len(lacking)} of its conditions"
-            return Known(replace(NOTHING, n=len(there)), problem)
+            return Estimate(n=len(there), problem=problem)
         if shares is not None and not len(shares):
             shares = None
         within = there if shares is None else there[there.isin(shares.index)]
         trials = human.finished.loc[within.index]
-        return Known(mean_of(trials, GAP.column, None if group is human else shares))
+        return mean_of(trials, GAP.column, None if group is human else shares)
     row = published("paper_ablation_quantitative").query("driver == 'human'").iloc[0]
     fit, outcomes = human_fit(human), human_outcomes().query("status == 'finished'")
     moved = np.zeros(len(GAP_TERMS))
@@ -380,7 +367,7 @@ def human_gap(human: Group, group: Group) -> Known:
     spread = published("human_gap_intercepts")["intercept_m"].std() / len(PAIRS) ** 0.5
     se = float(spread**2 + moved @ fit.covariance @ moved) ** 0.5
     value = float(row["gap_m"]) + float(moved @ [term.b for term in fit.terms.values()])
-    return Known(intervals.estimate(value, se, len(PAIRS) - 1, fit.n), remark=PUBLISHED)
+    return replace(intervals.estimate(value, se, len(PAIRS) - 1, fit.n), source=PUBLISHED)
 
 
 def _mean_design(trials: pd.DataFrame) -> Array:
@@ -409,48 +396,49 @@ def human_fit(human: Group) -> Regression:
 
 
 @remembered
-def _slope(group: Group, name: str) -> Known:
+def _slope(group: Group, name: str) -> Estimate:
     """A slope of who goes first by Firth's fit."""
     fit, term = fits(group).firth, TESTED[SLOPES[name]][0]
     ends = fit.interval(term, LEVEL)
     if ends is None:
         problem = fit.problem or "no profile of Firth's likelihood converges"
-        return Known(replace(NOTHING, n=fit.n), problem)
-    return Known(Estimate(fit.terms[term].b, *ends, fit.n, fit.terms[term].se))
+        return Estimate(n=fit.n, problem=problem)
+    return Estimate(fit.terms[term].b, *ends, fit.n, fit.terms[term].se)
 
 
-def _headway(fit: Regression) -> Known:
+def _headway(fit: Regression) -> Estimate:
     """The slope of the gap on headway."""
     if fit.problem:
-        return Known(replace(NOTHING, n=fit.n), fit.problem)
+        return Estimate(n=fit.n, problem=fit.problem)
     term = fit.terms[TESTED["I3"][0]]
-    return Known(intervals.estimate(term.b, term.se, fit.freedom, fit.n))
+    return intervals.estimate(term.b, term.se, fit.freedom, fit.n)
 
 
-def _moved(fit: Regression, group: Group) -> Known:
+def _moved(fit: Regression, group: Group) -> Estimate:
     """The largest difference of gaps that relative velocity alone makes in a group's conditions."""
     moved = fit.moved(group.trials)
     if moved is None:
-        return Known(replace(NOTHING, n=fit.n), fit.problem or NONE_APART)
-    return Known(Estimate(moved.most, *moved.interval(LEVEL), fit.n))
+        return Estimate(n=fit.n, problem=fit.problem or NONE_APART)
+    return Estimate(moved.most, *moved.interval(LEVEL), fit.n)
 
 
-def _collided(group: Group) -> Known:
+def _collided(group: Group) -> Estimate:
     """The share of ended trials with a collision by the humans' rule, in percent."""
     (k, n), cut_off = counts(group, BOXES), undecided(group, BOXES)
     if not n + cut_off:
-        return Known(NOTHING, f"no trial ended: {group.left_out}")
-    return Known(estimate(group, BOXES), undecided_note(group, BOXES), k=k, undecided=cut_off)
+        return Estimate(problem=f"no trial ended: {group.left_out}")
+    found, problem = estimate(group, BOXES), undecided_note(group, BOXES)
+    return replace(found, problem=problem, k=k, undecided=cut_off)
 
 
-def _standardised(human: Group, group: Group) -> Known:
+def _standardised(human: Group, group: Group) -> Estimate:
     """The humans' collisions in the conditions of a group, which weigh as they do there."""
     played = group.ended_outcomes["condition"].value_counts()  # with those that are undecided
     there = human.outcomes[human.outcomes["condition"].isin(played.index)]
     if there.empty:
-        return Known(NOTHING, "no human drove its conditions")
+        return Estimate(problem="no human drove its conditions")
     humans = there.groupby("condition")[BOXES.column].agg(["sum", "size"]).astype(int)
     k, n = humans.to_numpy().T
     rate, as_good_as = weighted(k, n, played[humans.index].to_numpy(float))
     low, high = wilson(rate, as_good_as)
-    return Known(Estimate(100 * rate, 100 * low, 100 * high, len(there), weight=as_good_as))
+    return Estimate(100 * rate, 100 * low, 100 * high, len(there), weight=as_good_as)

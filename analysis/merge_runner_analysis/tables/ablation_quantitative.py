@@ -6,12 +6,10 @@ from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.metrics import (
     INTERVALS,
     RULES_NOTE,
-    Bounded,
-    HumanReference,
     Metric,
     shown_in,
 )
-from merge_runner_analysis.stats.intervals import Estimate
+from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.measures import (
     estimate_or_reference,
     no_human_value,
@@ -62,16 +60,16 @@ def metric_table(name: str, groups: list[Group], place: str, *notes: str) -> Tab
         sizes = {
             f"{one.name}_n": estimate.n or None
             for one in metrics
-            if one.estimator == "median" and isinstance(estimate := found.get(one.name), Estimate)
+            if one.estimator == "median" and (estimate := found.get(one.name))
         }
         cells = {"n": len(group.ended_outcomes), **sizes, **values, **intervals}
         rows.append(row_of(group, cells, *remarks, rests_on=ENDED))
     return Table(name, columns, rows, (f"intervals: {INTERVALS}", *notes))
 
 
-def measured(group: Group, metrics: list[Metric]) -> tuple[dict[str, Bounded], list[str]]:
+def measured(group: Group, metrics: list[Metric]) -> tuple[dict[str, Estimate], list[str]]:
     """What a group comes to by each metric, and remarks on those that are published or missing."""
-    found: dict[str, Bounded] = {}
+    found: dict[str, Estimate] = {}
     remarks = [outcomes_note(group)]
     reasons: dict[str, list[str]] = {}
     for metric in metrics:
@@ -80,7 +78,7 @@ def measured(group: Group, metrics: list[Metric]) -> tuple[dict[str, Bounded], l
             remarks.append(no_human_value(metric))
             continue
         found[metric.name] = one
-        if isinstance(one, HumanReference):
+        if one.source:
             why = f"published, no human traces are imported ({one.source})"
             reasons.setdefault(why, []).append(metric.heading)
         elif one.value is None and one.bounds() is None:

@@ -86,28 +86,27 @@ def _family(study: Study, driver: str, metric: Metric) -> Iterator[Row]:
     groups = {group.setting: group for group in study.models if group.driver == driver}
     other = groups.pop(study.reference, None)
     found = {
-        group: difference
+        group: difference.times(100 if metric.rate else 1)
         for group in groups.values()
         if other and (difference := contrast(study, (group, other), metric))
     }
-    holm = corrected([difference.p for difference in found.values()])
+    holm = corrected([difference.p for difference in found.values() if difference.p is not None])
     for (group, difference), p_holm in zip(found.items(), holm, strict=True):
         assert other is not None
         first, second = (
             frame["condition"]
             for frame in trials_by_cell(study, (group, other), metric, "condition", shared=True)
         )
-        factor, least = 100 if metric.rate else 1, difference.detectable
         values: dict[str, Value] = {
             "driver": group.label,
             "setting": group.setting,
             "reference": other.setting,
             "measure": metric.heading,
-            "difference": factor * difference.value,
-            "ci": difference.bounds(factor),
+            "difference": difference.value,
+            "ci": difference.bounds(),
             "p": difference.p,
             "p_holm": p_holm,
-            "detectable": None if least is None else factor * least,
+            "detectable": difference.detectable,
             "n": len(first),
             "n_reference": len(second),
             "freedom": None if isinf(difference.freedom) else difference.freedom,
@@ -117,7 +116,7 @@ def _family(study: Study, driver: str, metric: Metric) -> Iterator[Row]:
             f"{group.id}/{other.setting}/{metric.name}",
             (group.id, other.id),
             values,
-            few if least is None else "",
+            few if difference.detectable is None else "",
             metric.column,
             tuple(sorted({*first})),
         )

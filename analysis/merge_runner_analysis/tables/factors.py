@@ -157,12 +157,8 @@ def _difference(study: Study, metric: Metric, *levels: Level) -> dict[str, Value
     found = contrast(study, [level.pooled for level in levels], metric, "cell")
     if found is None:
         return {}
-    unit = 100 if metric.rate else 1
-    return {
-        "difference": unit * found.value,
-        "difference_ci": found.bounds(unit),
-        "p": found.p,
-    }
+    found = found.times(100 if metric.rate else 1)
+    return {"difference": found.value, "difference_ci": found.bounds(), "p": found.p}
 
 
 def _interactions(study: Study, found: list[list[Level]]) -> Iterator[Row]:

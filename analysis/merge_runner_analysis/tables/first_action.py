@@ -9,6 +9,7 @@ import pandas as pd
 
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.published import citation, published
+from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.first_action import (
     HOLD_MPS2,
     exchange_rate,
@@ -18,7 +19,6 @@ from merge_runner_analysis.stats.first_action import (
     seats,
     slope,
 )
-from merge_runner_analysis.stats.intervals import Estimate
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.model import (
     ENDED,

@@ -14,7 +14,6 @@ from merge_runner_analysis.stats.indicators import (
     score,
     total,
 )
-from merge_runner_analysis.stats.intervals import Estimate
 from merge_runner_analysis.stats.measures import outcomes_note
 from merge_runner_analysis.stats.regressions import GAP_MARGIN_M
 from merge_runner_analysis.study import Study
@@ -115,9 +114,9 @@ def _metric_row(group: Group, metric: Metric) -> Row:
     one = found.get(metric.name)
     if one:
         values |= {"value": one.value, "interval": one.bounds()}
-    if isinstance(one, Estimate):
-        values["n"] = one.n
-    rests_on = metric.column if isinstance(one, Estimate) else FINISHED
+    rests_on = FINISHED
+    if one and not one.source:
+        values["n"], rests_on = one.n, metric.column
     return row_of(group, values, *remarks, item=metric.name, rests_on=rests_on)
 
 

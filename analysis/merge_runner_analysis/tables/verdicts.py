@@ -12,7 +12,8 @@ from merge_runner_analysis.drivers import language_models
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.metrics import BOXES
 from merge_runner_analysis.published import HUMAN, HUMAN_TRIALS
-from merge_runner_analysis.stats.verdicts import Comparison, Known, compared, of_humans
+from merge_runner_analysis.stats.estimate import Estimate
+from merge_runner_analysis.stats.verdicts import Comparison, compared, of_humans
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Value, interval
 from merge_runner_analysis.wording import (
@@ -104,8 +105,8 @@ def _compared(group: Group, kind: str, found: Comparison) -> Row:
     values: dict[str, Value] = _driver(group, kind) | {
         "measure": measure.name,
         **_known(found.own),
-        "human": found.human.estimate.value,
-        "human_ci": found.human.estimate.bounds(),
+        "human": found.human.value,
+        "human_ci": found.human.bounds(),
         "difference": found.difference,
         "difference_ci": found.interval,
         "level": None if found.level is None else 100 * found.level,
@@ -121,19 +122,19 @@ def _compared(group: Group, kind: str, found: Comparison) -> Row:
 def _human_rows(study: Study) -> Iterator[Row]:
     for name, found in of_humans(study).items():
         values = _driver(study.human, HUMANS) | {"measure": name, **_known(found)}
-        note = "; ".join(filter(None, (found.problem, found.remark)))
+        note = "; ".join(filter(None, (found.problem, found.source)))
         # What is published rests on no trials here.
         rests_on = MEASURES[name].rests_on
-        if found.remark or not study.human.measured:
+        if found.source or not study.human.measured:
             rests_on = ""
         yield Row(f"{HUMAN}/{name}", (HUMAN,), values, note, rests_on)
 
 
-def _known(found: Known) -> dict[str, Value]:
+def _known(found: Estimate) -> dict[str, Value]:
     return {
-        "n": found.estimate.n,
+        "n": found.n,
         "k": found.k,
         "undecided": found.undecided or None,
-        "estimate": found.estimate.value,
-        "ci": found.estimate.bounds(),
+        "estimate": found.value,
+        "ci": found.bounds(),
     }

@@ -9,7 +9,13 @@ from merge_runner_analysis.frames import SPEEDS
 from merge_runner_analysis.grouping import of_trials
 from merge_runner_analysis.metrics import GAP
 from merge_runner_analysis.stats.held import measure_profiles
-from merge_runner_analysis.stats.indicators import Verdict, less_humans, mean_gain, profiles, score
+from merge_runner_analysis.stats.indicators import (
+    Judgement,
+    less_humans,
+    mean_gain,
+    profiles,
+    score,
+)
 from merge_runner_analysis.stats.measures import estimate
 from merge_runner_analysis.stats.verdicts import human_gap
 from merge_runner_analysis.tables import make_tables
@@ -79,7 +85,7 @@ def test_how_like_the_humans_a_driver_is_in_i5_is_a_number(imported, after):
     (group,), human = imported.models, imported.human
     for one, passed in ((group, True), (human, False)):
         found = score(imported, one)
-        assert (found.robust["I5"], found.paper["I5"]) == (Verdict(passed), Verdict(None))
+        assert (found.robust["I5"], found.paper["I5"]) == (Judgement(passed), Judgement(None))
     assert mean_gain(imported, human).value < 0 < mean_gain(imported, group).value
     assert less_humans(imported, human) is None
     apart = less_humans(imported, group)
@@ -96,7 +102,7 @@ def test_the_humans_mean_gap_is_one_number_in_all_tables(imported):
     human = imported.human
     of_pair = human.trials["pair"] == human.trials["pair"].iloc[0]
     less = replace(human, trials=human.trials[~of_pair | (of_pair.cumsum() <= 4)])
-    beside, table = human_gap(less, less).estimate, estimate(less, GAP)
+    beside, table = human_gap(less, less), estimate(less, GAP)
     assert beside.value == pytest.approx(less.finished[GAP.column].mean())
     assert (table.value, table.bounds(), table.n) == (beside.value, beside.bounds(), beside.n)
 

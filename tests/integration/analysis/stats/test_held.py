@@ -9,7 +9,7 @@ from merge_runner.config import ScenarioConfig
 from merge_runner_analysis.frames import SPEEDS, load
 from merge_runner_analysis.stats.held import measure_profiles
 from merge_runner_analysis.stats.indicators import (
-    Verdict,
+    Judgement,
     gains,
     mean_gain,
     piecewise_constant,
@@ -84,16 +84,16 @@ def programs(golden):
 def test_idm_moves_and_its_gap_depends_on_who_is_faster_and_projected_order_holds(programs):
     study, groups = programs
     idm = score(study, groups["idm"])
-    assert (idm.paper["I4"], idm.robust["I4"]) == (Verdict(True), Verdict(False))
-    assert (idm.paper["I5"], idm.robust["I5"]) == (Verdict(None), Verdict(False))
-    assert score(study, groups["projected-order"]).robust["I5"] == Verdict(True)
+    assert (idm.paper["I4"], idm.robust["I4"]) == (Judgement(True), Judgement(False))
+    assert (idm.paper["I5"], idm.robust["I5"]) == (Judgement(None), Judgement(False))
+    assert score(study, groups["projected-order"]).robust["I5"] == Judgement(True)
 
 
 def test_before_an_import_humans_are_judged_by_eye_and_a_driver_by_its_accelerations(small):
     human, driver = score(small, small.human), score(small, small.models[0])
     eye = "by eye, the paper"
-    assert (human.paper["I5"], human.robust["I5"]) == (Verdict(True, eye), Verdict(None, eye))
-    assert (driver.paper["I5"], driver.robust["I5"]) == (Verdict(None), Verdict(True))
+    assert (human.paper["I5"], human.robust["I5"]) == (Judgement(True, eye), Judgement(None, eye))
+    assert (driver.paper["I5"], driver.robust["I5"]) == (Judgement(None), Judgement(True))
 
 
 def test_i5_is_one_sided_the_mean_gain_is_above_0(programs):
@@ -107,7 +107,7 @@ def test_i5_is_one_sided_the_mean_gain_is_above_0(programs):
             )
             values = gains(study, part)["gain"]
             above = stats.ttest_1samp(values, 0, alternative="greater").pvalue < 0.025
-            assert piecewise_constant(study, part) == Verdict(above)
+            assert piecewise_constant(study, part) == Judgement(above)
             seen.add((above, values.mean() > 0))
     assert {(True, True), (False, False)} <= seen
 

@@ -91,12 +91,12 @@ def test_i4_is_judged_by_the_largest_predicted_difference(study, gap_of, scatter
     gap = gap_of(headway, velocity) + scatter * noise
     moved = replace(group, trials=group.trials.assign(gap_m=gap, counted_gap_m=gap))
     (found,) = (c for c in compared(study, moved) if c.measure.name == "gap-velocity")
-    low, high = found.own.estimate.bounds()
+    low, high = found.own.bounds()
     assert found.state == state
     assert level is None or found.level == pytest.approx(level)
-    assert found.human.estimate.value == pytest.approx(6.4 * 0.06)
+    assert found.human.value == pytest.approx(6.4 * 0.06)
     if state == "unlike":
-        assert found.own.estimate.value == pytest.approx(0.34 * 6.4, abs=0.05)
+        assert found.own.value == pytest.approx(0.34 * 6.4, abs=0.05)
         assert found.level >= 0.95
     assert {"unlike": low > 1, "shown": high < 1, "inconclusive": low <= 1 <= high}[state]
 
@@ -104,18 +104,18 @@ def test_i4_is_judged_by_the_largest_predicted_difference(study, gap_of, scatter
 def test_humans_leave_their_gap_in_the_conditions_of_the_drivers_finished_trials(study):
     """Beside a driver that finished in wide conditions alone, they leave more."""
     group, human = study.models[0], study.human
-    assert human_gap(human, human).estimate.value == pytest.approx(3.85)
+    assert human_gap(human, human).value == pytest.approx(3.85)
     narrow = group.trials["projected_headway_m"].abs() != 4
-    wide = human_gap(human, group.part(lambda trials: ~narrow)).estimate
+    wide = human_gap(human, group.part(lambda trials: ~narrow))
     regression = 3.54 + 0.17 * 4 - 0.2 * 0.8 * 2 / 3  # h dv cancels
     assert wide.value == pytest.approx(regression, abs=0.05)
-    assert wide.value > human_gap(human, group).estimate.value
+    assert wide.value > human_gap(human, group).value
     # Conditions in which no trial has a gap do not count.
     lost = group.trials.assign(
         status=group.trials["status"].mask(narrow, "collided"),
         counted_gap_m=group.trials["counted_gap_m"].mask(narrow),
     )
-    assert human_gap(human, replace(group, trials=lost)).estimate == wide
+    assert human_gap(human, replace(group, trials=lost)) == wide
 
 
 def test_the_humans_are_the_published_ones(study, rows):

@@ -19,7 +19,7 @@ from merge_runner_analysis.stats.contrasts import (
     rejected,
     shared_cells,
 )
-from merge_runner_analysis.stats.verdicts import levels_of
+from merge_runner_analysis.stats.verdicts import holm_levels
 
 
 def trials(strata) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -150,5 +150,5 @@ def test_a_family_is_corrected_as_by_statsmodels(n):
 def test_the_levels_of_intervals_are_those_of_holms_steps():
     p = {"a": 0.001, "b": 0.04, "c": 0.02, "d": 0.9}
     # Of four the smallest is below .05 / 4; the next is not below .05 / 3, and ends it.
-    found = levels_of(p, dict(zip(p, corrected([*p.values()]), strict=True)))
+    found = holm_levels(p, dict(zip(p, corrected([*p.values()]), strict=True)))
     assert [*found.values()] == pytest.approx([1 - 0.05 / 4, *[1 - 0.05 / 3] * 3])

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner_analysis.stats.indicators import NONE_APART, Verdict, total, verdicts
+from merge_runner_analysis.stats.indicators import NONE_APART, Judgement, judge, total
 from merge_runner_analysis.stats.regressions import (
     GAP_MARGIN_M,
     Regression,
@@ -21,8 +21,8 @@ from merge_runner_analysis.stats.regressions import (
 
 SEPARATED = Regression(110, {}, "separation: no finite estimate of projected_headway")
 MISSING = Regression(0, {}, "no finished trial with a gap")
-paper_verdicts = partial(verdicts, robust=False)
-robust_verdicts = partial(verdicts, robust=True)
+paper_verdicts = partial(judge, robust=False)
+robust_verdicts = partial(judge, robust=True)
 BOTH = pytest.mark.parametrize("by_rule", [paper_verdicts, robust_verdicts])
 
 
@@ -66,7 +66,7 @@ def gap(headway=(0.2, 0.001), velocity=(0.0, 0.9), product=(0.0, 0.9), se=0.2) -
 )
 def test_i1_to_i3_need_their_sign_and_p_below_5_percent(by_rule, b, p, passed):
     found = by_rule(who_first((b, p), (b, p)), gap((b, p)))
-    assert [found[name] for name in ("I1", "I2", "I3")] == [*map(Verdict, passed)]
+    assert [found[name] for name in ("I1", "I2", "I3")] == [*map(Judgement, passed)]
 
 
 @BOTH
@@ -83,7 +83,7 @@ def test_each_indicator_reads_its_own_term(by_rule, open_one):
 @pytest.mark.parametrize(("p", "passed"), [(0.049, False), (0.05, True)])
 @pytest.mark.parametrize("b", [-1.0, 1.0])
 def test_i4_holds_by_the_paper_where_the_effect_is_not_significant(b, p, passed):
-    assert paper_verdicts(who_first(), gap(velocity=(b, p)))["I4"] == Verdict(passed)
+    assert paper_verdicts(who_first(), gap(velocity=(b, p)))["I4"] == Judgement(passed)
 
 
 @pytest.mark.parametrize(
@@ -135,7 +135,7 @@ def by_product(slope):
 def test_gaps_without_spread_are_compared_with_the_margin_themselves(slope, passed):
     """They lie on the regression: a slope of 1 / 6.4 of the product is 1 m."""
     fit = gap_ols(trials_of(by_product(slope)), robust=True)
-    assert robust_verdicts(who_first(), fit)["I4"] == Verdict(passed)
+    assert robust_verdicts(who_first(), fit)["I4"] == Judgement(passed)
     assert [equivalence_p(b, 0.0, 9) for b in (0.0, 0.999, -0.999, 1.0, -1.0)] == [0, 0, 0, 1, 1]
 
 
@@ -148,12 +148,12 @@ def test_differences_are_of_played_conditions_with_one_projected_headway():
         trials = pd.concat([trials_of(played)] * 20)
         trials["gap_m"] += rng.normal(0, 0.01, len(trials))
         fit = gap_ols(trials, robust=True)
-        assert robust_verdicts(who_first(), fit)["I4"] == Verdict(holds)
+        assert robust_verdicts(who_first(), fit)["I4"] == Judgement(holds)
 
 
 def test_without_conditions_that_differ_in_relative_velocity_alone_i4_is_not_judged():
     fit = replace(gap(), equivalence_p=None)
-    assert robust_verdicts(who_first(), fit)["I4"] == Verdict(None, NONE_APART)
+    assert robust_verdicts(who_first(), fit)["I4"] == Judgement(None, NONE_APART)
     assert paper_verdicts(who_first(), fit)["I4"].passed is True
 
 
@@ -167,15 +167,15 @@ def test_equivalence_is_the_larger_p_of_two_one_sided_t_tests(b, freedom):
 
 def test_a_separated_fit_is_neither_a_pass_nor_a_failure_and_no_part_of_the_score():
     found = paper_verdicts(SEPARATED, gap((0.2, 0.2)))
-    assert found["I1"] == found["I2"] == Verdict(None, SEPARATED.problem)
+    assert found["I1"] == found["I2"] == Judgement(None, SEPARATED.problem)
     assert total(found) == "1 of 2"
-    assert total({"I1": Verdict(None, "too few")}) is None
+    assert total({"I1": Judgement(None, "too few")}) is None
 
 
 @BOTH
 def test_a_fit_that_is_missing_leaves_its_indicators_open(by_rule):
     nobody = Regression(0, {}, "no finished trial with a first merger")
-    first, second = Verdict(None, nobody.problem), Verdict(None, MISSING.problem)
-    yes = Verdict(True)
+    first, second = Judgement(None, nobody.problem), Judgement(None, MISSING.problem)
+    yes = Judgement(True)
     assert [*by_rule(nobody, gap(se=0.05)).values()] == [first, first, yes, yes]
     assert [*by_rule(who_first(), MISSING).values()] == [yes, yes, second, second]

@@ -8,8 +8,8 @@ import pytest
 from scipy import stats
 from statsmodels.stats.proportion import proportion_confint
 
+from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.intervals import (
-    Estimate,
     detectable,
     difference,
     estimate,
@@ -36,7 +36,7 @@ def test_a_proportion_has_the_wilson_interval_whose_ends_are_exact(n):
 
 def test_no_trial_has_no_proportion_and_no_value_no_bounds():
     assert proportion(0, 0) == mean([]) == mean([np.nan]) == NOTHING
-    assert NOTHING.bounds() is Estimate(4.2, None, None, 1).bounds(100) is None
+    assert NOTHING.bounds() is Estimate(4.2, None, None, 1).bounds() is None
     assert mean([4.2]) == mean([np.nan, 4.2]) == Estimate(4.2, None, None, 1)
 
 
@@ -58,7 +58,7 @@ def test_a_difference_of_means_is_welchs_t_test(seed):
     found, welch = difference(mean(one), mean(other)), stats.ttest_ind(one, other, equal_var=False)
     assert (found.p, found.freedom) == (pytest.approx(welch.pvalue), pytest.approx(welch.df))
     interval = welch.confidence_interval(0.95)
-    assert found.bounds(100) == pytest.approx((100 * interval.low, 100 * interval.high))
+    assert found.times(100).bounds() == pytest.approx((100 * interval.low, 100 * interval.high))
     assert difference(mean([1.0, 1.0]), mean([2.0, 2.0])) is None
 
 

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from merge_runner_analysis.stats.indicators import compared
+from merge_runner_analysis.stats.indicators import likeness
 
 PAIRS = 9
 EACH = 10
@@ -37,16 +37,16 @@ def driver(shift, n=200, condition="N_0_0") -> pd.DataFrame:
 def test_another_mix_of_conditions_is_no_difference_and_trials_without_action_do_not_count():
     """The driver finished in one condition alone, where human gains are higher by 2."""
     ours = driver(0, condition="L_4_0")
-    found = compared(ours, humans())
+    found = likeness(ours, humans())
     assert (found.value, found.n) == (pytest.approx(0, abs=0.2), 200)
-    assert compared(pd.concat([ours, ours.assign(gain=np.nan)]), humans()) == found
+    assert likeness(pd.concat([ours, ours.assign(gain=np.nan)]), humans()) == found
 
 
 def test_the_unit_is_the_spread_of_human_trials_within_conditions():
     human, ours = humans(between=0), driver(0.4)
-    found = compared(ours, human).value
+    found = likeness(ours, human).value
     twice = [one.assign(gain=2 * one["gain"]) for one in (ours, human)]
-    assert compared(*twice).value == pytest.approx(found)
+    assert likeness(*twice).value == pytest.approx(found)
     apart = human["gain"] - human.groupby("condition")["gain"].transform("mean")
     spread = np.sqrt((apart**2).sum() / (len(human) - 2))
     usual = human.loc[human["condition"] == "N_0_0", "gain"].mean()
@@ -59,11 +59,11 @@ def test_the_interval_is_welchs_over_trials_and_pairs():
     pairs = one.groupby("pair")["gain"].mean()
     expected = stats.ttest_ind(ours["gain"], pairs, equal_var=False).confidence_interval()
     spread = np.sqrt(((one["gain"] - one["gain"].mean()) ** 2).sum() / (len(one) - 1))
-    found = compared(ours, one)
+    found = likeness(ours, one)
     assert (found.low, found.high) == pytest.approx((expected.low / spread, expected.high / spread))
 
 
 def test_one_pair_or_one_trial_or_none_cannot_be_compared():
     alone = humans().query("pair == 'pair3'")
     for ours, human in ((driver(0), alone), (driver(0, 1), humans()), (driver(0, 0), humans())):
-        assert compared(ours, human).bounds() is None
+        assert likeness(ours, human).bounds() is None
