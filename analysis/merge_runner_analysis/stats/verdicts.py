@@ -20,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -81,9 +82,6 @@ from merge_runner_analysis.wording import (
     Measure,
 )
 
-# By measure: the indicator that tests it.
-SLOPES = {"headway": "I1", "velocity": "I2", "gap-headway": "I3", "gap-velocity": "I4"}
-WHO_FIRST = ("headway", "velocity")
 PUBLISHED = "humans as published"
 # The level of an interval that lies within a margin where two one-sided tests at 5 % say so.
 WITHIN_LEVEL = 1 - 2 * ALPHA
@@ -107,6 +105,34 @@ class Tested:
     detectable: float | None = None
     within: bool = False
     trait: bool | None = None
+
+
+class Both(NamedTuple):
+    """A driver's trials in conditions of humans, and the humans.
+
+    ``likeness`` is how far the driver's accelerations are held, less the humans' (I5).
+    """
+
+    group: Group
+    human: Group
+    likeness: Estimate = Estimate()
+
+
+@dataclass(frozen=True, slots=True)
+class Statistic:
+    """How a measure is estimated of a driver and of humans, and tested: if not said, by Welch.
+
+    ``indicator`` is the one whose own test shows the trait.
+    """
+
+    own: Callable[[Both], Estimate]
+    human: Callable[[Both], Estimate]
+    test: Callable[[Both], Tested | None] | None = None
+    indicator: str = ""
+
+    def tested(self, both: Both) -> Tested | None:
+        """The test, if it can be made."""
+        return self.test(both) if self.test else _means(self.own(both), self.human(both))
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,20 +161,18 @@ class Comparison:
 def compared(study: Study, group: Group) -> tuple[Comparison, ...]:
     """Compare a driver with the humans by every measure."""
     alike = in_human_conditions(group)
-    likeness = less_humans(study, alike) if len(alike.finished) else None
-    tests = tests_of(alike, study.human, likeness)
+    both = Both(alike, study.human, _likeness(study, alike))
+    tests = tests_of(both)
     states, p_holm = decided(tests)
     levels = holm_levels({name: test.p for name, test in tests.items()}, p_holm)
-    why = {
-        name: judgement.why
-        for name, indicator in SLOPES.items()
-        if (judgement := judge(fits(alike).firth, fits(alike).hc3, robust=True)[indicator]).why
-    }
+    judgements = judge(fits(alike).firth, fits(alike).hc3, robust=True)
     found = []
     for name, measure in MEASURES.items():
-        own, human = _own(study, alike, name, likeness), _human(study.human, alike, name)
+        statistic = STATISTICS[name]
+        own, human = statistic.own(both), statistic.human(both)
         test, state = tests.get(name), states.get(name, OPEN if own.undecided else "")
-        note = [own.problem, human.problem, "" if own.problem else why.get(name, "")]
+        why = judgements[statistic.indicator].why if statistic.indicator else ""
+        note = [own.problem, human.problem, "" if own.problem else why]
         level = WITHIN_LEVEL if test and test.within else levels.get(name)
         one = Comparison(measure, own, human, state, "; ".join(filter(None, note)), level=level)
         if test and level is not None:
@@ -165,7 +189,8 @@ def compared(study: Study, group: Group) -> tuple[Comparison, ...]:
 @remembered
 def of_humans(study: Study) -> dict[str, Estimate]:
     """The humans by measure, over all conditions."""
-    return {name: _human(study.human, study.human, name) for name in MEASURES}
+    both = Both(study.human, study.human)
+    return {name: statistic.human(both) for name, statistic in STATISTICS.items()}
 
 
 def in_human_conditions(group: Group) -> Group:
@@ -175,25 +200,15 @@ def in_human_conditions(group: Group) -> Group:
     return group.part(lambda trials: trials["condition"].isin(HUMAN_CONDITIONS))
 
 
-def tests_of(group: Group, human: Group, likeness: Estimate | None) -> dict[str, Tested]:
+def tests_of(both: Both) -> dict[str, Tested]:
     """The tests of a driver's measures; those that cannot be tested are missing."""
-    robust = judge(fits(group).firth, fits(group).hc3, robust=True)
-    found = {name: _who_first(group, human, name) for name in WHO_FIRST}
-    found["collisions"] = _rates(group, human)
-    found["gap"] = _means(_gap(group), human_gap(human, group))
-    found["gap-headway"] = _means(_headway(fits(group).hc3), _headway(human_fit(human)))
-    moved = fits(group).hc3.moved(group.trials)
-    if moved is not None:
-        found["gap-velocity"] = Tested(
-            moved.most, 0.0, moved.beyond_p, moved.interval, within=moved.within_p < ALPHA
-        )
-    if likeness is not None:
-        found["held"] = _held(likeness)
-    return {
-        name: replace(test, trait=robust[SLOPES[name]].passed) if name in SLOPES else test
-        for name, test in found.items()
-        if test is not None
-    }
+    judgements = judge(fits(both.group).firth, fits(both.group).hc3, robust=True)
+    tests = {}
+    for name, statistic in STATISTICS.items():
+        if test := statistic.tested(both):
+            trait = judgements[statistic.indicator].passed if statistic.indicator else None
+            tests[name] = replace(test, trait=trait)
+    return tests
 
 
 def decided(tests: Mapping[str, Tested]) -> tuple[dict[str, str], dict[str, float]]:
@@ -226,9 +241,9 @@ def _state(measure: Measure, test: Tested, p_holm: float) -> str:
     return (WEAKER if weaker else STRONGER) if differs else SHOWN
 
 
-def _who_first(group: Group, human: Group, name: str) -> Tested | None:
+def _who_first(both: Both, term: str) -> Tested | None:
     """A slope of who goes first: a term of one model of both, in which every term may differ."""
-    term = TESTED[SLOPES[name]][0]
+    group, human = both.group, both.human
     own, other = fits(group).firth.terms.get(term), fits(human).firth.terms.get(term)
     less = _less_humans(group, human)
     if own is None or other is None or term not in less.terms:
@@ -243,12 +258,13 @@ def _less_humans(group: Group, human: Group) -> Regression:
     return who_first_firth(group.outcomes, less=human.outcomes)
 
 
-def _rates(group: Group, human: Group) -> Tested | None:
+def _rates(both: Both) -> Tested | None:
     """Collisions in percent; None with undecided trials, whose rate has no value."""
+    group, human = both.group, both.human
     cells = shared_cells(group.ended_outcomes, human.outcomes, BOXES.column)
     if cells is None or undecided(group, BOXES):
         return None
-    (k, n), humans = counts(group, BOXES), _standardised(human, group)
+    (k, n), humans = counts(group, BOXES), _standardised(both)
     assert humans.value is not None
     assert humans.weight is not None
     rates, p = ((k / n, n), (humans.value / 100, humans.weight)), cells.p
@@ -274,8 +290,18 @@ def _means(own: Estimate, other: Estimate) -> Tested | None:
     return Tested(value, human, apart.p, interval, apart.detectable)
 
 
-def _held(likeness: Estimate) -> Tested | None:
+def _velocity(both: Both) -> Tested | None:
+    """I4, against its margin."""
+    moved = fits(both.group).hc3.moved(both.group.trials)
+    if moved is None:
+        return None
+    within = moved.within_p < ALPHA
+    return Tested(moved.most, 0.0, moved.beyond_p, moved.interval, within=within)
+
+
+def _held(both: Both) -> Tested | None:
     """I5, against its margin."""
+    likeness = both.likeness
     value, se, margin = likeness.value, likeness.se, MEASURES["held"].margin
     if value is None or se is None or margin is None:
         return None
@@ -291,37 +317,17 @@ def _held(likeness: Estimate) -> Tested | None:
     return Tested(value, 0.0, p, interval, within=max(-low, high) < margin)
 
 
-def _own(study: Study, group: Group, name: str, likeness: Estimate | None) -> Estimate:
-    """A driver's estimate."""
-    if name == "collisions":
-        return _collided(group)
-    if name in WHO_FIRST:
-        return _slope(group, name)
-    if name == "gap":
-        return _gap(group)
-    if name == "gap-headway":
-        return _headway(fits(group).hc3)
-    if name == "gap-velocity":
-        return _moved(fits(group).hc3, group)
-    # I5: how far accelerations are held, less the humans, in human standard deviations.
+def _likeness(study: Study, group: Group) -> Estimate:
+    """How far accelerations are held, less the humans, in human standard deviations."""
+    likeness = less_humans(study, group) if len(group.finished) else None
     if likeness is not None and likeness.value is not None:
         return likeness
     why = "no trial acted" if study.calibrated else "too few human recordings are imported"
     return Estimate(n=len(group.finished), problem=f"I5 is not compared: {why}")
 
 
-def _human(human: Group, group: Group, name: str) -> Estimate:
-    """The humans' estimate beside a group's, in the same conditions."""
-    if name == "collisions":
-        return _standardised(human, group)
-    if name == "held":
-        return Estimate(0.0, n=len(human.finished))
-    if name in WHO_FIRST:
-        return _slope(human, name)
-    if name == "gap":
-        return human_gap(human, group)
-    fit = human_fit(human)
-    found = _headway(fit) if name == "gap-headway" else _moved(fit, group)
+def _of_fit(human: Group, found: Estimate) -> Estimate:
+    """What follows from the humans' regression of the gap, and where that is from."""
     if found.problem:
         return replace(found, problem=f"humans: {found.problem}")
     return found if _imported(human) else replace(found, source=PUBLISHED)
@@ -396,9 +402,9 @@ def human_fit(human: Group) -> Regression:
 
 
 @remembered
-def _slope(group: Group, name: str) -> Estimate:
+def _slope(group: Group, term: str) -> Estimate:
     """A slope of who goes first by Firth's fit."""
-    fit, term = fits(group).firth, TESTED[SLOPES[name]][0]
+    fit = fits(group).firth
     ends = fit.interval(term, LEVEL)
     if ends is None:
         problem = fit.problem or "no profile of Firth's likelihood converges"
@@ -431,8 +437,9 @@ def _collided(group: Group) -> Estimate:
     return replace(found, problem=problem, k=k, undecided=cut_off)
 
 
-def _standardised(human: Group, group: Group) -> Estimate:
+def _standardised(both: Both) -> Estimate:
     """The humans' collisions in the conditions of a group, which weigh as they do there."""
+    group, human = both.group, both.human
     played = group.ended_outcomes["condition"].value_counts()  # with those that are undecided
     there = human.outcomes[human.outcomes["condition"].isin(played.index)]
     if there.empty:
@@ -442,3 +449,41 @@ def _standardised(human: Group, group: Group) -> Estimate:
     rate, as_good_as = weighted(k, n, played[humans.index].to_numpy(float))
     low, high = wilson(rate, as_good_as)
     return Estimate(100 * rate, 100 * low, 100 * high, len(there), weight=as_good_as)
+
+
+def _goes_first(indicator: str) -> Statistic:
+    """The slope of who goes first that an indicator tests."""
+    term = TESTED[indicator][0]
+    return Statistic(
+        lambda both: _slope(both.group, term),
+        lambda both: _slope(both.human, term),
+        partial(_who_first, term=term),
+        indicator,
+    )
+
+
+STATISTICS = {
+    "headway": _goes_first("I1"),
+    "velocity": _goes_first("I2"),
+    "collisions": Statistic(lambda both: _collided(both.group), _standardised, _rates),
+    "gap": Statistic(
+        lambda both: _gap(both.group),
+        lambda both: human_gap(both.human, both.group),
+    ),
+    "gap-headway": Statistic(
+        lambda both: _headway(fits(both.group).hc3),
+        lambda both: _of_fit(both.human, _headway(human_fit(both.human))),
+        indicator="I3",
+    ),
+    "gap-velocity": Statistic(
+        lambda both: _moved(fits(both.group).hc3, both.group),
+        lambda both: _of_fit(both.human, _moved(human_fit(both.human), both.group)),
+        _velocity,
+        "I4",
+    ),
+    "held": Statistic(
+        lambda both: both.likeness,
+        lambda both: Estimate(0.0, n=len(both.human.finished)),
+        _held,
+    ),
+}

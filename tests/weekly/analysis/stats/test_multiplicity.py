@@ -72,7 +72,7 @@ def humans(tmp_path_factory):
 
 @np.errstate(divide="ignore")
 def states(groups: Iterator[Group], humans: Group) -> list[dict[str, str]]:
-    tests = (verdicts.tests_of(group, humans, None) for group in groups)
+    tests = (verdicts.tests_of(verdicts.Both(group, humans)) for group in groups)
     return [verdicts.decided(test)[0] for test in tests]
 
 
