@@ -323,7 +323,7 @@ def view(
         raise UsageError("--single FILE.html needs --trials: name some, or all with '*'")
     from merge_runner_analysis.web.app import serve
     from merge_runner_analysis.web.export import export_folder, export_page
-    from merge_runner_analysis.web.notes import reader_of
+    from merge_runner_analysis.web.note_file import reader_of
 
     def announce(address: str) -> None:
         print_out(address)

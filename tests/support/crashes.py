@@ -3,7 +3,7 @@
 from merge_runner.config import ScenarioConfig
 from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.geometry import TRACK
-from merge_runner_analysis.web.collision_account import Course
+from merge_runner_analysis.web.trial.account import Course
 from tests.support.studies import SCENARIO, Drive, Said, played
 
 NO_PLAN = Said(failure="no_array")

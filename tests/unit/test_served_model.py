@@ -13,7 +13,7 @@ from merge_runner_analysis.provenance import provenance, tally
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.attempts import attempts
 from merge_runner_analysis.web.catalogue import Catalogue
-from merge_runner_analysis.web.pages.sweep import list_runs
+from merge_runner_analysis.web.runs import list_runs
 from tests.support.studies import Drive, Said, write_study
 
 SERVED = ("another", "o3", "o3-2025", "o3-2026", "it's")

@@ -32,6 +32,7 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from merge_runner.errors import MergeRunnerError, UsageError
+from merge_runner_analysis.web.filters import sort_of
 from merge_runner_analysis.web.glossary import sections
 from merge_runner_analysis.web.guard import LOOPBACK, Guard
 from merge_runner_analysis.web.pages import (
@@ -132,7 +133,7 @@ def _page(site: Site, render: Callable[..., str | Response], asked: Request) -> 
 
 def _trials_csv(site: Site, asked: Mapping[str, str]) -> Response:
     wanted = trials.export_filter(site, asked)
-    return download(site.catalogue.export(wanted, trials.sort_of(asked)), "trials.csv")
+    return download(site.catalogue.export(wanted, sort_of(asked)), "trials.csv")
 
 
 # What renders each page, of what its address names and asks for.

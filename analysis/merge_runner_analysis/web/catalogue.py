@@ -19,8 +19,8 @@ from merge_runner.text_safety import csv_writer, first_line
 from merge_runner_analysis.web.database_copy import Copies, Copy
 from merge_runner_analysis.web.display_text import csv_cell
 from merge_runner_analysis.web.listing import FACTOR, Listing, columns_of, list_trials
+from merge_runner_analysis.web.phrases import condition_text
 from merge_runner_analysis.web.reading import Row, records
-from merge_runner_analysis.web.views import condition_text
 
 PAGE = 100
 # While a run goes on the database changes all the time: so many trials are listed anew, which takes

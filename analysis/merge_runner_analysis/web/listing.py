@@ -20,15 +20,15 @@ from merge_runner.results.database import SETTINGS, in_memory
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.served_model import Pair, other_models, sql_of
 from merge_runner_analysis.drivers import language_models, stand_in, unresponsive
-from merge_runner_analysis.web.collision_account import (
+from merge_runner_analysis.web.database_copy import Copy
+from merge_runner_analysis.web.reading import Row, records
+from merge_runner_analysis.web.trial.account import (
     ALONE,
     OTHER_ACCOUNTS,
     Course,
     collision_class,
 )
-from merge_runner_analysis.web.database_copy import Copy
-from merge_runner_analysis.web.reading import Row, records
-from merge_runner_analysis.web.views import scenario_of
+from merge_runner_analysis.web.trial.reader import scenario_of
 
 # The names of both: of the list, and of the copy.
 BOTH = "SET search_path = 'memory.main,results.main'"

@@ -11,8 +11,8 @@ from starlette.datastructures import QueryParams
 
 from merge_runner.prompts.blocks import title_of
 from merge_runner.study.file import BASELINE
+from merge_runner_analysis.web.phrases import ordered
 from merge_runner_analysis.web.site import SCOPE, NotThere, Site
-from merge_runner_analysis.web.views import ordered
 
 # What the analysis adds to the names of drivers that have several tasks, prompts or stand-ins.
 MARKS = re.compile(r"( \[([0-9a-f]{8}|scripted)\])+$")

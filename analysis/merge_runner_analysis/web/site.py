@@ -19,12 +19,13 @@ from merge_runner_analysis.cache import stamp_of
 from merge_runner_analysis.metrics import METRICS
 from merge_runner_analysis.web.catalogue import Catalogue
 from merge_runner_analysis.web.computing import Computing
-from merge_runner_analysis.web.notes import LONGEST_TEXT, Notes
+from merge_runner_analysis.web.note_file import LONGEST_TEXT, Notes
+from merge_runner_analysis.web.phrases import clock, condition_text
 from merge_runner_analysis.web.queries import Queries
+from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.rendering import environment
 from merge_runner_analysis.web.search import Words
 from merge_runner_analysis.web.urls import HOME, Links
-from merge_runner_analysis.web.views import clock, condition_text
 from merge_runner_analysis.wording import MEASURES, TABLE
 
 # What draws and moves a trial, in the order in which it is loaded.
@@ -137,6 +138,13 @@ class Site:
         if self.catalogue.refresh():
             self._conditions = {}
         self.catalogue.tag(self.notes.kept().tags)
+
+    def trial(self, trial_id: str, spec_hash: str) -> Row:
+        """The trial of this name, of several specs of this one; raises NotThere."""
+        row = self.catalogue.find(trial_id, spec_hash)
+        if row is None:
+            raise NotThere(f"the database holds no trial {trial_id}")
+        return row
 
     def in_words(self, condition: str) -> str:
         """What a condition's name says; empty where no human drove it and it has no trial."""

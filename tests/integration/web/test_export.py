@@ -13,7 +13,7 @@ from merge_runner.results.store import Store, query
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.tables import TABLES
 from merge_runner_analysis.web.export import export_page
-from merge_runner_analysis.web.notes import Notes
+from merge_runner_analysis.web.note_file import Notes
 from tests.support.hostile import hostile_trial
 from tests.support.serving import Page, export
 from tests.support.studies import Drive, as_humans, write_study, yielding

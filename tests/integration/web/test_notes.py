@@ -10,7 +10,7 @@ import pytest
 
 from merge_runner.errors import UsageError
 from merge_runner_analysis.web.app import MOST_NOTED
-from merge_runner_analysis.web.notes import LONGEST_NAME, LONGEST_TEXT, Notes, reader_of
+from merge_runner_analysis.web.note_file import LONGEST_NAME, LONGEST_TEXT, Notes, reader_of
 from tests.support.hostile import HOSTILE
 from tests.support.serving import HOST, Page, client_of
 from tests.support.studies import write_study, yielding

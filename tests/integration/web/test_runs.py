@@ -16,8 +16,9 @@ from merge_runner.results.store import Store, query, sweep_facts
 from merge_runner.run.progress import remove_standing, write_standing
 from merge_runner.run.stored_replay import audit_database
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner_analysis.web.pages.sweep import list_runs, numbers_of, sweep_page
-from merge_runner_analysis.web.pages.trials import filter_of
+from merge_runner_analysis.web.filters import filter_of
+from merge_runner_analysis.web.pages.sweep import sweep_page
+from merge_runner_analysis.web.runs import list_runs, numbers_of
 from merge_runner_analysis.web.site import Site
 from tests.support.serving import Page, client_of, held
 from tests.support.standings import progress, runner

@@ -13,7 +13,8 @@ from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner_analysis.humans.archive import open_files
 from merge_runner_analysis.humans.load import import_trials, sort_files
 from merge_runner_analysis.web.reading import reading
-from merge_runner_analysis.web.views import collision_bounds, plan_chart, read_trial
+from merge_runner_analysis.web.trial.reader import read_trial
+from merge_runner_analysis.web.trial.replay import collision_bounds, plan_chart
 from tests.support import recordings
 from tests.support.cases import table
 from tests.support.crashes import EXAMPLES, drive

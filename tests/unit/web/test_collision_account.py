@@ -2,7 +2,7 @@
 
 import pytest
 
-from merge_runner_analysis.web.collision_account import Mark, account
+from merge_runner_analysis.web.trial.account import Mark, account
 from tests.support.crashes import EXAMPLES, course_of, crash, decided, drive
 from tests.support.studies import played
 

@@ -12,7 +12,7 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 from merge_runner_analysis.published import human_outcomes, published
-from merge_runner_analysis.web.collision_account import (
+from merge_runner_analysis.web.trial.account import (
     BRAKING,
     COLLISIONS,
     SPEEDING_UP,

@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from merge_runner_analysis.web.prompts import parts_of
 from merge_runner_analysis.web.search import BEFORE, LONGEST_QUERY, SHOWN, pieces_of, terms_of
+from merge_runner_analysis.web.trial.prompt_parts import parts_of
 from tests.support.cases import cases
 
 

@@ -9,8 +9,7 @@ from merge_runner_analysis.tables.formats import printed
 from merge_runner_analysis.web.computed import computed_table
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.display_text import with_minus
-from merge_runner_analysis.web.marks import rate
-from merge_runner_analysis.web.pages.home import (
+from merge_runner_analysis.web.judged import (
     Driver,
     by_condition,
     by_kind,
@@ -18,6 +17,7 @@ from merge_runner_analysis.web.pages.home import (
     judged,
     noted,
 )
+from merge_runner_analysis.web.marks import rate
 from merge_runner_analysis.web.scope import Scope, scope_of, unmarked
 from merge_runner_analysis.web.site import NotThere, Site
 from merge_runner_analysis.wording import DIFFERS, OPEN, SHOWN, UNLIKE

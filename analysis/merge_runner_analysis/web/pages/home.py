@@ -2,62 +2,16 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping
 
-from merge_runner_analysis.published import HUMAN, human_counts
-from merge_runner_analysis.tables.model import Table
-from merge_runner_analysis.web.computed import computed_table
-from merge_runner_analysis.web.marks import Cell, band, cells
-from merge_runner_analysis.web.pages.sweep import standing_of
-from merge_runner_analysis.web.reading import Row
-from merge_runner_analysis.web.scope import DESCRIPTIONS, Bar, Scope, carried, scope_of, unmarked
+from merge_runner_analysis.web.judged import by_condition, by_kind, judged, noted
+from merge_runner_analysis.web.runs import standing_of
+from merge_runner_analysis.web.scope import DESCRIPTIONS, scope_of, unmarked
 from merge_runner_analysis.web.site import Site, news_of
-from merge_runner_analysis.web.views import ordered
 from merge_runner_analysis.wording import (
-    HUMANS,
     LANGUAGE_MODEL,
-    MEASURES,
-    MOCK,
-    PROGRAM,
-    TABLE,
-    by_group,
-    capital,
     headline,
-    sentence,
 )
-
-KINDS = {
-    LANGUAGE_MODEL: ("Language models", ""),
-    PROGRAM: ("Programs", "compute their plans; asked nobody"),
-    MOCK: ("Mock models", "a script answered in a model's name; in no conclusion"),
-}
-# Where each driver's decisions were asked, and what was sent with them, as the specs say it.
-ASKED = """
-SELECT model, variant, coalesce(any_value(spec->>'$.left.endpoint'), '') AS endpoint,
-    any_value(coalesce(spec->'$.left.body', spec->'$.right.body'))::VARCHAR AS body
-FROM listed JOIN specs USING (spec_hash) GROUP BY ALL
-"""
-
-
-@dataclass(frozen=True, slots=True)
-class Driver:
-    """A driver with a prompt: its verdicts, and what its trials come to.
-
-    ``facts`` are counts of the list of trials, None where it has none of them; ``parameters`` are
-    those of the requests to its model.
-    """
-
-    name: str
-    prompt: str
-    kind: str
-    cells: dict[str, Cell]
-    sentence: str
-    facts: Row | None
-    endpoint: str
-    parameters: str
 
 
 def home_page(site: Site, asked: Mapping[str, str]) -> str:
@@ -92,111 +46,3 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         conditions=by_condition(site, scope, shown),
         imported=bool(site.catalogue.counts({"who": "humans"}, "who")),
     )
-
-
-def judged(site: Site, bar: Bar, asked: Mapping[str, str]) -> tuple[list[Driver], dict[str, Any]]:
-    """The drivers of a scope, and the values of every page that shows their verdicts."""
-    found, table = computed_table(site, TABLE, bar.scope.sweep, bar.scope.condition)
-    return drivers_of(site, table, bar.scope), {
-        "bar": bar,
-        "carried": carried(asked),
-        "computed": found,
-        "table": table,
-        "headings": KINDS,
-        "human": humans_of(table),
-    }
-
-
-def humans_of(table: Table | None, own: Driver | None = None) -> dict[str, Any]:
-    """The humans' cells by measure, where their bands lie, and which humans they are.
-
-    Beside a driver they are those that it is compared with, in its conditions.
-    """
-    found = by_group(table.rows).get(HUMAN, {}) if table else {}
-    label = str(next(iter(found.values()))["driver"]) if found else HUMAN
-    for name, cell in own.cells.items() if own else ():
-        beside = {"estimate": cell.values.get("human"), "ci": cell.values.get("human_ci")}
-        found[name] = {**found[name], **beside}
-    return {
-        "about": label.partition("(")[2].rstrip(")") or "990 trials of nine pairs, as published",
-        "cells": cells(found),
-        "bands": {name: band(measure, found.get(name, {})) for name, measure in MEASURES.items()},
-    }
-
-
-def drivers_of(site: Site, table: Table | None, scope: Scope) -> list[Driver]:
-    """Every driver and prompt with trials in a scope; without a table their facts alone."""
-    counts = site.catalogue.counts(scope.trials(), "model", "variant", "who")
-    facts = {(row["model"], row["variant"]): row for row in counts if row["who"] != "humans"}
-    specs = {(row["model"], row["variant"]): row for row in site.catalogue.ask(ASKED)}
-    groups = by_group(table.rows) if table else {"/".join(key): {} for key in facts}
-    drivers = []
-    for group, verdicts in groups.items():
-        name, _, prompt = group.rpartition("/")
-        of, spec = (rows.get((unmarked(name), prompt)) for rows in (facts, specs))
-        kind = next((str(values["kind"]) for values in verdicts.values()), _kind(of))
-        if kind == HUMANS:
-            continue
-        body = json.loads((spec and spec["body"]) or "{}")
-        parameters = [
-            f"{key} {value}" for key, value in body.items() if isinstance(value, str | int | float)
-        ]
-        drivers.append(
-            Driver(
-                name,
-                prompt,
-                kind,
-                cells(verdicts),
-                sentence(verdicts) if verdicts else "",
-                of,
-                spec["endpoint"] if spec else "",
-                ", ".join(parameters),
-            )
-        )
-    return drivers
-
-
-def _kind(facts: Row | None) -> str:
-    """What kind of driver the list of trials tells."""
-    if facts and facts["who"] == "stand-ins":
-        return MOCK
-    return LANGUAGE_MODEL if facts and facts["asked"] else PROGRAM
-
-
-def by_kind(drivers: Sequence[Driver]) -> dict[str, list[Driver]]:
-    """Drivers by their kinds."""
-    return {kind: [one for one in drivers if one.kind == kind] for kind in KINDS}
-
-
-def noted(drivers: Sequence[Driver]) -> list[tuple[str, str, str]]:
-    """What is to be known of a number: driver, measure and note, each at its cell (†)."""
-    return [
-        (one.name, cell.measure.trait, capital(str(cell.values["note"])))
-        for one in drivers
-        for cell in one.cells.values()
-        if cell.values["note"]
-    ]
-
-
-def by_condition(site: Site, scope: Scope, drivers: Sequence[Driver]) -> dict[str, Any]:
-    """What drivers' trials, and the humans' as published, come to by condition.
-
-    None stands for a condition that somebody did not drive; without a driver they are the humans'.
-    """
-    rows = site.catalogue.counts(scope.trials(), "model", "variant", "condition")
-    counted = {(row["model"], row["variant"], row["condition"]): _merged(row) for row in rows}
-    of = [(one, (unmarked(one.name), one.prompt)) for one in drivers]
-    known = {name: _merged(counts._asdict()) for name, counts in human_counts().items()}
-    played = {name for *key, name in counted if tuple(key) in [driver for _, driver in of]}
-    names = ordered(played or known)
-    return {
-        "names": names,
-        "humans": [known.get(name) for name in names],
-        "rows": [(one, [counted.get((*key, name)) for name in names]) for one, key in of],
-    }
-
-
-def _merged(row: Row) -> Row:
-    """Counts of trials with how many merged, and without other counts how many ended."""
-    merged = row["left_first"] + row["right_first"]
-    return {"ended": merged + row["collided"], **row, "merged": merged}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from merge_runner_analysis.web.pages.trial import find
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.site import Site
 from merge_runner_analysis.web.urls import whole
@@ -25,7 +24,7 @@ def notes_page(site: Site, _: Mapping[str, str]) -> str:
 
 def add_note(site: Site, given: Mapping[str, str]) -> Row:
     """Note what a form gives; returns the trial. Raises NotThere and UsageError."""
-    row = find(site, given.get("trial", ""), given)
+    row = site.trial(given.get("trial", ""), given.get("spec", ""))
     side, number = given.get("side", ""), whole(given.get("decision", ""))
     text = given.get("text", "").replace("\r\n", "\n").strip()
     site.notes.add(row["trial_id"], row["spec_hash"], side, number, text)

@@ -12,13 +12,13 @@ from merge_runner.study.file import BASELINE
 from merge_runner_analysis.metrics import COLLISIONS
 from merge_runner_analysis.tables.formats import printed
 from merge_runner_analysis.tables.model import Row, Table
-from merge_runner_analysis.web import views
 from merge_runner_analysis.web.computed import computed_table
+from merge_runner_analysis.web.judged import Driver, judged
 from merge_runner_analysis.web.marks import Mark
-from merge_runner_analysis.web.pages.home import Driver, judged
-from merge_runner_analysis.web.prompts import parts_of
+from merge_runner_analysis.web.phrases import UNKNOWN, block_meaning, changes_text
 from merge_runner_analysis.web.scope import scope_of, unmarked
 from merge_runner_analysis.web.site import NotThere, Site
+from merge_runner_analysis.web.trial.prompt_parts import parts_of
 
 # The blocks of a prompt, as its specs name them; a program has none.
 STORED = """
@@ -124,16 +124,16 @@ def left_out(site: Site, variant: str) -> str:
     """What a variant's prompt leaves out and adds, by name and meaning."""
     ((names,),) = map(dict.values, site.catalogue.ask(STORED, variant))
     if names is None:
-        return f"of which {views.UNKNOWN}"
+        return f"of which {UNKNOWN}"
     own, baseline = frozenset(names), frozenset(blocks_of(BASELINE))
     changes = Variant(removes=baseline - own, adds=own - baseline)
-    return views.changes_text(changes, _named) or "the whole prompt"
+    return changes_text(changes, _named) or "the whole prompt"
 
 
 def _named(block: str) -> str:
     """A block with what it means, if that is known here."""
-    meaning = views.block_meaning(block)
-    return block if meaning == views.UNKNOWN else f"{block}: {meaning}"
+    meaning = block_meaning(block)
+    return block if meaning == UNKNOWN else f"{block}: {meaning}"
 
 
 def discordant_page(site: Site, asked: Mapping[str, str]) -> str:

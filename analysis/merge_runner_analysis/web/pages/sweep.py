@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import shlex
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from datetime import UTC
-from typing import Any
 
-from merge_runner.audit.checks import not_judged
-from merge_runner.config import both_sides, pair_name
-from merge_runner.run.progress import Standing, read_standing
-from merge_runner_analysis.web.catalogue import Catalogue, Wanted
 from merge_runner_analysis.web.computed import computed
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.listing import MISSING
 from merge_runner_analysis.web.reading import Row
+from merge_runner_analysis.web.runs import duration, list_runs, numbers_of
 from merge_runner_analysis.web.scope import carried, scope_of
 from merge_runner_analysis.web.site import NothingNew, NotThere, Site, news_of
 
@@ -25,13 +17,6 @@ SELECT value AS cause, count(*) AS trials, sum(times)::BIGINT AS times
 FROM several SEMI JOIN (FROM several WHERE facet = 'sweep' AND value = ?) USING (number)
 WHERE facet = 'cause' GROUP BY ALL ORDER BY trials DESC, cause
 """
-# Why a run ended early, by its exit code.
-REASONS = {
-    2: "the service refused the key or the model, or a setting was wrong",
-    3: "the account's quota or --max-cost was used up",
-    4: "a replay makes no calls, and some replies are not recorded",
-    130: "it was interrupted (Ctrl-C)",
-}
 
 
 # How often things happened that may cost trust: ``count`` of ``of`` are columns of a run, and
@@ -58,142 +43,6 @@ TRUST = [
          "one reply decided in several trials, which are no separate samples there", {}),
     )
 ]  # fmt: skip
-
-
-def list_runs(catalogue: Catalogue) -> list[Row]:
-    """All runs, the newest first; see ``run_of``. Raises what ``Catalogue.refresh`` does."""
-    runs: list[Row] = []
-    # A run notes its end in the database before its file goes: one that seems to be lost may have
-    # ended since the rows were read, by whoever refreshed the catalogue since.
-    for is_sure in (False, True):
-        catalogue.refresh(at_once=is_sure)
-        counted, newest, runs = numbers_of(catalogue, {}), dict[Any, str](), []
-        for row in catalogue.ask("FROM sweeps ORDER BY started_at DESC, sweep_id DESC"):
-            sweep_id, config = row["sweep_id"], json.loads(row["config"])
-            standing = None if row["ended_at"] else read_standing(catalogue.db, sweep_id)
-            # The newest run of the same trials went on with those before it.
-            same = row["name"], config.get("model"), config.get("sample_set")
-            later = newest.setdefault(same, sweep_id).replace(sweep_id, "")
-            runs.append(run_of(row | counted[sweep_id], config, standing, later))
-        if all(run["state"] != "lost" for run in runs):
-            break
-    return runs
-
-
-def numbers_of(catalogue: Catalogue, wanted: Wanted) -> Mapping[str, Row]:
-    """What the wanted trials of each run come to, and, without an id, those of all together.
-
-    Whatever several runs or trials share counts once. A run may have begun since: it has none.
-    """
-    (total,) = catalogue.counts({**wanted, "who": ["drivers", "stand-ins"]})
-    counted = {row["sweep"]: row for row in catalogue.counts(wanted, "sweep")}
-    return defaultdict(lambda: dict.fromkeys(total, 0), {"": total} | counted)
-
-
-def standing_of(catalogue: Catalogue) -> list[Row]:
-    """The runs that go on, or ended early and nobody went on with them; else the newest one.
-
-    The newest come first. Raises what ``Catalogue.refresh`` does.
-    """
-    runs = list_runs(catalogue)
-    return [run for run in runs if run["state"] != "finished" and not run["later"]] or runs[:1]
-
-
-def run_of(row: Row, config: Row, standing: Standing | None, later: str = "") -> Row:
-    """A run of a sweep: how far it is, and in a ``text`` whether it can be trusted.
-
-    ``row`` has what is stored of it and what its trials come to, ``config`` what it planned, and
-    ``standing`` what its process says, None: no file does. It is ``running``, ``checking`` what is
-    stored, ``lost``, ``finished`` or ``stopped``. ``command``, as it was typed, goes on with it,
-    unless a ``later`` run already did. One that is ``followed`` may have news: it may have slept,
-    and go on.
-    """
-    state, last_word = "stopped" if row["exit_code"] else "finished", row["ended_at"]
-    if last_word is None:
-        state = "lost"
-        if standing:
-            # As the database has it: UTC, without saying so.
-            last_word = standing.updated_at.astimezone(UTC).replace(tzinfo=None)
-            if standing.alive:
-                state = "running" if standing.doing == "playing" else "checking"
-    live = standing if state in {"running", "checking"} else None
-    drivers, endpoints = config.get("model", "").split(","), config.get("endpoints", {})
-    part = f", in {row['scripted']} of {row['trials']} trials"
-    run = {
-        "row": row,
-        "config": config,
-        "sweep_id": row["sweep_id"],
-        "driver": ", ".join(pair_name(both_sides(name).values(), endpoints) for name in drivers),
-        "stand_in": row["scripted"]
-        and f"{row['stand_in']}{part if row['scripted'] < row['trials'] else ''}",
-        "state": state,
-        "live": live,
-        "followed": row["ended_at"] is None and standing is not None,
-        "planned": sum(arm["repetitions"] for arm in config.get("arms", ()))
-        * len(config.get("conditions", ())),
-        "ended": live.ended if live else row["ended"],
-        "failed": live.failed if live else row["failed"],
-        "last_word": last_word,
-        "lasted_s": last_word and (last_word - row["started_at"]).total_seconds(),
-        "later": later,
-    }
-    kind, text = assessment_of(run)
-    code = row["exit_code"]
-    goes_on = state in {"lost", "stopped"} and code != 4 and run["ended"] != run["planned"]
-    typed = config.get("typed") if goes_on and not later else None  # a notebook types none
-    command = shlex.join(["merge-runner", *typed]) if typed else ""
-    return {**run, "kind": kind, "text": text, "command": command}
-
-
-def assessment_of(run: Row) -> tuple[str, str]:
-    """Say whether a run is finished, and can be trusted: of what kind that is, and a sentence."""
-    ended, planned, code, state = (
-        run["ended"],
-        run["planned"],
-        run["row"]["exit_code"],
-        run["state"],
-    )
-    counted = f"{ended} of {planned or '?'} trials"
-    failures = f", {run['failed']} failed" if run["failed"] else ""
-    if state == "checking":
-        return "running", f"Nearly done: {counted} ended{failures}; the audit runs."
-    if state == "running":
-        left_s = run["live"].left_s
-        left = f", about {duration(left_s)} left" if left_s is not None else ""
-        return "running", f"Running: {counted} ended{failures}{left}."
-    if state == "finished":
-        if ended < planned:
-            text = f"It had finished, but the database holds only {ended} of its {planned} trials."
-            return "stopped", text
-        row, text = run["row"], f"Finished: all {ended} trials ended"
-        if why := not_judged(run["driver"], row["invalid"], row["asked"]):
-            return "doubtful", f"{text}; {why}."
-        troubles = {"failed attempts": row["faults"], "invalid replies": row["invalid"]}
-        if met := ", ".join(f"{name} {times:,}" for name, times in troubles.items() if times):
-            text += f"; on the way: {met}"
-        else:
-            text += ", and no problems were found"
-        if others := row["others"]:
-            return "doubtful", f"{text}; but another model gave {others} answers."
-        return "finished", f"{text}."
-    if state == "lost":
-        gone = "Stopped without a word: its process is gone, or frozen."
-        return "stopped", f"{gone} {counted} are stored{failures}."
-    if code in REASONS:
-        return "stopped", f"Stopped: {REASONS[code]}. {counted} have an outcome{failures}."
-    if ended == planned:
-        text = f"Ended with faults: {counted} have an outcome, but what is stored does not hold "
-        return "stopped", f"{text}together. See: merge-runner audit --sweep {run['sweep_id']}"
-    if run["failed"]:
-        return "stopped", f"Ended: {counted} have an outcome{failures}."
-    return "stopped", f"Stopped by an error that it printed: {counted} have an outcome."
-
-
-def duration(seconds: float) -> str:
-    """A time span as a reader says it."""
-    if seconds < 5_400:
-        return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
-    return f"{seconds / 3600:.1f} h"
 
 
 def sweeps_page(site: Site, asked: Mapping[str, str]) -> str:

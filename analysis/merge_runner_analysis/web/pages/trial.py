@@ -13,12 +13,15 @@ from merge_runner.llm.formats import reasoning_of
 from merge_runner.records import DAMAGED, reply_object
 from merge_runner.served_model import Pair
 from merge_runner.text_safety import quoted
-from merge_runner_analysis.web import views
 from merge_runner_analysis.web.display_text import clamped, shortened, visible
+from merge_runner_analysis.web.phrases import block_meaning
 from merge_runner_analysis.web.pictures import step_points
-from merge_runner_analysis.web.prompts import parts_of
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.site import REPLAY, NotThere, Site
+from merge_runner_analysis.web.trial.prompt_parts import parts_of
+from merge_runner_analysis.web.trial.reader import Trial, read_trial
+from merge_runner_analysis.web.trial.replay import VIEW_BOX, account_of, plan_chart, replay_data
+from merge_runner_analysis.web.trial.sentences import facts, judged_text, outcome_text, summary
 
 # What is offered to lay beside a trial, and by what rule.
 HUMAN, REPETITION = "nearest human", "next repetition"
@@ -62,22 +65,22 @@ def trial_page(
 ) -> str:
     """Return a trial with all of its decisions, as a page or by another template."""
     row, trial = found(site, trial_id, asked)
-    account = views.account_of(row, trial)
+    account = account_of(row, trial)
     return site.render(
         template,
         here="trials",
         scripts=REPLAY,
         panels=panels(site, row, trial),
         row=row,
-        outcome=views.outcome_text(row),
-        facts=views.facts(row),
-        judged=views.judged_text(trial.scenario),
-        view_box=views.VIEW_BOX,
-        data=views.replay_data(row, trial, account) if trial.states else None,
+        outcome=outcome_text(row),
+        facts=facts(row),
+        judged=judged_text(trial.scenario),
+        view_box=VIEW_BOX,
+        data=replay_data(row, trial, account) if trial.states else None,
         account=account,
         reply_of=REPLY,
         samples=SAMPLES.format(quoted(row["trial_id"]), quoted(row["spec_hash"])),
-        lines=views.summary(trial),
+        lines=summary(trial),
         trial_decisions=trial.by_side,
         offers=OFFERS,
         clamped=clamped,
@@ -89,27 +92,19 @@ def trial_page(
     )
 
 
-def find(site: Site, trial_id: str, asked: Mapping[str, str]) -> Row:
-    """The trial that an address names; raises NotThere."""
-    row = site.catalogue.find(trial_id, asked.get("spec", ""))
-    if row is None:
-        raise NotThere(f"the database holds no trial {trial_id}")
-    return row
-
-
-def found(site: Site, trial_id: str, asked: Mapping[str, str]) -> tuple[Row, views.Trial]:
+def found(site: Site, trial_id: str, asked: Mapping[str, str]) -> tuple[Row, Trial]:
     """The trial that an address names, with what was stored of it; raises NotThere."""
-    row = find(site, trial_id, asked)
+    row = site.trial(trial_id, asked.get("spec", ""))
     return row, read(site, row)
 
 
-def read(site: Site, row: Row) -> views.Trial:
+def read(site: Site, row: Row) -> Trial:
     """What was stored of a trial."""
     with site.catalogue.cursor() as connection:
-        return views.read_trial(connection, row["trial_id"], row["spec_hash"])
+        return read_trial(connection, row["trial_id"], row["spec_hash"])
 
 
-def panels(site: Site, row: Row, trial: views.Trial) -> list[Markup]:
+def panels(site: Site, row: Row, trial: Trial) -> list[Markup]:
     """Return the panels of all decisions of a trial, in the order of its ribbons."""
     others = site.catalogue.others
     decisions = (d for mine in trial.by_side.values() for d in mine)
@@ -117,7 +112,7 @@ def panels(site: Site, row: Row, trial: views.Trial) -> list[Markup]:
 
 
 def decision_panel(
-    site: Site, row: Row, trial: views.Trial, decision: Row, others: Sequence[Pair]
+    site: Site, row: Row, trial: Trial, decision: Row, others: Sequence[Pair]
 ) -> Markup:
     """What a driver was told, said, planned and did; ``others`` are answers of another model."""
     named = {"side": decision["side"], "decision": decision["decision"]}
@@ -133,12 +128,12 @@ def decision_panel(
         clamped=clamped,
         before=before,
         parts=parts_of(decision["prompt"] or "", before["prompt"] if before else None),
-        meaning=views.block_meaning,
+        meaning=block_meaning,
         others=others,
         reply=shortened(decision["reply"]) if decision["reply"] else None,
         reasoning=shortened(thoughts) if thoughts else None,
         raw=site.at.to("sql.csv", q=REPLY.format(decision["call_key"])),
-        chart=views.plan_chart(decision, trial),
+        chart=plan_chart(decision, trial),
         points=step_points,
     )
     return Markup(panel)  # noqa: S704 # rendered by a template of ours, which escapes
@@ -151,7 +146,7 @@ def others(site: Site, trial_id: str, asked: Mapping[str, str]) -> dict[str, Any
     ``q=WORDS`` gives the first trials that have the words, those of the same condition before
     others. Raises NotThere.
     """
-    row = find(site, trial_id, asked)
+    row = site.trial(trial_id, asked.get("spec", ""))
     if "compare" in asked:
         other = named(site, asked["compare"])
         return None if other is None else _laid(site, other)
@@ -183,7 +178,7 @@ def _laid(site: Site, row: Row) -> dict[str, Any] | None:
     if not trial.states:
         return None
     return {
-        **views.replay_data(row, trial, views.account_of(row, trial)),
+        **replay_data(row, trial, account_of(row, trial)),
         "page": site.at.trial(row),
         "ribbons": site.render("_ribbons.html", row=row, trial_decisions=trial.by_side),
         "panels": "".join(panels(site, row, trial)),

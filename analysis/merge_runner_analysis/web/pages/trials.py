@@ -5,20 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from merge_runner_analysis.tables import TABLES
-from merge_runner_analysis.web.catalogue import FACETS, PAGE, SORTS, Wanted
+from merge_runner_analysis.web.catalogue import PAGE, SORTS, Wanted
 from merge_runner_analysis.web.computed import awaited, computed
+from merge_runner_analysis.web.filters import HEADINGS, filter_of, sort_of
 from merge_runner_analysis.web.listing import FACTOR
 from merge_runner_analysis.web.pictures import sparkline, speed_range
 from merge_runner_analysis.web.scope import carried
-from merge_runner_analysis.web.search import LONGEST_QUERY, MOST_TERMS
-from merge_runner_analysis.web.site import NotThere, Site, TooMuch, news_of
+from merge_runner_analysis.web.site import NotThere, Site, news_of
 from merge_runner_analysis.web.urls import whole
-
-# So many facets may be chosen at once, each by a value of up to so many characters. What is longer
-# is a fault within DuckDB, or the end of the process.
-MOST_CHOSEN, LONGEST_VALUE = 30, 1_000
-# What facets are called that have another name in an address.
-HEADINGS = {"sweep": "run", "model": "driver", "variant": "prompt"}
 
 
 def trials_page(site: Site, asked: Mapping[str, str]) -> str:
@@ -92,31 +86,3 @@ def cell_request(cell: str) -> tuple[str, str, str, str]:
     if table not in TABLES or not row:
         raise NotThere(f"a cell is named TABLE/ROW:COLUMN; the tables are {', '.join(TABLES)}")
     return "cell", table, row, column
-
-
-def filter_of(asked: Mapping[str, str]) -> dict[str, str]:
-    """The filter in an address; raises TooMuch."""
-    wanted = {
-        name: value
-        for name, value in asked.items()
-        if value and (name in {*FACETS, "q"} or name.startswith(FACTOR))
-    }
-    words = wanted.get("q", "")
-    if len(words) > LONGEST_QUERY or len(words.split()) > MOST_TERMS:
-        raise TooMuch(
-            f"a search has up to {MOST_TERMS} words and {LONGEST_QUERY} characters, this one "
-            f"{len(words.split()):,} and {len(words):,}"
-        )
-    longest = max(map(len, asked.values()), default=0)
-    if len(wanted) > MOST_CHOSEN or longest > LONGEST_VALUE:
-        raise TooMuch(
-            f"a filter has up to {MOST_CHOSEN} parts of up to {LONGEST_VALUE:,} characters, this "
-            f"one {len(wanted):,} of up to {longest:,}"
-        )
-    return wanted
-
-
-def sort_of(asked: Mapping[str, str]) -> str:
-    """The order in an address; one that is unknown is that of the names."""
-    sort = asked.get("sort", "trial")
-    return sort if sort.removeprefix("-") in SORTS else "trial"

@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 
-from merge_runner_analysis.web.pages import trials
+from merge_runner_analysis.web.filters import HEADINGS as OF_TRIALS
+from merge_runner_analysis.web.filters import filter_of
 from merge_runner_analysis.web.scope import carried
 from merge_runner_analysis.web.search import (
     FACETS,
@@ -15,7 +16,7 @@ from merge_runner_analysis.web.search import (
 from merge_runner_analysis.web.site import Site
 from merge_runner_analysis.web.urls import whole
 
-HEADINGS = trials.HEADINGS | {
+HEADINGS = OF_TRIALS | {
     "tactical": "said",
     "switch": "change of mind",
     "failure": "invalid",
@@ -27,7 +28,7 @@ LIMIT = re.compile(r"-?(0?\.\d{1,6}|[01](\.0{1,6})?)")
 def words_page(site: Site, asked: Mapping[str, str]) -> str:
     """A page of the decisions that an address asks for."""
     query = asked.get("q", "")
-    wanted = trials.filter_of(asked) | {name: asked.get(name, "") for name in FACETS}
+    wanted = filter_of(asked) | {name: asked.get(name, "") for name in FACETS}
     wanted = {name: value for name, value in wanted.items() if value and name != "q"}
     limits = {name: text for name in LIMITS if LIMIT.fullmatch(text := asked.get(name, ""))}
     chosen = {**wanted, **limits, "q": query}

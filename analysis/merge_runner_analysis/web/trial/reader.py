@@ -1,0 +1,115 @@
+"""One trial as it is read: its samples, its decisions with their calls, and its task."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from duckdb import DuckDBPyConnection
+
+from merge_runner.config import ScenarioConfig
+from merge_runner.drivers.pace import Pace, pace_of
+from merge_runner.records import SIDES, Side
+from merge_runner.results.database import by_name, names_of
+from merge_runner_analysis.web.reading import Row, records
+
+ONE = "WHERE trial_id = $trial AND spec_hash = $spec"
+STATES = f"""
+SELECT side, list(time_s ORDER BY step) AS time_s,
+    list(position_m ORDER BY step) AS position_m, list(velocity_mps ORDER BY step) AS velocity_mps,
+    list(acceleration_mps2 ORDER BY step) AS acceleration_mps2
+FROM states {ONE} GROUP BY ALL ORDER BY side
+"""  # noqa: S608 # constants
+DECISIONS = f"SELECT *, false AS lost FROM decisions {ONE}"  # noqa: S608 # constants
+CALLS = f"SELECT * EXCLUDE request FROM calls {ONE} ORDER BY attempt"  # noqa: S608 # constants
+PERCEIVED = f"FROM perceptions {ONE}"
+TASKS = f"""
+SELECT source, spec
+FROM (FROM trials {ONE}) LEFT JOIN specs USING (spec_hash)
+"""  # noqa: S608 # constants
+# Recordings do not describe their task: collisions were judged by the outlines, at 20 Hz.
+HUMAN_TASK = {"collision_rule": "rectangle", "step_s": 0.05}
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """A trial's samples by side, its decisions, and the task it is of.
+
+    ``paces`` say when each driver decided. A decision is a row with the one ``before`` on its side,
+    its ``attempts`` and the last ``reply``, what was ``perceived`` where that was imperfect,
+    whether its call was ``lost`` and whether it was ``driven``.
+    """
+
+    scenario: ScenarioConfig
+    paces: dict[Side, Pace]
+    states: dict[Side, Row]
+    decisions: list[Row]
+
+    @property
+    def end_s(self) -> float:
+        """The time of the last sample."""
+        return max((samples["time_s"][-1] for samples in self.states.values()), default=0.0)
+
+    @property
+    def by_side(self) -> dict[Side, list[Row]]:
+        """The decisions of each side that has any."""
+        decisions = self.decisions
+        return {
+            side: mine for side in SIDES if (mine := [d for d in decisions if d["side"] == side])
+        }
+
+    def interval_s(self, side: Side) -> float:
+        """How long a decision of a side is driven."""
+        return self.paces[side].interval_steps * self.scenario.step_s
+
+
+def read_trial(connection: DuckDBPyConnection, trial_id: str, spec_hash: str) -> Trial:
+    """Read a trial that is known to be there."""
+    key = {"trial": trial_id, "spec": spec_hash}
+    states, calls, (task,) = (records(connection, sql, key) for sql in (STATES, CALLS, TASKS))
+    result = connection.execute(DECISIONS, key)
+    lost = dict.fromkeys(names_of(result)) | {"valid": False, "fallback": False, "lost": True}
+    made = {(row["decision"], row["side"]): row for row in by_name(result)}
+    for call in calls:
+        place = call["decision"], call["side"]
+        # Where it got no answer the trial ended, and what the other driver decided is never driven.
+        row = made.setdefault(place, lost | dict(zip(("decision", "side"), place, strict=True)))
+        row.setdefault("attempts", []).append(call)
+    decisions = [made[place] for place in sorted(made)]
+    is_told = any(row["other_seen"] is not None for row in decisions)
+    perceived = {
+        (row["decision"], row["side"]): row
+        for row in (records(connection, PERCEIVED, key) if is_told else ())
+    }
+    told = json.loads(task["spec"] or "{}")
+    scenario = scenario_of(task["source"], told.get("scenario"))
+    trial = Trial(
+        scenario,
+        {side: pace_of(scenario, told.get(side, {})) for side in SIDES},
+        {row["side"]: row for row in states},
+        decisions,
+    )
+    before: dict[str, Row] = {}
+    for row in decisions:
+        row.setdefault("attempts", [])
+        replies = [call["reply"] for call in row["attempts"] if call["reply"] is not None]
+        row["reply"] = replies[-1] if replies else None
+        row["perceived"] = perceived.get((row["decision"], row["side"]))
+        if row["lost"]:
+            row["time_s"] = trial.end_s
+        row |= {"driven": row["time_s"] < trial.end_s, "before": before.get(row["side"])}
+        before[row["side"]] = row
+    return trial
+
+
+def scenario_of(source: str, told: Mapping[str, Any] | None) -> ScenarioConfig:
+    """The task of a trial, as its spec tells it, or as it usually is."""
+    usual = HUMAN_TASK if source == "human" else {}
+    return ScenarioConfig.model_validate(usual if told is None else told)
+
+
+def controlled(samples: Row, name: str) -> list[float]:
+    """The samples of a vehicle from the start of control on; in the tunnels nobody controls it."""
+    return [x for t, x in zip(samples["time_s"], samples[name], strict=True) if t >= 0]

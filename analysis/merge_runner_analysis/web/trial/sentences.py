@@ -1,0 +1,71 @@
+"""What is said of a trial: how it ended, what it was about, and what its charts show."""
+
+from __future__ import annotations
+
+from merge_runner.config import ScenarioConfig
+from merge_runner.prompts.blocks import title_of
+from merge_runner_analysis.web.phrases import condition_text
+from merge_runner_analysis.web.reading import Row
+from merge_runner_analysis.web.trial.reader import Trial, controlled
+
+
+def outcome_text(row: Row) -> str:
+    """How a trial ended, in a sentence."""
+    end = f"{row['end_time_s']:.1f} s"
+    without_first = {
+        "collided": f"The vehicles collided after {end}.",
+        "failed": f"The trial failed after {end}: {row['error']}.",
+        "timeout": f"Nobody had left the track after {end}.",
+    }
+    first = row["merged_first"]
+    if first is None:
+        merged = f"The trial ended after {end}; no vehicle merged first."
+        return without_first.get(row["status"], merged)
+    other = "right" if first == "left" else "left"
+    when = "" if row["time_to_merge_s"] is None else f", after {row['time_to_merge_s']:.1f} s"
+    gap = "" if row["gap_m"] is None else f", with a gap of {row['gap_m']:.1f} m"
+    return f"The {other} vehicle yielded: the {first} one reached the merge point first{when}{gap}."
+
+
+def judged_text(scenario: ScenarioConfig) -> str:
+    """What the picture draws of the rule by which the scenario judges a collision."""
+    length = f"{scenario.vehicle_length_m:g} m"
+    drawn = {
+        "euclid2d": f"circles of {length}, a vehicle's length, about the centres",
+        "shared_lane": f"bars of {length} along the road, once a vehicle is past the merge point",
+        "rectangle": f"outlines of {length} by {scenario.vehicle_width_m:g} m",
+    }[scenario.collision_rule]
+    return f"{drawn}: it is a collision where they overlap"
+
+
+def facts(row: Row) -> list[str]:
+    """What a trial was about and what was measured, in short sentences."""
+    condition = condition_text(row["projected_headway_m"], row["relative_velocity_mps"])
+    programs = "no prompt, since only programs drive"
+    prompt = programs if row["source"] == "driver" else f"the prompt {title_of(row['variant'])}"
+    texts = (
+        f"{row['condition']}: {condition}",
+        row["variant"] and f"{row['variant']}: {prompt}",
+        ", ".join(row["levels"] or ()),
+        row["rmse_mps"] is not None and f"RMSE of the speed {row['rmse_mps']:.2f} m/s",
+        row["asked"] and f"{row['invalid']} of {row['asked']} decisions invalid",
+        row["cost_usd"] is not None and f"{row['cost_usd']:.3f} USD",
+        row["caution"] and f"Note: {row['caution']}",
+    )
+    return [f"{text}." for text in texts if text]
+
+
+def summary(trial: Trial) -> list[str]:
+    """What the charts of a trial show, in sentences."""
+    lines = []
+    for side, samples in trial.states.items():
+        speeds = controlled(samples, "velocity_mps")
+        # A sample's acceleration is that of the step before it.
+        hardest = max(controlled(samples, "acceleration_mps2")[1:], key=abs, default=0.0)
+        if speeds:
+            lines.append(
+                f"The {side} vehicle began at {speeds[0]:.1f} m/s, drove between "
+                f"{min(speeds):.1f} and {max(speeds):.1f} m/s, and ended at {speeds[-1]:.1f} m/s; "
+                f"its hardest acceleration was {hardest:+z.1f} m/s²."
+            )
+    return lines
