@@ -58,8 +58,9 @@ def sparkline(row: Row, speeds: tuple[int, int]) -> dict[str, str] | None:
 
 
 def _spark_points(values: Sequence[float], speeds: tuple[int, int]) -> str:
-    x, y = Scale(0, max(len(values) - 1, 1), 0, SPARK_WIDTH), Scale(*speeds, SPARK_HEIGHT, 0)
-    return " ".join([f"{x(i):.0f},{y(speed):.1f}" for i, speed in enumerate(values)])
+    low, high = speeds  # of all, so that none lies beyond
+    across, down = SPARK_WIDTH / max(len(values) - 1, 1), SPARK_HEIGHT / (high - low)
+    return " ".join([f"{i * across:.0f},{(high - v) * down:.1f}" for i, v in enumerate(values)])
 
 
 def step_points(values: Sequence[float], width: float, height: float, steps: int) -> str:
