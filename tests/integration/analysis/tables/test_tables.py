@@ -93,6 +93,7 @@ def test_every_form_holds_the_same_values(tables):
         cells = {line.replace(r"\&", "").count("&") for line in body}
         assert cells == ({bars.pop() - 2} if body else set())
         assert latex.count("{") == latex.count("}")
+        assert r"\begin{tabular}{l" in latex, "names stand at the left"
         assert len(text) >= len(table.rows) + 3
         assert "nan" not in "\n".join(text).lower()
 
