@@ -33,7 +33,9 @@ def test_the_reference_of_commands_has_every_command_and_every_option_and_no_oth
             words = f"{name} {part}".strip()
             assert re.search(rf"^\| `{words}[` ]", text, re.MULTILINE), words
             shown = (p for p in inner.params if not getattr(p, "hidden", False))
-            options |= {option for p in shown for option in p.opts if option[:2] == "--"}
+            for p in shown:
+                options |= {option for option in p.opts if option[:2] == "--"}
+                assert len(p.help.split()) > 1, f"{words}: {p.name} says what it does"
     assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", text)) == options
 
 

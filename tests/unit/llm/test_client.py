@@ -163,6 +163,8 @@ async def test_a_rejected_request_fails_this_call_alone(make, cache):
     assert caught.value.request == client.transport.sent[0]
     assert list(cache.entries()) == []
     assert cache.unanswered(caught.value.request.key) == caught.value.attempts
+    reply = await make(answer()).ask("prompt", slot())
+    assert [each.number for each in reply.attempts] == [1, 2, 3], "an earlier run's count too"
     assert (await client.ask("prompt", slot(2))).outcome == "ok"
     unknown = make(error(404, code="model_not_found"))  # which no other request would mend
     with pytest.raises(EndpointRefused, match="'m-1'"):
