@@ -10,8 +10,8 @@ import pytest
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
 from merge_runner_analysis.figures import FIGURES
-from merge_runner_analysis.figures.figure_2 import PAGE_IN
 from merge_runner_analysis.figures.gallery import rendered, write_figures
+from merge_runner_analysis.figures.style import PAGE_IN
 from merge_runner_analysis.provenance import provenance, tally
 from merge_runner_analysis.published import published
 from merge_runner_analysis.study import Study

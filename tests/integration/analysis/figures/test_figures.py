@@ -9,7 +9,7 @@ from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 
 from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
-from merge_runner_analysis.figures.figure_2 import (
+from merge_runner_analysis.figures.figure2 import (
     HUMAN_VELOCITIES_MPS,
     deviation,
     gap,
@@ -18,7 +18,8 @@ from merge_runner_analysis.figures.figure_2 import (
     points,
     published_gap_line,
 )
-from merge_runner_analysis.figures.gallery import MAKERS, SETTINGS, rendered
+from merge_runner_analysis.figures.gallery import MAKERS, rendered
+from merge_runner_analysis.figures.style import SETTINGS
 from merge_runner_analysis.frames import load
 from merge_runner_analysis.stats.intervals import mean, proportion
 from merge_runner_analysis.study import Study

@@ -10,7 +10,7 @@ from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.explain import explain
-from merge_runner_analysis.figures.gallery import figure_of_first_actions
+from merge_runner_analysis.figures.first_action import first_action
 from merge_runner_analysis.frames import load
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import Study
@@ -201,7 +201,7 @@ def test_the_explorer_and_the_figure_tell_who_was_only_asked(asked):
     assert [row["source"] for row in listed] == ["llm"]
     configs = catalogue.ask("SELECT config::VARCHAR AS config FROM sweeps")
     assert [bool(json.loads(sweep["config"])["seat"]) for sweep in configs] == [False]
-    figure = figure_of_first_actions(Study(asked / "t.duckdb"))
+    figure = first_action(Study(asked / "t.duckdb"))
     (axis,), (legend,) = figure.axes, figure.legends
     names = [text.get_text() for text in legend.get_texts()]
     assert len(names) == len(axis.containers)

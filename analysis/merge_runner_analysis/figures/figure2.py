@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import re
-import textwrap
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -17,6 +14,16 @@ from numpy.typing import NDArray
 
 from merge_runner.prompts.blocks import title_of
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner_analysis.figures.style import (
+    GREY,
+    LINE_IN,
+    PAGE_IN,
+    Points,
+    Style,
+    draw_points,
+    style,
+    wrapped,
+)
 from merge_runner_analysis.grouping import Group, of_trials
 from merge_runner_analysis.published import HUMAN, published
 from merge_runner_analysis.stats.estimate import Estimate
@@ -24,22 +31,11 @@ from merge_runner_analysis.stats.intervals import mean, proportion
 from merge_runner_analysis.stats.regressions import gap_design
 from merge_runner_analysis.study import Study
 
-# IEEE transactions: one column and the whole page, in inches.
-COLUMN_IN, PAGE_IN = 3.5, 7.16
-# A character of the figures' font, as wide as the wider ones are.
-CHARACTER_IN = 0.06
-BREAK = "\u200b"  # a zero-width space
-# The palette of Okabe and Ito (2008), safe for the colour-blind.
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
-MARKERS = "v^sDPX"
-Points = list[tuple[float, Estimate]]  # estimates at their places on an axis
 Array = NDArray[np.float64]
-# Laid out by hand, in inches: many rows of equal panels need no solver.
-LABEL_IN, ROW_IN, LINE_IN = 1.15, 0.62, 0.12
-# A few rows share this height, each of at most the other.
-FEW_ROWS_IN, HIGHEST_ROW_IN = 4.4, 1.1
-LEFT_IN, RIGHT_IN, TOP_IN, BOTTOM_IN = LABEL_IN + 0.35, 0.08, 0.4, 0.62
-BETWEEN_ROWS_IN, BETWEEN_COLUMNS_IN = 0.16, 0.3
+Styles = dict[float, Style]  # of relative velocities in m/s
+LABEL = 21  # characters of a line of a row's name
+# A row is so high, of few rows each higher; and what is above and below all rows.
+ROW_IN, FEW_ROWS_IN, HIGHEST_ROW_IN, AROUND_IN = 0.62, 4.4, 1.1, 0.86
 # One row a finished trial: the ego's speeds.
 EGO_SPEEDS = """
 SELECT trial_id, spec_hash, list(time_s ORDER BY step) AS time_s,
@@ -61,62 +57,25 @@ MISSING = "human recordings\nare not imported"
 SHOWN = 0.95
 
 
-class Style(NamedTuple):
-    """A colour, and a marker as matplotlib names it."""
-
-    colour: str
-    marker: str
-
-
-Styles = dict[float, Style]  # of relative velocities in m/s
-
-
-def style(number: int) -> Style:
-    """A style, counted from 0; once the colours are used up, each comes with another marker."""
-    turn = number + number // len(COLOURS)
-    return Style(COLOURS[number % len(COLOURS)], MARKERS[turn % len(MARKERS)])
-
-
-def wrapped(text: str, width_in: float) -> str:
-    """A name in lines no wider than this, broken at blanks or punctuation, or else anywhere."""
-    marked = re.sub(r"([+/])", f"\\1{BREAK} ", text)
-    lines = textwrap.wrap(marked, max(6, int(width_in / CHARACTER_IN)))
-    return "\n".join(re.sub(f"{BREAK} ?", "", line) for line in lines)
-
-
-def key(style: Style, label: str) -> Line2D:
-    """A line of a legend."""
-    return Line2D(
-        [], [], color=style.colour, marker=style.marker, ms=3, lw=0.8, mfc="white", label=label
-    )
-
-
-def draw_points(axis: Axes, points: Points, shift: float, style: Style) -> None:
-    """Draw estimates with their intervals, ``shift`` beside their places on the axis."""
-    rows = [(x + shift, one.value, one.low, one.high) for x, one in points]
-    x, y, low, high = np.array(rows, dtype=float).reshape(-1, 4).T
-    axis.errorbar(
-        x, y, yerr=np.nan_to_num(np.vstack([y - low, high - y])), color=style.colour,
-        marker=style.marker, ms=3, lw=0.8, elinewidth=0.7, capsize=1.5, mfc="white", mew=0.8,
-    )  # fmt: skip
-
-
-def figure_2(study: Study, chosen: list[Group]) -> Figure:
-    """Left speeds (A, B), who was first (C), gap (D) and speed deviation (E) of these groups."""
+def figure2(study: Study, chosen: list[Group]) -> Figure:
+    """Return left speeds (A, B), who was first (C), gap (D) and speed deviation (E) of groups."""
     # Humans drove in conditions, too, that no driver of this study did.
     groups = [
         group.part(lambda trials: trials["condition"].isin(study.conditions)) for group in chosen
     ]
     velocities = sorted({velocity for _, velocity in study.conditions.values()})
     styles = {velocity: style(number) for number, velocity in enumerate(velocities)}
-    parts = [(group.label, title_of(group.setting)) for group in groups]
-    names = ["\n".join(wrapped(part, LABEL_IN) for part in pair).strip() for pair in parts]
-    figure, axes = _panels(names)
+    names = [
+        "\n".join(wrapped(part, LABEL) for part in (group.label, title_of(group.setting)) if part)
+        for group in groups
+    ]
+    rows = max(len(names), 1)
+    lines = max((name.count("\n") + 1 for name in names), default=1)
+    row_in = max(ROW_IN, min(HIGHEST_ROW_IN, FEW_ROWS_IN / rows), LINE_IN * lines + 0.2)
+    figure = Figure(figsize=(PAGE_IN, AROUND_IN + rows * row_in), layout="constrained")
+    axes = figure.subplots(rows, len(HEADINGS), sharex="col", sharey="col", squeeze=False)
     for row, group, name in zip(axes, groups, names, strict=False):
-        row[0].annotate(
-            name, (0, 0.5), (-72 * (LEFT_IN - 0.05), 0), "axes fraction",
-            textcoords="offset points", va="center",
-        )  # fmt: skip
+        row[0].set_ylabel(name, rotation=0, ha="right", va="center", multialignment="right")
         for axis, first in zip(row[:2], ("left", "right"), strict=True):
             _draw_traces(axis, study, group, first, styles)
         for axis, summary in zip(row[2:], SUMMARIES, strict=True):
@@ -126,18 +85,23 @@ def figure_2(study: Study, chosen: list[Group]) -> Figure:
     _scale(axes, groups, study)
     for axis, heading, panel in zip(axes[0], HEADINGS, "ABCDE", strict=True):
         axis.set_title(heading)
-        axis.text(-0.02, 1.1, panel, transform=axis.transAxes, fontweight="bold", ha="right")
+        axis.set_title(panel, loc="left", fontweight="bold")
     for axis, label in zip(axes[-1], HEADINGS.values(), strict=True):
         axis.set_xlabel(label)
     signed = (f"{v:+g}".replace("-", "−") if v else "0" for v in velocities)
-    handles = [key(styles[v], f"Δv = {text} m/s") for v, text in zip(styles, signed, strict=True)]
-    lines = {":": "humans", "--": "published regression"} if study.human in study.groups else {}
+    handles = [
+        Line2D([], [], label=f"Δv = {text} m/s", **styles[v])
+        for v, text in zip(styles, signed, strict=True)
+    ]
+    humans = {":": "humans", "--": "published regression"} if study.human in study.groups else {}
     handles += [
-        Line2D([], [], color="#555555", ls=dashes, lw=0.8, label=label)
-        for dashes, label in lines.items()
+        Line2D([], [], color=GREY, ls=dashes, lw=0.8, label=label)
+        for dashes, label in humans.items()
         if dashes == ":" or not study.human.measured
     ]
-    figure.legend(handles=handles, loc="lower center", ncols=len(handles), frameon=False)
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=min(len(handles), 6), frameon=False
+    )
     return figure
 
 
@@ -200,25 +164,6 @@ def published_gap_line(velocity_mps: float) -> tuple[Array, Array]:
     return headway, gap_design(headway, np.full_like(headway, velocity_mps)) @ terms
 
 
-def _panels(names: list[str]) -> tuple[Figure, NDArray[np.object_]]:
-    """A figure of page width with a row of panels of equal size for each name."""
-    rows = max(len(names), 1)
-    lines = max((name.count("\n") + 1 for name in names), default=1)
-    row_in = max(ROW_IN, min(HIGHEST_ROW_IN, FEW_ROWS_IN / rows), LINE_IN * lines + 0.05)
-    height_in = TOP_IN + BOTTOM_IN + rows * row_in - BETWEEN_ROWS_IN
-    panel_in = (PAGE_IN - LEFT_IN - RIGHT_IN + BETWEEN_COLUMNS_IN) / len(HEADINGS)
-    figure = Figure(figsize=(PAGE_IN, height_in))
-    figure.subplots_adjust(
-        left=LEFT_IN / PAGE_IN,
-        right=1 - RIGHT_IN / PAGE_IN,
-        top=1 - TOP_IN / height_in,
-        bottom=BOTTOM_IN / height_in,
-        hspace=BETWEEN_ROWS_IN / (row_in - BETWEEN_ROWS_IN),
-        wspace=BETWEEN_COLUMNS_IN / (panel_in - BETWEEN_COLUMNS_IN),
-    )
-    return figure, figure.subplots(rows, len(HEADINGS), sharex="col", sharey="col", squeeze=False)
-
-
 def _draw_traces(axis: Axes, study: Study, group: Group, first: str, styles: Styles) -> None:
     """The left speeds of those trials in which this side merged first."""
     traces = left_traces(study, group, first)
@@ -230,7 +175,7 @@ def _draw_traces(axis: Axes, study: Study, group: Group, first: str, styles: Sty
         # Many traces must not be one blot.
         alpha = min(0.4, max(0.06, 25 / count))
         lines = LineCollection(
-            traces.get(velocity, []), color=look.colour, lw=0.4, alpha=alpha, rasterized=True
+            traces.get(velocity, []), color=look["color"], lw=0.4, alpha=alpha, rasterized=True
         )
         lines.set(capstyle="projecting", joinstyle="round")
         axis.add_collection(lines)
@@ -254,10 +199,8 @@ def _draw_estimates(axis: Axes, group: Group, summary: Summary, styles: Styles) 
 
 def _say(axis: Axes, text: str) -> None:
     """A remark in a panel."""
-    axis.text(
-        0.5, 0.9, text, transform=axis.transAxes, ha="center", va="top", fontsize=6,
-        color="#555555",
-    )  # fmt: skip
+    place = {"xycoords": "axes fraction", "ha": "center", "va": "top"}
+    axis.annotate(text, (0.5, 0.9), fontsize=6, color=GREY, **place)
 
 
 def _draw_humans(axis: Axes, human: Group, summary: Summary, styles: Styles, dashes: str) -> None:
@@ -268,7 +211,7 @@ def _draw_humans(axis: Axes, human: Group, summary: Summary, styles: Styles, das
         else:
             found = [(x, one.value) for x, one in points(human, velocity, summary)]
             x, y = np.array(found, dtype=float).reshape(-1, 2).T
-        axis.plot(x, y, color=styles[velocity].colour, ls=dashes, lw=0.8)
+        axis.plot(x, y, color=styles[velocity]["color"], ls=dashes, lw=0.8)
 
 
 def _scale(axes: NDArray[np.object_], groups: list[Group], study: Study) -> None:

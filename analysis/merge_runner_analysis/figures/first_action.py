@@ -1,0 +1,63 @@
+"""Means of first actions by own relative velocity, of every driver's baseline prompt."""
+
+from __future__ import annotations
+
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from merge_runner.study.file import BASELINE
+from merge_runner_analysis.figures.style import (
+    LINE_IN,
+    LINES,
+    PAGE_IN,
+    Points,
+    draw_points,
+    style,
+    wrapped,
+)
+from merge_runner_analysis.published import published
+from merge_runner_analysis.stats.estimate import Estimate
+from merge_runner_analysis.stats.first_action import Seat, first_actions, mean, seats
+from merge_runner_analysis.stats.intervals import interval
+from merge_runner_analysis.study import Study
+
+LEGEND = 48  # characters of a line
+
+
+def first_action(study: Study) -> Figure:
+    """Return the figure."""
+    groups = [g for g in (*study.baselines, *study.asked) if g.setting == BASELINE]
+    drawn = [(LINES | {"color": "black", "marker": "o"}, "humans", _human_first_actions(study))]
+    for number, seat in enumerate(seat for group in groups for seat in seats(group)):
+        drawn.append((style(number), seat.name, _first_actions(study, seat)))
+    labels = [wrapped(name, LEGEND) for _, name, _ in drawn]
+    legend_in = LINE_IN * sum(label.count("\n") + 1.5 for label in labels)
+    figure = Figure(figsize=(PAGE_IN, max(2.7, legend_in)), layout="constrained")
+    axis = figure.subplots()
+    # Beside each other, and far from the next velocity.
+    apart_mps = min(0.04, 0.4 / len(drawn))
+    for place, (look, _, means) in enumerate(drawn):
+        draw_points(axis, means, apart_mps * place, look)
+    axis.set(xlabel="own relative velocity (m/s)", ylabel="first action (m/s²)")
+    handles = [
+        Line2D([], [], label=label, **look)
+        for label, (look, _, _) in zip(labels, drawn, strict=True)
+    ]
+    figure.legend(handles=handles, loc="outside right center", frameon=False)
+    return figure
+
+
+def _human_first_actions(study: Study) -> Points:
+    if study.complete:
+        return _first_actions(study, Seat(study.human))
+    return [
+        (row.relative_velocity_mps, Estimate(mps2, *interval(mps2, row.se_mps2), row.n))
+        for row in published("human_first_actions").itertuples()
+        for mps2 in (row.mean_mps2,)
+    ]
+
+
+def _first_actions(study: Study, seat: Seat) -> Points:
+    by_velocity = first_actions(study, seat).groupby("velocity_mps")
+    found = ((float(velocity), mean(rows)) for velocity, rows in by_velocity)
+    return [(velocity, estimate) for velocity, estimate in found if estimate]

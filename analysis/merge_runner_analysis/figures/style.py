@@ -1,0 +1,55 @@
+"""What all figures share: sizes, colours, markers, the fonts; and estimates as they draw them."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from merge_runner_analysis.stats.estimate import Estimate
+
+# IEEE transactions: the whole page, in inches.
+PAGE_IN = 7.16
+# The height of a line of the figures' font, with what is between two.
+LINE_IN = 0.12
+# The palette of Okabe and Ito (2008), safe for the colour-blind.
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
+MARKERS = "v^sDPX"
+GREY = "#555555"
+LINES = {"ms": 3, "lw": 0.8, "mfc": "white"}
+# These settings are fixed, so that equal input gives equal files.
+SETTINGS: Any = {
+    "font.size": 7,
+    "axes.titlesize": 7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.6,
+    "pdf.fonttype": 42,
+    "text.parse_math": False,  # a dollar sign in a name does not start a formula
+    "svg.hashsalt": "merge-runner",
+    "savefig.dpi": 300,
+}
+Points = list[tuple[float, Estimate]]  # estimates at their places on an axis
+Style = dict[str, Any]  # of lines with markers, as matplotlib has it
+
+
+def style(number: int) -> Style:
+    """Return a style, counted from 0; used-up colours come again, each with another marker."""
+    marker = MARKERS[(number + number // len(COLOURS)) % len(MARKERS)]
+    return LINES | {"color": COLOURS[number % len(COLOURS)], "marker": marker}
+
+
+def wrapped(text: str, width: int) -> str:
+    """Return a name in lines of so many characters, broken at blanks or punctuation if any."""
+    lines = re.findall(rf".{{1,{width}}}(?:(?<=[ +/-])|(?= )|$)|.{{1,{width}}}", text)
+    return "\n".join(line.strip() for line in lines)
+
+
+def draw_points(axis: Axes, points: Points, shift: float, style: Style) -> None:
+    """Draw estimates with their intervals, ``shift`` beside their places on the axis."""
+    rows = [(x + shift, one.value, one.low, one.high) for x, one in points]
+    x, y, low, high = np.array(rows, dtype=float).reshape(-1, 4).T
+    errors = np.nan_to_num(np.vstack([y - low, high - y]))
+    axis.errorbar(x, y, yerr=errors, elinewidth=0.7, capsize=1.5, mew=0.8, **style)
