@@ -177,8 +177,6 @@ async def _noted(site: Site, request: Request) -> Response:
             row = notes.add_note(site, dict(parse_qsl(body, max_num_fields=MOST_FIELDS)))
         except (UsageError, ValueError) as exc:
             return PlainTextResponse(str(exc), 400)
-        if "hx-request" in request.headers:
-            return HTMLResponse(site.render("_notes_of.html", row=row))
         return RedirectResponse(site.at.trial(row), 303)
 
     return await run_in_threadpool(write)
@@ -195,9 +193,7 @@ def _errors(site: Site) -> dict[Any, Callable[[Request, Exception], Response]]:
             LOG.error("%s: a fault of the explorer: %r", request.url.path, exc)
             LOG.debug("where it happened", exc_info=exc)
             text = f"A fault of the explorer: {exc!r}. The other pages go on."
-        page = site.render("message.html", heading=heading, text=text, here="")
-        # A page that waited for what is not there is loaded anew, to say so.
-        return HTMLResponse(page, code, {"hx-refresh": "true"} if code == 404 else None)
+        return HTMLResponse(site.render("message.html", heading=heading, text=text, here=""), code)
 
     return {
         NothingNew: lambda *_: Response(status_code=204),

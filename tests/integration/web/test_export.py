@@ -36,8 +36,8 @@ class References(HTMLParser):
         self.feed(text)
 
     def handle_starttag(self, tag, attrs):
-        names = {"href", "src", "action", "data-back", "data-others"}
-        self.found += [v for name, v in attrs if name in names or name.startswith("hx-")]
+        names = {"href", "src", "action", "data-back", "data-others", "data-from"}
+        self.found += [v for name, v in attrs if name in names]
 
 
 def broken(page):
@@ -94,7 +94,7 @@ def test_all_that_an_export_of_a_study_refers_to_lies_in_it_and_asks_no_server(s
     assert len(lists) == 3
     assert "It hesitates." in pages[exported / "files/notes.html"]
     scripts = {name.partition("static/")[2] for name in names if name.endswith(".js")}
-    assert scripts.isdisjoint({"vendor/htmx-2.0.11.min.js", "notes.js", "lost.js"})
+    assert scripts.isdisjoint({"live.js", "notes.js"})
     assert "replay/start.js" in scripts
 
 

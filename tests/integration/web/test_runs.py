@@ -92,7 +92,7 @@ def asked_by(url):
 def news_of(client, url):
     """Where a page looks for what is new."""
     text = url if "<" in url else client.get(url).text
-    return html.unescape(re.search(r'hx-get="([^"]*seen=[^"]*)"', text)[1])
+    return html.unescape(re.search(r'data-from="([^"]*seen=[^"]*)"', text)[1])
 
 
 def running(db, ended=None, **changes):

@@ -226,7 +226,7 @@ def test_the_study_begins_with_its_description_and_says_what_to_type_and_counts_
     links = [(to, words) for to, words in page.to("/trials?") if words.isdigit()]
     assert len(links) >= 3
     assert [(to, str(listed(client.get(to).text))) for to, _ in links] == links
-    (again,) = re.findall(r'hx-get="(/\?seen=[^"]+)"', text)
+    (again,) = re.findall(r'data-from="(/\?seen=[^"]+)"', text)
     assert client.get(again).status_code == 204
     changed(copy, "UPDATE sweeps SET exit_code = 0")
     assert "Stopped: the account" not in client.get(again).text

@@ -19,11 +19,16 @@
     event.preventDefault();
     form.requestSubmit();
   });
-  form.addEventListener("htmx:afterRequest", ({ detail: { successful, xhr } }) => {
-    document.getElementById("note-said").textContent = successful
+  form.addEventListener("submit", async (event) => {
+    event.preventDefault();
+    const reply = await live(form.action, ["#noted"], {
+      method: "POST",
+      body: new URLSearchParams(new FormData(form)),
+    });
+    document.getElementById("note-said").textContent = reply?.ok
       ? "saved"
-      : xhr.responseText || "not saved: no answer";
-    if (!successful) return;
+      : (await reply?.text()) || "not saved: no answer";
+    if (!reply?.ok) return;
     form.reset();
     document.activeElement.blur();
   });
