@@ -199,7 +199,7 @@ def _draw_estimates(axis: Axes, group: Group, summary: Summary, styles: Styles) 
 
 def _say(axis: Axes, text: str) -> None:
     """A remark in a panel."""
-    place = {"xycoords": "axes fraction", "ha": "center", "va": "top"}
+    place: Style = {"xycoords": "axes fraction", "ha": "center", "va": "top"}
     axis.annotate(text, (0.5, 0.9), fontsize=6, color=GREY, **place)
 
 

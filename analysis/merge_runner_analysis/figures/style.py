@@ -18,7 +18,8 @@ LINE_IN = 0.12
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
 MARKERS = "v^sDPX"
 GREY = "#555555"
-LINES = {"ms": 3, "lw": 0.8, "mfc": "white"}
+Style = dict[str, Any]  # of lines with markers, as matplotlib has it
+LINES: Style = {"ms": 3, "lw": 0.8, "mfc": "white"}
 # These settings are fixed, so that equal input gives equal files.
 SETTINGS: Any = {
     "font.size": 7,
@@ -32,7 +33,6 @@ SETTINGS: Any = {
     "savefig.dpi": 300,
 }
 Points = list[tuple[float, Estimate]]  # estimates at their places on an axis
-Style = dict[str, Any]  # of lines with markers, as matplotlib has it
 
 
 def style(number: int) -> Style:
