@@ -15,11 +15,6 @@ PROVIDERS = {
 KEYS = dict.fromkeys(("OPENAI_API_KEY", "GOOGLE_API_KEY", "ANTHROPIC_API_KEY"), "a-dummy-key")
 
 
-def urls_at(url):
-    """The base URL of each format at a server of all of them."""
-    return {wire: f"{url}/v1" if wire.startswith("openai") else url for wire in PROVIDERS}
-
-
 @pytest.fixture
 def plan():
     """An answer that keeps the speed."""

@@ -2,7 +2,7 @@
 
 Tests of the lanes run in a copy of the commit at ROOT, and RESULTS keeps what each calls. Then the
 tests of the function of each mutant with PART in its path run, quickest first. A rerun goes on.
-It needs Python 3.12, whose monitoring costs a test next to nothing.
+Needs Python 3.12 or newer.
 """
 
 import ast
@@ -20,9 +20,9 @@ import pytest
 
 HEAVY = "duckdb httpx hypothesis matplotlib.figure pandas pydantic scipy.stats statsmodels.api"
 OPTIONS = "-n0 -p no:cacheprovider -o faulthandler_timeout=400 -o faulthandler_exit_on_timeout=1"
-SECONDS, TOGETHER = 60, 300  # of the tests of a mutant; so many are collected together
+SECONDS, TOGETHER = 20, 300  # of the tests of a mutant; so many are collected together
 ROOT, RESULTS, PART, *LANES = sys.argv[1:]
-MONITORING = sys.monitoring
+MONITORING, TOOL = sys.monitoring, sys.monitoring.COVERAGE_ID
 NOTES, COPY, RAN = [Path(f"{RESULTS}{end}").resolve() for end in ("", ".copy", ".ran")]
 
 
@@ -38,10 +38,9 @@ class Watch:
             os.environ["PYTHONPATH"] = ":".join(sys.path[:3])
             os.dup2(os.open(f"{COPY}.out", os.O_CREAT | os.O_WRONLY | os.O_TRUNC), 1)
             if "-x" not in arguments:
-                MONITORING.use_tool_id(MONITORING.COVERAGE_ID, "mutants")
-                begins = MONITORING.events.PY_START
-                MONITORING.register_callback(MONITORING.COVERAGE_ID, begins, self.called)
-                MONITORING.set_events(MONITORING.COVERAGE_ID, begins)
+                MONITORING.use_tool_id(TOOL, "mutants")
+                MONITORING.register_callback(TOOL, MONITORING.events.PY_START, self.called)
+                MONITORING.set_events(TOOL, MONITORING.events.PY_START)
             options = [*OPTIONS.split(), f"--basetemp={COPY}.tmp", *arguments]
             os._exit(pytest.main(options, plugins=[self]))
         self.status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
@@ -102,14 +101,13 @@ def killer(tests):
 
 def score(mutant, tests):
     """Which test kills a mutant, of those that call its function, or any of its file or folder."""
-    file, line, starts = COPY / mutant["file"], re.escape(mutant["line"]), [0]
+    file, line, starts = COPY / (path := mutant["file"]), re.escape(mutant["line"]), [0]
     places = re.finditer(f"^{line}$", text := file.read_text(), re.M)
     start, end = [*places][mutant.get("nth", 0)].span()
     for node in ast.walk(ast.parse(text)):
         is_function = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
         if is_function and node.lineno <= text.count("\n", 0, start) + 1 <= node.end_lineno:
             starts.append(min(each.lineno for each in [node, *node.decorator_list]))
-    path = mutant["file"]
     for near in (f"{path}:{max(starts)}:", f"{path}:", f"{os.path.dirname(path)}/"):
         found = [test for test in tests if any(call.startswith(near) for call in test["calls"])]
         if found:

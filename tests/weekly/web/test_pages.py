@@ -18,7 +18,7 @@ COMPUTED_MS = 600_000  # on a busy machine
 PAPER_PX = round(190 * 96 / 25.4)  # A4 within its margins
 # A number, a share, a p-value, an interval or a date, of which no part may stand in a line below.
 BROKEN = r"""() => [...document.querySelectorAll("td")].filter((cell) => {
-  if (!/^[-+<\[\]\d., :]*\d[-\d., :\]%]*$/.test(cell.textContent.trim())) return false;
+  if (!/^[-−+<\[\]\d., :]*\d[-−\d., :\]%]*$/.test(cell.textContent.trim())) return false;
   const range = document.createRange();
   range.selectNodeContents(cell);
   const lines = [...range.getClientRects()].filter((box) => box.width > 0);

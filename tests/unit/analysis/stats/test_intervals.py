@@ -22,6 +22,12 @@ from merge_runner_analysis.stats.measures import median
 NOTHING = Estimate(None, None, None, 0)
 
 
+def test_an_interval_with_one_end_is_none():
+    assert Estimate(1.0, 0.5, None, 3).bounds() is None
+    assert Estimate(1.0, None, 1.5, 3).bounds() is None
+    assert Estimate(1.0, 0.5, 1.5, 3).bounds() == (0.5, 1.5)
+
+
 @pytest.mark.parametrize("n", [1, 2, 7, 110, 990])
 def test_a_proportion_has_the_wilson_interval_whose_ends_are_exact(n):
     successes = np.arange(n + 1)
