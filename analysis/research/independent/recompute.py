@@ -100,23 +100,6 @@ def _by_term(groups, terms, rows_of) -> dict[str, dict]:
     }
 
 
-def who_first_data(trials: pd.DataFrame) -> tuple[np.ndarray, np.ndarray, pd.DataFrame]:
-    """Design of intercept, h and dv; left first as 0 or 1; their trials."""
-    used = trials[(trials["status"] == "finished") & trials["first"].notna()]
-    x = np.column_stack([np.ones(len(used)), used[["h", "dv"]].to_numpy(float)])
-    return x, (used["first"] == "left").to_numpy(float), used
-
-
-def gap_data(
-    trials: pd.DataFrame, measure: str = "gap"
-) -> tuple[np.ndarray, np.ndarray, pd.DataFrame]:
-    """Design of intercept, |h|, |dv| and h dv; the gaps in m; their trials."""
-    used = trials[(trials["status"] == "finished") & trials[measure].notna()]
-    h, dv = used["h"].to_numpy(float), used["dv"].to_numpy(float)
-    x = np.column_stack([np.ones(len(used)), np.abs(h), np.abs(dv), h * dv])
-    return x, used[measure].to_numpy(float), used
-
-
 def _columns(names: str, rows: np.ndarray | None, k: int) -> dict:
     """The values of a term by column, None where there is no fit."""
     values = [None] * len(names.split()) if rows is None else rows[k]
@@ -124,7 +107,7 @@ def _columns(names: str, rows: np.ndarray | None, k: int) -> dict:
 
 
 def _who_first(trials: pd.DataFrame) -> list[dict]:
-    x, y, _ = who_first_data(trials)
+    x, y, _ = measured.who_first_data(trials)
     plain, penalised = statistics.logit(x, y), statistics.firth(x, y)
     return [
         {"n": len(y)}
@@ -135,7 +118,7 @@ def _who_first(trials: pd.DataFrame) -> list[dict]:
 
 
 def _gap(trials: pd.DataFrame) -> list[dict]:
-    x, y, used = gap_data(trials)
+    x, y, used = measured.gap_data(trials)
     plain, robust, covariance = statistics.least_squares(x, y)
     rows = []
     for k, term in enumerate(GAP):
@@ -161,21 +144,17 @@ def _gap(trials: pd.DataFrame) -> list[dict]:
     return rows
 
 
-def _ordinary(x: np.ndarray, y: np.ndarray) -> np.ndarray | None:
-    return statistics.least_squares(x, y)[0]
-
-
 def _clustered(recorded: pd.DataFrame, table: str) -> dict[str, dict]:
     """The humans with the errors of a jackknife over their pairs."""
     if recorded.empty:
         return {}
     if table == "who-first":
-        data = {"clustered": (statistics.logit, who_first_data(recorded))}
+        data = {"clustered": (statistics.logit, measured.who_first_data(recorded))}
         terms, names, other = WHO_FIRST, "b se z p", ("firth_b", "firth_se", "firth_p")
     else:
         data = {
-            "clustered": (_ordinary, gap_data(recorded)),
-            "clustered-mean100": (_ordinary, gap_data(recorded, "gap_mean100")),
+            "clustered": (statistics.ordinary, measured.gap_data(recorded)),
+            "clustered-mean100": (statistics.ordinary, measured.gap_data(recorded, "gap_mean100")),
         }
         terms, names, other = GAP, "b se t p", ("hc3_se", "hc3_p", "equivalence_p", "velocity_p")
     found = {}
@@ -209,11 +188,10 @@ def _estimate(trials: pd.DataFrame, column: str, kind: str) -> tuple:
         value = None if cut_off else 100 * k / every
         return value, 100 * low, 100 * high, len(values)
     if kind == "mean":
-        pair = trials.loc[trials[column].notna(), "pair"] if "pair" in trials else None
+        used = trials[trials[column].notna()]
         ends = statistics.mean_interval(values)
-        if pair is not None and pair.notna().all():
-            cell = trials.loc[pair.index, "cell"]
-            ends = statistics.by_pair_interval(values, cell.to_numpy(), pair.to_numpy())
+        if "pair" in used and used["pair"].notna().all():
+            ends = statistics.by_pair_interval(used, column)
         return values.mean(), *ends, len(values)
     return np.median(values), *statistics.median_interval(values), len(values)
 

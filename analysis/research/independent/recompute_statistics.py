@@ -141,6 +141,11 @@ def least_squares(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray | None, ...]
     return tuple(found)
 
 
+def ordinary(x: np.ndarray, y: np.ndarray) -> np.ndarray | None:
+    """Rows (b, se, t, p) of the usual errors."""
+    return least_squares(x, y)[0]
+
+
 def equivalence_p(b: np.ndarray, covariance: np.ndarray, rows: np.ndarray, freedom: int) -> float:
     """The largest p, over differences ``rows`` of two designs, against one of 1 m or more.
 
@@ -206,21 +211,31 @@ def mean_interval(values: np.ndarray) -> tuple[float | None, float | None]:
     return values.mean() - half, values.mean() + half
 
 
-def by_pair_interval(values, cell, pair) -> tuple[float | None, float | None]:
-    """The interval of a mean of human trials: a jackknife over pairs, conditions weighing alike."""
-    names, cells = np.unique(pair), pd.Series(cell)
-    if len(names) < 2:
-        return None, None
-    weights = cells.value_counts()
+def mean_by_pairs(
+    trials: pd.DataFrame, column: str, weights: pd.Series
+) -> tuple[float, float, int]:
+    """A mean of human trials with its error and degrees of freedom: a jackknife over pairs.
+
+    Conditions weigh as ``weights`` says.
+    """
 
     def weighed(rows):
-        means = pd.Series(values[rows]).groupby(cells[rows].to_numpy()).mean()
+        means = rows.groupby("cell")[column].mean()
         return float((weights[means.index] * means).sum() / weights[means.index].sum())
 
-    apart = [weighed(pair != name) - values.mean() for name in names]
+    whole, names = weighed(trials), trials["pair"].unique()
+    apart = [weighed(trials[trials["pair"] != name]) - whole for name in names]
     se = np.sqrt(np.square(apart).sum() * (len(names) - 1) / len(names))
-    half = stats.t.ppf(0.975, len(names) - 1) * se
-    return values.mean() - half, values.mean() + half
+    return whole, se, len(names) - 1
+
+
+def by_pair_interval(trials: pd.DataFrame, column: str) -> tuple[float | None, float | None]:
+    """The interval of a mean of human trials, conditions weighing alike."""
+    if trials["pair"].nunique() < 2:
+        return None, None
+    value, se, freedom = mean_by_pairs(trials, column, trials["cell"].value_counts())
+    half = stats.t.ppf(0.975, freedom) * se
+    return value - half, value + half
 
 
 def median_interval(values: np.ndarray) -> tuple[float | None, float | None]:
@@ -235,14 +250,9 @@ def rates_within(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Se
 
     Empty where there is no such cell.
     """
-    first, second = (
-        v.astype(float).groupby(c).agg(["sum", "size"])
-        for v, c in zip((one, other), cells, strict=True)
-    )
-    both = first.join(second, how="inner", suffixes=("1", "2"))
-    if both.empty:
+    a, n, b, m = _counts(one, other, cells)
+    if not len(a):
         return {}
-    a, n, b, m = (both[name].to_numpy(int) for name in ("sum1", "size1", "sum2", "size2"))
     w = n * m / (n + m)
     w = w / w.sum()
     p, q = w @ (a / n), w @ (b / m)
@@ -263,14 +273,19 @@ def rates_within(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Se
     }
 
 
-def exact_p(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Series]) -> float:
-    """Fisher's exact test within the cells that both have, two-sided by probability."""
+def _counts(one: pd.Series, other: pd.Series, cells: tuple) -> list[np.ndarray]:
+    """Successes and trials of the one, and of the other, in each cell that both have."""
     first, second = (
         v.astype(float).groupby(c).agg(["sum", "size"])
         for v, c in zip((one, other), cells, strict=True)
     )
     both = first.join(second, how="inner", suffixes=("1", "2"))
-    a, n, b, m = (both[name].to_numpy(int) for name in ("sum1", "size1", "sum2", "size2"))
+    return [both[name].to_numpy(int) for name in ("sum1", "size1", "sum2", "size2")]
+
+
+def exact_p(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Series]) -> float:
+    """Fisher's exact test within the cells that both have, two-sided by probability."""
+    a, n, b, m = _counts(one, other, cells)
     # The distribution of the successes of the first, all margins of all cells given.
     chances, least = np.ones(1), 0
     for k in range(len(a)):

@@ -103,6 +103,27 @@ def read(db: str, study: str = "") -> pd.DataFrame:
     return every
 
 
+def who_first_data(trials: pd.DataFrame) -> tuple[np.ndarray, np.ndarray, pd.DataFrame]:
+    """Design of intercept, h and dv; left first as 0 or 1; their trials."""
+    used = trials[(trials["status"] == "finished") & trials["first"].notna()]
+    x = np.column_stack([np.ones(len(used)), used[["h", "dv"]].to_numpy(float)])
+    return x, (used["first"] == "left").to_numpy(float), used
+
+
+def gap_design(trials: pd.DataFrame) -> np.ndarray:
+    """Intercept, |h|, |dv| and h dv."""
+    h, dv = trials["h"].to_numpy(float), trials["dv"].to_numpy(float)
+    return np.column_stack([np.ones(len(h)), np.abs(h), np.abs(dv), h * dv])
+
+
+def gap_data(
+    trials: pd.DataFrame, measure: str = "gap"
+) -> tuple[np.ndarray, np.ndarray, pd.DataFrame]:
+    """Their design; the gaps in m; their trials."""
+    used = trials[(trials["status"] == "finished") & trials[measure].notna()]
+    return gap_design(used), used[measure].to_numpy(float), used
+
+
 def _with_cells(trials: pd.DataFrame) -> pd.DataFrame:
     cells = zip(trials["h"].round(6) + 0.0, trials["dv"].round(6) + 0.0, strict=True)
     return trials.assign(cell=pd.Series(list(cells), trials.index, dtype=object))

@@ -118,12 +118,6 @@ def _beside(own: dict, other: dict, apart: dict) -> dict:
     return row | {"p_holm": None, "level": None}
 
 
-def _first_data(trials: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
-    used = trials[(trials["status"] == "finished") & trials["first"].notna()]
-    x = np.column_stack([np.ones(len(used)), used[["h", "dv"]].to_numpy(float)])
-    return x, (used["first"] == "left").to_numpy(float)
-
-
 def _profiled(x: np.ndarray, y: np.ndarray, column: int, level: float = 0.95) -> dict:
     """A coefficient of Firth's fit with its profile interval and likelihood-ratio test."""
     fit = statistics.Firth(x, y)
@@ -134,7 +128,7 @@ def _profiled(x: np.ndarray, y: np.ndarray, column: int, level: float = 0.95) ->
 
 def _first(trials: pd.DataFrame, column: int) -> dict:
     """The slope of who goes first on headway (1) or relative velocity (2)."""
-    x, y = _first_data(trials)
+    x, y, _ = measured.who_first_data(trials)
     if statistics.unidentified(x, y):
         return {"n": len(y)}
     return _profiled(x, y, column) | {"n": len(y)}
@@ -142,7 +136,8 @@ def _first(trials: pd.DataFrame, column: int) -> dict:
 
 def _firsts_apart(own: pd.DataFrame, other: pd.DataFrame, column: int, level: float = 0.95) -> dict:
     """How two slopes differ: an interaction in one model in which every term may differ."""
-    (x, x_left), (y, y_left) = _first_data(own), _first_data(other)
+    x, x_left, _ = measured.who_first_data(own)
+    y, y_left, _ = measured.who_first_data(other)
     if statistics.unidentified(x, x_left):
         return {}
     design = np.block([[x, x], [y, 0 * y]])
@@ -187,13 +182,11 @@ def _collisions(own: pd.DataFrame, human: pd.DataFrame) -> tuple[dict, tuple]:
 
 def _gap(trials: pd.DataFrame, name: str) -> dict:
     """The mean gap, or a slope with HC3 errors."""
-    used = trials[(trials["status"] == "finished") & trials["gap"].notna()]
-    gaps = used["gap"].to_numpy(float)
+    x, gaps, _ = measured.gap_data(trials)
     if name == "gap":
         if len(gaps) < 2:
             return {"estimate": gaps[0] if len(gaps) else None, "n": len(gaps)}
         return _by_t(gaps.mean(), gaps.std(ddof=1) / len(gaps) ** 0.5, len(gaps) - 1, len(gaps))
-    x = _gap_design(used)
     fit = statistics.least_squares(x, gaps)[1]
     if fit is None:
         return {"n": len(gaps)}
@@ -221,8 +214,7 @@ class Moved:
 
     @classmethod
     def of(cls, trials: pd.DataFrame) -> Moved:
-        used = trials[(trials["status"] == "finished") & trials["gap"].notna()]
-        x, gaps = _gap_design(used), used["gap"].to_numpy(float)
+        x, gaps, _ = measured.gap_data(trials)
         _, fit, covariance = statistics.least_squares(x, gaps)
         b = None if fit is None else fit[:, 0]
         conditions = {*zip(trials["h"], trials["dv"], strict=True)}
@@ -261,11 +253,6 @@ def _designed(h: float, dv: float) -> np.ndarray:
     return np.array([1.0, abs(h), abs(dv), h * dv])
 
 
-def _gap_design(trials: pd.DataFrame) -> np.ndarray:
-    h, dv = trials["h"].to_numpy(float), trials["dv"].to_numpy(float)
-    return np.column_stack([np.ones(len(h)), np.abs(h), np.abs(dv), h * dv])
-
-
 def _by_t(value: float, se: float, freedom: int, n: int) -> dict:
     half = stats.t.ppf(0.975, freedom) * se
     ends = {"ci_low": value - half, "ci_high": value + half}
@@ -278,34 +265,19 @@ def human_gap(recorded: pd.DataFrame | None, driven: pd.DataFrame | None, name: 
         if name == "gap-headway":
             return _by_t(GAP_B[1], GAP_SE[1], GAP_N - 4, GAP_N)
         moved = np.zeros(4)
-        finished = _with_gap(driven) if driven is not None else None
-        if finished is not None and len(finished):
-            moved = _gap_design(finished).mean(axis=0) - _human_design().mean(axis=0)
+        design = measured.gap_data(driven)[0] if driven is not None else ()
+        if len(design):
+            moved = design.mean(axis=0) - _human_design().mean(axis=0)
         se = np.sqrt(PAIR_SD_M**2 / PAIRS + moved @ _human_covariance() @ moved)
         return _by_t(GAP_M + moved @ GAP_B, se, PAIRS - 1, GAP_N)
-    used = _with_gap(recorded)
-    gaps, pair = used["gap"].to_numpy(float), used["pair"].to_numpy()
+    x, gaps, used = measured.gap_data(recorded)
     if name == "gap":
-        finished = _with_gap(driven) if driven is not None else None
-        cells = used["cell"] if finished is None or finished.empty else finished["cell"]
-        weights = cells.value_counts()
+        finished = used if driven is None else measured.gap_data(driven)[2]
+        weights = (used if finished.empty else finished)["cell"].value_counts()
         used = used[used["cell"].isin(weights.index)]
-        pair = used["pair"].to_numpy()
-
-        def weighed(trials):
-            means = trials.groupby("cell")["gap"].mean()
-            w = weights[means.index]
-            return (w * means).sum() / w.sum()
-
-        whole, names = weighed(used), np.unique(pair)
-        apart = [weighed(used[pair != one]) - whole for one in names]
-        se = np.sqrt(np.square(apart).sum() * (len(names) - 1) / len(names))
-        return _by_t(whole, se, len(names) - 1, len(used))
-
-    def plain(x, y):
-        return statistics.least_squares(x, y)[0]
-
-    fit = statistics.by_pairs(plain, _gap_design(used), gaps, pair)
+        return _by_t(*statistics.mean_by_pairs(used, "gap", weights), len(used))
+    pair = used["pair"].to_numpy()
+    fit = statistics.by_pairs(statistics.ordinary, x, gaps, pair)
     return _by_t(*fit[1, :2], len(np.unique(pair)) - 1, len(gaps))
 
 
@@ -314,8 +286,8 @@ def human_moved(recorded: pd.DataFrame | None, driven: pd.DataFrame) -> Moved:
     conditions = {*zip(driven["h"], driven["dv"], strict=True)}
     if recorded is None:
         return Moved(GAP_B, _human_covariance(), GAP_N - 4, GAP_N, conditions)
-    used = _with_gap(recorded)
-    x, gaps, pair = _gap_design(used), used["gap"].to_numpy(float), used["pair"].to_numpy()
+    x, gaps, used = measured.gap_data(recorded)
+    pair = used["pair"].to_numpy()
 
     def b(rows):
         return np.linalg.lstsq(x[rows], gaps[rows], rcond=None)[0]
@@ -326,13 +298,9 @@ def human_moved(recorded: pd.DataFrame | None, driven: pd.DataFrame) -> Moved:
     return Moved(whole, covariance, len(names) - 1, len(gaps), conditions)
 
 
-def _with_gap(trials: pd.DataFrame) -> pd.DataFrame:
-    return trials[(trials["status"] == "finished") & trials["gap"].notna()]
-
-
 def _human_design() -> np.ndarray:
     """The published human trials that finished."""
-    return _gap_design(measured.published_humans().query("status == 'finished'"))
+    return measured.gap_design(measured.published_humans().query("status == 'finished'"))
 
 
 def _human_covariance() -> np.ndarray:
