@@ -20,7 +20,7 @@ PAPER_PX = round(190 * 96 / 25.4)  # A4 within its margins
 BROKEN = r"""() => [...document.querySelectorAll("td")].filter((cell) => {
   if (!/^[-−+<\[\]\d., :]*\d[-−\d., :\]%]*$/.test(cell.textContent.trim())) return false;
   const range = document.createRange();
-  range.selectNodeContents(cell);
+  range.selectNodeContents(cell.querySelector("a") ?? cell);
   const lines = [...range.getClientRects()].filter((box) => box.width > 0);
   return new Set(lines.map((box) => Math.round(box.bottom))).size > 1;
 }).map((cell) => cell.textContent)"""
