@@ -121,9 +121,11 @@ class StudyDriver(Frozen):
 class Effect(Frozen):
     """What a level of a factor is supposed to add, before anything is played.
 
-    To the coefficients of who merges first, to the gap in m, and to the share of collisions.
+    To the share of trials in which its driver goes first, to the coefficients of who merges first,
+    to the gap in m, and to the share of collisions.
     """
 
+    goes_first: Annotated[float, Field(ge=-1, le=1)] = 0.0
     intercept: float = 0.0
     projected_headway: float = 0.0
     relative_velocity: float = 0.0
@@ -138,11 +140,13 @@ class StudyFile(Frozen):
     ``factors`` are crossed with each other, with the ``models`` and with the conditions; ``skip``
     leaves crossings out: each row names levels, or lists of them. Tables compare the levels of a
     factor with its first one, or with that which ``reference`` names; ``effect`` is by factor what
-    each other level adds, for ``merge-runner power``. With ``mirror`` two different drivers are
-    played both ways round. ``perception`` holds by name what the levels of the factors
-    perception, perception_left and perception_right stand for. ``budget`` is what it may cost, in
-    USD over all models, runs and days, ``plugins`` are Python files that register drivers, prompt
-    blocks, metrics and so on, beside the study.
+    each other level adds, for ``merge-runner power``. ``primary`` is the measure that is tested by
+    itself, by its name in the analysis, which knows them: all others are corrected together.
+
+    With ``mirror`` two different drivers are played both ways round. ``perception`` holds by name
+    what the levels of the factors perception, perception_left and perception_right stand for.
+    ``budget`` is what it may cost, in USD over all models, runs and days, ``plugins`` are Python
+    files that register drivers, prompt blocks, metrics and so on, beside the study.
     """
 
     description: str = ""
@@ -156,6 +160,7 @@ class StudyFile(Frozen):
     skip: tuple[dict[str, JsonValue], ...] = ()
     reference: dict[str, JsonValue] = Field(default_factory=dict)
     effect: dict[str, Effect] = Field(default_factory=dict)
+    primary: Annotated[str, Field(min_length=1)] = "goes_first"
     mirror: bool = False
     prompts: dict[str, StudyPrompt] = Field(default_factory=dict)
     drivers: dict[str, StudyDriver] = Field(default_factory=dict)
