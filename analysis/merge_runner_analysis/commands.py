@@ -16,6 +16,7 @@ import typer
 
 from merge_runner.cli import app, main
 from merge_runner.cli import options as cli
+from merge_runner.cli.app import KEEP, LOOK, PLAY
 from merge_runner.cli.options import (
     DbOption,
     StudyOption,
@@ -43,7 +44,12 @@ __all__ = ["app", "main"]
 HTML = b"<!doctype html"
 TOLD_EVERY = 100  # pages
 
-app.add_typer(human_app, name="human")
+NAMES = (
+    "Tables, all if none is named: verdicts, who-first, gap, indicators, ablation-qualitative, "
+    "ablation-quantitative, contrasts, factors, criticality, attempts, first-action."
+)
+
+app.add_typer(human_app, name="human", rich_help_panel=KEEP)
 
 ModelsOption = Annotated[
     str | None,
@@ -74,13 +80,11 @@ def _table_names() -> list[str]:
     return list(TABLES)
 
 
-@app.command()
+@app.command(rich_help_panel=LOOK)
 def tables(
     names: Annotated[
         list[str] | None,
-        typer.Argument(
-            metavar="NAME", autocompletion=_table_names, help="Tables; all if none is named."
-        ),
+        typer.Argument(metavar="NAME", autocompletion=_table_names, help=NAMES),
     ] = None,
     db: DbOption = DEFAULT_DB,
     models: ModelsOption = None,
@@ -99,9 +103,15 @@ def tables(
         bool,
         flag("--without-fallbacks", "Without the trials in which a reply held no valid plan."),
     ] = False,
+    wide: Annotated[
+        bool, flag("--wide", "All columns, also where the terminal is narrower.")
+    ] = False,
     as_json: cli.JsonOption = False,
 ) -> None:
-    """Print the paper's tables III to VII, and further ones."""
+    """Print the paper's tables, and further ones.
+
+    Example: merge-runner tables who-first gap --format csv
+    """
     if by is not None and list(names or ()) != ["factors"]:
         raise UsageError("--by FACTOR goes with the table factors: tables factors --by FACTOR")
     use_study(study_file, trust=trust)
@@ -121,10 +131,11 @@ def tables(
     made = finished_tables(db, names or (), study, selection)
     if study is not None:
         made = [beside(table, study) for table in made]
-    print_out(render(made, TableFormat.JSON if as_json else output, terminal_width()))
+    width = None if wide else terminal_width()
+    print_out(render(made, TableFormat.JSON if as_json else output, width))
 
 
-@app.command()
+@app.command(rich_help_panel=LOOK)
 def explain(
     table: Annotated[
         str,
@@ -138,7 +149,10 @@ def explain(
     by: ByOption = None,
     as_json: cli.JsonOption = False,
 ) -> None:
-    """Explain a row of a table: its query and its trials."""
+    """Explain a row of a table: its query and its trials.
+
+    Example: merge-runner explain indicators emulator/baseline:collided_percent
+    """
     study = _study(db, _selection(where=where, file=study_file, by=by), trust=trust)
     from merge_runner_analysis.explain import explain as explain_cell
     from merge_runner_analysis.tables import finished_tables
@@ -153,7 +167,7 @@ def explain(
         print_out("\n".join(found.lines()))
 
 
-@app.command()
+@app.command(rich_help_panel=PLAY)
 def power(
     study: Annotated[
         str, typer.Argument(metavar="STUDY", help="experiments/STUDY.toml, or a path.")
@@ -169,7 +183,10 @@ def power(
     trust: TrustOption = False,
     as_json: cli.JsonOption = False,
 ) -> None:
-    """Say what a study could find and what it costs; send nothing."""
+    """Say what a study could find and what it costs; send nothing.
+
+    Example: merge-runner power my-study/study.toml
+    """
     import asyncio
 
     from merge_runner.registry import use
@@ -203,7 +220,7 @@ def power(
     print_out(render([table], TableFormat.TEXT, terminal_width()))
 
 
-@app.command()
+@app.command(rich_help_panel=LOOK)
 def figures(
     out: Annotated[
         Path, option("DIR", "The folder to write to.", "--out", callback=beside_study)
@@ -214,7 +231,10 @@ def figures(
     study_file: StudyOption = None,
     trust: TrustOption = False,
 ) -> None:
-    """Draw all figures as PDF and PNG."""
+    """Draw all figures as PDF and PNG.
+
+    Example: merge-runner figures --out results/figures
+    """
     study = _study(db, _selection(models, where, study_file), trust=trust)
     from merge_runner_analysis.figures.gallery import write_figures
 
@@ -222,21 +242,24 @@ def figures(
     print_out(f"wrote the figures into {out}")
 
 
-@app.command()
+@app.command(rich_help_panel=KEEP)
 def export(
     folder: Annotated[
         Path, typer.Argument(metavar="DIR", help="A new folder, or that of an earlier export.")
     ],
     db: DbOption = DEFAULT_DB,
 ) -> None:
-    """Write every table as Parquet and CSV, with all columns explained."""
+    """Write every table as Parquet and CSV, with all columns explained.
+
+    Example: merge-runner export results/tables
+    """
     from merge_runner.results.export import export_tables
 
     export_tables(db, folder)
     print_out(f"wrote every table into {folder}: begin with {folder / 'dictionary.csv'}")
 
 
-@app.command()
+@app.command(rich_help_panel=LOOK)
 def report(
     out: Annotated[
         Path, option("FILE", "The HTML file to write.", "--out", callback=beside_study)
@@ -250,7 +273,10 @@ def report(
     study_file: StudyOption = None,
     trust: TrustOption = False,
 ) -> None:
-    """Write conclusions, tables and figures as one HTML file."""
+    """Write conclusions, tables and figures as one HTML file.
+
+    Example: merge-runner report --study my-study/study.toml
+    """
     refuse_another_kind(out, HTML, "page of HTML")
     study = _study(db, _selection(models, where, study_file), trust=trust)
     from merge_runner_analysis.web.report import write_report
@@ -290,7 +316,7 @@ def drivers(text: str | None) -> list[str] | None:
     return [part.strip() for part in re.split(r",(?![^\[]*\])", text) if part.strip()]
 
 
-@app.command()
+@app.command(rich_help_panel=LOOK)
 def view(
     port: Annotated[int, option("N", "0: any free port.", min=0, max=65535)] = 8700,
     export: Annotated[
@@ -314,7 +340,10 @@ def view(
     study_file: StudyOption = None,
     trust: TrustOption = False,
 ) -> None:
-    """Serve the explorer: trials, decisions and sweeps in a browser."""
+    """Serve the explorer: trials, decisions and sweeps in a browser.
+
+    Example: merge-runner view --study my-study/study.toml
+    """
     use_study(study_file, trust=trust)
     wanted = listed(trials) or []
     if trials is not None and export is None and single is None:

@@ -20,6 +20,8 @@ from merge_runner.text_safety import say
 
 # A full disk, a limit of file sizes, and a device that fails.
 OUTPUT_ERRORS = (errno.ENOSPC, errno.EFBIG, errno.EIO)
+# An error of Click, whose name Typer keeps to itself.
+USAGE: type[typer.BadParameter] = typer.BadParameter.__mro__[2]
 COMPLETION = "_MERGE_RUNNER_COMPLETE"  # set by the shell's script that typer installs
 
 
@@ -38,16 +40,20 @@ app = typer.Typer(
     help="Finds out whether a language model drives like a human.",
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
-    rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
 app.callback(invoke_without_command=True)(common)
-for _command in (
-    *(commands.init, commands.sweep, commands.replay, commands.sql, commands.digest),
-    *(commands.audit, commands.ledger, commands.forget, commands.models, commands.emulate),
-):
-    app.command()(_command)
-app.add_typer(commands.recording_app, name="recording")
+# The groups of the menu, in which the commands of the analysis take their places, too.
+PLAY, LOOK, KEEP, CHECK = "Play", "Look", "Keep", "Check"
+for _panel, _commands in {
+    PLAY: (commands.sweep, commands.replay, commands.init, commands.models, commands.emulate),
+    LOOK: (commands.sql,),
+    KEEP: (commands.forget,),
+    CHECK: (commands.audit, commands.digest, commands.ledger),
+}.items():
+    for _command in _commands:
+        app.command(rich_help_panel=_panel)(_command)
+app.add_typer(commands.recording_app, name="recording", rich_help_panel=KEEP)
 
 
 def alone(command: str | None) -> typer.Typer:
@@ -76,8 +82,15 @@ def main() -> None:
     completing = COMPLETION in os.environ  # a shell asks, whose words are not in argv
     words = (argument for argument in sys.argv[1:] if not argument.startswith("-"))
     try:
-        (app if completing else alone(next(words, None)))(prog_name="merge-runner")
+        run = app if completing else alone(next(words, None))
+        sys.exit(run(prog_name="merge-runner", standalone_mode=False))
+    except typer.Abort:
+        say("Aborted!")
+        sys.exit(1)
     except Exception as exc:
+        if isinstance(exc, USAGE):
+            exc.show()  # in plain lines: in Typer's boxes a script could not find them
+            sys.exit(exc.exit_code)
         code, text = _told(exc)
         if debug or not text:
             raise

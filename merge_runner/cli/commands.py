@@ -33,6 +33,13 @@ GRID = (
     "With --first, in the place of the study's conditions: h=FROM:TO:STEP,dv=FROM:TO:STEP, "
     "projected headways in m and relative velocities in m/s; usual: -6:6:2 and -1.6:1.6:0.4."
 )
+SAMPLES = "Another number draws a fresh set of samples."
+ORDER = "Another number draws another order of the trials."
+FIRST = "Only the first decision of both sides."
+DRY_RUN = "Only estimate: trials, calls, tokens, cost, time. Nothing is sent."
+IN_FLIGHT = "Trials at once, over all workers."
+KEEP_GOING = "Go on with a model that gives no valid decision."
+REPLAY = "From recorded replies alone: no key, no network."
 MAX_COST = "Never spend more on this, over all its runs."
 STRICT = "Stop when another model answers."
 DASK = "Play on a Dask cluster: local:N, a scheduler's address, or its file."
@@ -51,7 +58,10 @@ recording_app = typer.Typer(
 def init(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="A new folder, or an empty one.")],
 ) -> None:
-    """Write a folder with a study that runs, to change into your own."""
+    """Write a folder with a study that runs, to change into your own.
+
+    Example: merge-runner init my-study
+    """
     from merge_runner.study.file import write_folder
 
     for path in write_folder(folder):
@@ -61,45 +71,54 @@ def init(
 
 def sweep(
     studies: Annotated[
-        list[str],
+        list[str] | None,
         typer.Argument(
             metavar="NAME...",
-            help="experiments/NAME.toml, or a path. Several are played one after the other.",
+            help="experiments/NAME.toml, or a path; baseline if none is named. Several are played "
+            "one after the other.",
         ),
-    ],
-    first: Annotated[bool, cli.flag("--first", "Only the first decision of both sides.")] = False,
-    grid: Annotated[str | None, cli.option("GRID", GRID)] = None,
+    ] = None,
     models: cli.ModelOption = None,
     only: cli.OnlyOption = None,
-    mirror: Annotated[bool, cli.flag("--mirror", "Also play two drivers both ways.")] = False,
+    mirror: Annotated[
+        bool, cli.flag("--mirror", "Also play two drivers both ways.", **cli.PLAYED)
+    ] = False,
     repetitions: cli.RepsOption = None,
     conditions: cli.ConditionsOption = None,
     variants: cli.VariantsOption = None,
-    sample_set: Annotated[int, cli.option("N", "Another number draws a fresh set of samples.")] = 0,
-    order_seed: Annotated[int, cli.option("N", "Another number draws another order.")] = 0,
+    sample_set: Annotated[int, cli.option("N", SAMPLES, **cli.PLAYED)] = 0,
+    order_seed: Annotated[int, cli.option("N", ORDER, **cli.PLAYED)] = 0,
+    first: Annotated[bool, cli.flag("--first", FIRST, **cli.PLAYED)] = False,
+    grid: Annotated[str | None, cli.option("GRID", GRID, **cli.PLAYED)] = None,
+    dry_run: Annotated[bool, cli.flag("--dry-run", DRY_RUN, **cli.PACE)] = False,
+    max_cost_usd: Annotated[
+        float | None, cli.option("USD", MAX_COST, "--max-cost", min=0, **cli.PACE)
+    ] = None,
+    batch: Annotated[bool, cli.flag("--batch", BATCH, **cli.PACE)] = False,
+    in_flight: Annotated[int, cli.option("N", IN_FLIGHT, min=1, **cli.PACE)] = 200,
+    rpm: Annotated[int | None, cli.option("N", "Requests a minute.", min=1, **cli.PACE)] = None,
+    tpm: Annotated[int | None, cli.option("N", "Tokens a minute.", min=1, **cli.PACE)] = None,
+    dask: Annotated[str | None, cli.option("CLUSTER", DASK, **cli.PACE)] = None,
+    strict_model: Annotated[bool, cli.flag("--strict-model", STRICT, **cli.FAULTS)] = False,
+    keep_going: Annotated[bool, cli.flag("--keep-going", KEEP_GOING, **cli.FAULTS)] = False,
+    replay: Annotated[bool, cli.flag("--replay", REPLAY, **cli.REPLAY)] = False,
+    recordings: Annotated[
+        list[Path] | None, cli.option("FILE", RECORDING, "--recording", **cli.REPLAY)
+    ] = None,
     db: cli.DbOption = DEFAULT_DB,
     cache: cli.CacheOption = DEFAULT_CACHE,
-    in_flight: Annotated[int, cli.option("N", "Trials at once, over all workers.", min=1)] = 200,
-    rpm: Annotated[int | None, cli.option("N", "Requests a minute.", min=1)] = None,
-    tpm: Annotated[int | None, cli.option("N", "Tokens a minute.", min=1)] = None,
-    max_cost_usd: Annotated[float | None, cli.option("USD", MAX_COST, "--max-cost", min=0)] = None,
-    dask: Annotated[str | None, cli.option("CLUSTER", DASK)] = None,
-    batch: Annotated[bool, cli.flag("--batch", BATCH)] = False,
-    strict_model: Annotated[bool, cli.flag("--strict-model", STRICT)] = False,
-    keep_going: Annotated[
-        bool, cli.flag("--keep-going", "Go on with a model that gives no valid decision.")
-    ] = False,
-    dry_run: Annotated[bool, cli.flag("--dry-run", "Only estimate.")] = False,
     yes: cli.YesOption = False,
     trust: cli.TrustOption = False,
-    replay: Annotated[bool, cli.flag("--replay", "From recorded replies alone.")] = False,
-    recordings: Annotated[list[Path] | None, cli.option("FILE", RECORDING, "--recording")] = None,
-    quiet: Annotated[bool, cli.flag("--quiet", "Show no progress.")] = False,
+    quiet: Annotated[bool, cli.flag("--quiet", "Show no progress.", **cli.ASKED)] = False,
     as_json: cli.JsonOption = False,
 ) -> None:
-    """Play all trials of one or more sweeps that are not stored yet."""
+    """Run a study. What is already stored is not run again.
+
+    Example: merge-runner sweep baseline --model o3 --dry-run
+    """
     from merge_runner.run.plan import Options, make_plan
 
+    studies = studies or ["baseline"]
     if not isfinite(max_cost_usd or 0):
         raise UsageError("--max-cost is a number of USD")
     if recordings and not replay:
@@ -158,7 +177,10 @@ def sweep(
 
 @wraps(sweep, assigned=["__annotations__"])
 def replay(**options: Any) -> None:  # noqa: ANN401 # those of sweep
-    """Play a sweep from recorded replies alone: no key, no network."""
+    """Run a study again from recorded replies alone: no key, no network.
+
+    Example: merge-runner replay baseline --model emulator
+    """
     sweep(**{**options, "replay": True})
 
 
@@ -207,7 +229,10 @@ def sql(
     output: Annotated[Form, typer.Option("--format", help="Form of the result.")] = "text",
     as_json: cli.JsonOption = False,
 ) -> None:
-    """Query the results; also while a sweep runs. Nothing can be changed."""
+    """Query the results; also while a sweep runs. Nothing can be changed.
+
+    Example: merge-runner sql "select status, count(*) from trials group by all"
+    """
     from merge_runner.results import database, export, store
 
     writers = {"text": export.write_table, "csv": export.write_csv, "json": export.write_json}
@@ -222,7 +247,10 @@ def sql(
 
 
 def digest(db: cli.DbOption = DEFAULT_DB, as_json: cli.JsonOption = False) -> None:
-    """Print one line: a hash of all results, equal for equal results."""
+    """Print one line: a hash of all results, equal for equal results.
+
+    Example: merge-runner digest --db results/merge.duckdb
+    """
     from merge_runner.results.store import results_digest
 
     value, trials = results_digest(db)
@@ -243,7 +271,10 @@ def audit(
     trust: cli.TrustOption = False,
     as_json: cli.JsonOption = False,
 ) -> None:
-    """Check that each trial is there and follows from its replies."""
+    """Check that each trial is there and follows from its replies.
+
+    Example: merge-runner audit --recording baseline.parquet
+    """
     from merge_runner.audit.checks import audit_recording
     from merge_runner.run.stored_replay import NOT_REPLAYED, audit_database
 
@@ -279,6 +310,8 @@ def forget(
     """Remove sweeps and their trials from the database.
 
     Their replies stay in the cache.
+
+    Example: merge-runner forget "baseline-*"
     """
     from merge_runner.results import store
     from merge_runner.run.progress import running
@@ -303,7 +336,10 @@ def recording_export(
     cache: cli.CacheOption = DEFAULT_CACHE,
     sweeps: Annotated[list[str] | None, cli.option("ID", SWEEP, "--sweep")] = None,
 ) -> None:
-    """Write what sweeps asked and were answered into one file."""
+    """Write what sweeps asked and were answered into one file.
+
+    Example: merge-runner recording export mine.parquet
+    """
     from merge_runner.llm.cache import ResponseCache
     from merge_runner.results.recording import carried_plugins, export_recording, provenance_of
     from merge_runner.results.store import recorded_sweeps
@@ -329,7 +365,10 @@ def recording_import(
     ],
     cache: cli.CacheOption = DEFAULT_CACHE,
 ) -> None:
-    """Verify a recording or a cache folder, and add it to the cache."""
+    """Verify a recording or a cache folder, and add it to the cache.
+
+    Example: merge-runner recording import theirs.parquet
+    """
     from merge_runner.llm.cache import ResponseCache, import_folder
     from merge_runner.results.recording import import_recording
 
@@ -341,7 +380,10 @@ def recording_import(
 
 @recording_app.command("verify")
 def recording_verify(file: RecordingFile) -> None:
-    """Check that a file is as it was exported."""
+    """Check that a file is as it was exported.
+
+    Example: merge-runner recording verify theirs.parquet
+    """
     from merge_runner.results.recording import summarise
 
     found = summarise(file)
@@ -353,7 +395,10 @@ def recording_info(
     file: RecordingFile,
     as_json: cli.JsonOption = True,
 ) -> None:
-    """Verify a recording and print what it holds, as JSON."""
+    """Verify a recording and print what it holds.
+
+    Example: merge-runner recording info theirs.parquet
+    """
     from merge_runner.results.recording import summarise
 
     print_out(json.dumps(summarise(file), indent=2, ensure_ascii=False))
@@ -367,7 +412,10 @@ def ledger(
     yes: cli.YesOption = False,
     as_json: cli.JsonOption = False,
 ) -> None:
-    """Show what each sweep has spent, and what is set aside."""
+    """Show what each sweep has spent, and what is set aside.
+
+    Example: merge-runner ledger --cache cache/responses
+    """
     from merge_runner.llm.cache import ResponseCache
     from merge_runner.llm.ledger import Ledger, scopes
     from merge_runner.run.progress import as_table
@@ -407,7 +455,10 @@ def ledger(
 
 
 def models(as_json: cli.JsonOption = False) -> None:
-    """List the models and programs that can drive."""
+    """List the models and programs that can drive.
+
+    Example: merge-runner models --json
+    """
     from merge_runner.config import Price, key_status
     from merge_runner.drivers.registry import PROGRAMS
     from merge_runner.llm.ledger import cost_usd
@@ -451,7 +502,10 @@ def models(as_json: cli.JsonOption = False) -> None:
 def emulate(
     port: Annotated[int, cli.option("N", "0: any free port.", min=0, max=65535)] = 8765,
 ) -> None:
-    """Serve the emulator on 127.0.0.1, and print its base URL."""
+    """Serve the emulator on 127.0.0.1, and print its base URL.
+
+    Example: merge-runner emulate --port 8765
+    """
     import asyncio
 
     from merge_runner.emulator.server import run

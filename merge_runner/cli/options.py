@@ -21,9 +21,18 @@ def option(metavar: str, text: str, *names: str, **more: Any) -> Any:  # noqa: A
     return typer.Option(*names, metavar=metavar, help=text, **more)
 
 
-def flag(name: str, text: str) -> Any:  # noqa: ANN401 # as typer's
+def flag(name: str, text: str, **more: Any) -> Any:  # noqa: ANN401 # as typer's
     """An option without a value."""
-    return typer.Option(name, help=text)
+    return typer.Option(name, help=text, metavar="", **more)
+
+
+# The groups in which a command's help shows its options.
+PLAYED = {"rich_help_panel": "What is played"}
+PACE = {"rich_help_panel": "Money and pace"}
+FAULTS = {"rich_help_panel": "When a model fails"}
+REPLAY = {"rich_help_panel": "Replay"}
+FILES = {"rich_help_panel": "Files"}
+ASKED = {"rich_help_panel": "Questions and output"}
 
 
 def beside_study(ctx: typer.Context, param: typer.CallbackParam, path: Path) -> Path:
@@ -43,8 +52,8 @@ def beside_study(ctx: typer.Context, param: typer.CallbackParam, path: Path) -> 
 
 DB = "The results database; that of a study's file lies beside it."
 CACHE = "The folder of recorded replies; that of a study's file lies beside it."
-DbOption = Annotated[Path, option("FILE", DB, "--db", callback=beside_study)]
-CacheOption = Annotated[Path, option("DIR", CACHE, "--cache", callback=beside_study)]
+DbOption = Annotated[Path, option("FILE", DB, "--db", callback=beside_study, **FILES)]
+CacheOption = Annotated[Path, option("DIR", CACHE, "--cache", callback=beside_study, **FILES)]
 ModelOption = Annotated[
     list[str] | None,
     option(
@@ -52,25 +61,38 @@ ModelOption = Annotated[
         "A model of the registry, a program, or LEFT+RIGHT; may be repeated. Else those of the "
         "study's file, or the emulator.",
         "--model",
+        **PLAYED,
     ),
 ]
 OnlyOption = Annotated[
     list[str] | None,
     option(
-        "FACTOR=LEVEL", "A level of a factor, or of model or prompt; may be repeated.", "--only"
+        "FACTOR=LEVEL",
+        "A level of a factor, or of model or prompt; may be repeated.",
+        "--only",
+        **PLAYED,
     ),
 ]
-RepsOption = Annotated[int | None, option("N", "Repetitions per condition and variant.", "--reps")]
+RepsOption = Annotated[
+    int | None, option("N", "Repetitions per condition and prompt.", "--reps", **PLAYED)
+]
 ConditionsOption = Annotated[
-    str | None, option("A,B", "Conditions, separated by commas.", "--conditions")
+    str | None, option("A,B", "Conditions, separated by commas.", "--conditions", **PLAYED)
 ]
 VariantsOption = Annotated[
-    str | None, option("A,B", "Prompt variants, separated by commas.", "--variants")
+    str | None, option("A,B", "Prompts, separated by commas.", "--variants", **PLAYED)
 ]
-JsonOption = Annotated[bool, flag("--json", "Print the result as JSON.")]
-YesOption = Annotated[bool, flag("--yes", "Do not ask before something is spent or removed.")]
+JsonOption = Annotated[bool, flag("--json", "Print the result as JSON.", **ASKED)]
+YesOption = Annotated[
+    bool, flag("--yes", "Do not ask before something is spent or removed.", **ASKED)
+]
 TrustOption = Annotated[
-    bool, flag("--trust", "Run the study's code and send keys where its models.toml says, unasked.")
+    bool,
+    flag(
+        "--trust",
+        "Run the study's code and send keys where its models.toml says, unasked.",
+        **ASKED,
+    ),
 ]
 StudyOption = Annotated[
     str | None,
@@ -79,6 +101,7 @@ StudyOption = Annotated[
         "A study's file: tables, figures and reports are of its trials alone, its plug-ins run, "
         "and its prompts, conditions, drivers and metrics are known.",
         "--study",
+        **FILES,
     ),
 ]
 

@@ -6,6 +6,8 @@ import io
 import json
 import os
 import pty
+import re
+import shlex
 import struct
 import subprocess
 import termios
@@ -16,6 +18,7 @@ import typer.main
 from typer.testing import CliRunner
 
 from merge_runner_analysis.commands import app
+from merge_runner_analysis.tables import TABLES
 from tests.support import program
 from tests.support.harness import PROGRAM, environment
 from tests.unit.test_cli import every_command
@@ -39,9 +42,47 @@ def test_every_help_has_a_short_form_and_cuts_no_line():
     for path, _ in every_command(typer.main.get_command(app)):
         run = CliRunner().invoke(app, [*path, "-h"], env={"COLUMNS": "80"})
         assert run.exit_code == 0, path
-        for line in run.output.splitlines()[1:]:
+        for line in run.output.splitlines()[2:]:  # the usage goes first
             assert len(line) <= 80, (path, line)
-            assert not line.endswith("..."), (path, line)
+            assert not line.rstrip(" │").endswith(("...", "…")), (path, line)
+
+
+def groups_of(shown):
+    """The titles of the groups of a help, each with its first words."""
+    groups = {}
+    for line in shown.splitlines():
+        if line.startswith("╭─ "):
+            groups[line.strip("╭─╮ ")] = words = []
+        elif line.startswith("│ ") and line[2] not in " *":
+            words.append(line.split()[1])
+    return groups
+
+
+def test_the_menu_and_the_options_of_a_sweep_are_in_groups():
+    menu = groups_of(CliRunner().invoke(app, ["-h"]).output)
+    assert [*menu][-4:] == ["Play", "Look", "Keep", "Check"]
+    assert {"sweep", "replay", "init", "power"} <= {*menu["Play"]}
+    assert {"tables", "explain", "figures", "report", "view", "sql"} == {*menu["Look"]}
+    assert {"recording", "export", "forget", "human"} == {*menu["Keep"]}
+    assert {"audit", "digest", "ledger"} == {*menu["Check"]}
+    options = groups_of(CliRunner().invoke(app, ["sweep", "-h"]).output)
+    assert len(options) > 5
+    assert "Options" not in options or options["Options"] == ["--help"]
+    assert {"--max-cost", "--dry-run", "--rpm"} <= {*options["Money and pace"]}
+
+
+def test_every_command_has_an_example_that_it_can_read():
+    for path, command in every_command(typer.main.get_command(app)):
+        if not hasattr(command, "commands"):
+            (example,) = re.findall("^Example: (.*)$", command.help, re.MULTILINE)
+            words = shlex.split(example)
+            assert words[: 1 + len(path)] == ["merge-runner", *path]
+            command.make_context(path[-1], words[1 + len(path) :])
+
+
+def test_the_help_of_tables_names_each_of_them():
+    shown = CliRunner().invoke(app, ["tables", "-h"]).output.replace("│", " ")
+    assert {*TABLES} <= {*re.findall(r"[\w-]+", " ".join(shown.split()))}
 
 
 def test_the_json_of_tables_sql_digest_and_models_can_be_read(run):
@@ -54,25 +95,29 @@ def test_the_json_of_tables_sql_digest_and_models_can_be_read(run):
         assert json.loads(run(*words, "--json").out), words
 
 
-def test_a_table_fits_the_terminal_and_is_whole_elsewhere(run, golden):
+def test_a_table_fits_the_terminal_and_is_whole_elsewhere_and_with_wide(run, golden):
     whole = run("tables", "indicators", *DB).out.splitlines()
     assert max(map(len, whole)) > 80
+    assert at_a_terminal("tables", "indicators", "--wide", *DB, cwd=golden) == whole
+    lines = at_a_terminal("tables", "indicators", *DB, cwd=golden)
+    assert max(map(len, lines)) <= 80
+    assert any("hidden: --wide" in line for line in lines)
+
+
+def at_a_terminal(*words, cwd):
+    """The lines that a command prints at a terminal of 80 columns."""
     ours, its = pty.openpty()
     fcntl.ioctl(its, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
     env = {name: value for name, value in environment().items() if name != "COLUMNS"}
     with open(ours, "rb", buffering=0) as terminal:
-        process = subprocess.Popen(
-            [PROGRAM, "tables", "indicators", *DB], cwd=golden, env=env, stdout=its
-        )
+        process = subprocess.Popen([PROGRAM, *words], cwd=cwd, env=env, stdout=its)
         os.close(its)
         text = b""
         with suppress(OSError):  # its other end is closed
             while part := terminal.read(4096):
                 text += part
     assert process.wait() == 0
-    lines = text.decode().splitlines()
-    assert max(map(len, lines)) <= 80
-    assert any("so without" in line for line in lines)
+    return text.decode().splitlines()
 
 
 async def test_a_quiet_sweep_shows_no_progress(merge_runner):

@@ -35,6 +35,8 @@ def human_import(path: PathArgument, db: DbOption = DEFAULT_DB) -> None:
     """Add the recorded human trials to the database.
 
     Those that are there stay as they are.
+
+    Example: merge-runner human import 19550377.zip
     """
     from merge_runner.results.store import Store
     from merge_runner_analysis.humans.archive import open_files
@@ -64,7 +66,10 @@ def human_import(path: PathArgument, db: DbOption = DEFAULT_DB) -> None:
 
 @human_app.command("status")
 def human_status(db: DbOption = DEFAULT_DB, as_json: JsonOption = False) -> None:
-    """Count the human trials, beside the published counts."""
+    """Count the human trials, beside the published counts.
+
+    Example: merge-runner human status --db results/merge.duckdb
+    """
     from merge_runner_analysis.humans import imported as humans
     from merge_runner_analysis.published import HUMAN_DOI
 

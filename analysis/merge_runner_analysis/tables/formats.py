@@ -10,7 +10,7 @@ import json
 import textwrap
 from collections.abc import Callable, Sequence
 from functools import partial
-from itertools import accumulate, takewhile
+from itertools import takewhile
 
 from merge_runner.prompts.blocks import title_of
 from merge_runner.text_safety import csv_writer, in_spreadsheet
@@ -19,6 +19,12 @@ from merge_runner_analysis.tables.model import Column, Row, Table, Value
 
 MISSING = "–"
 BETWEEN = "   "
+# A narrow terminal shows these columns last, and those that say what is found first.
+ASIDE = {
+    *(("kind", "text"), ("k", "count"), ("undecided", "count"), ("level", "number")),
+    *(("detectable", "number"), ("freedom", "number"), ("human_ci", "interval")),
+}
+FINDINGS = {"estimate", "value", "b", "difference"}
 LATEX = str.maketrans(
     {
         "\\": r"\textbackslash{}",
@@ -64,27 +70,23 @@ def _grid(table: Table) -> tuple[list[Column], list[list[str]]]:
 
 
 def as_text(table: Table, width: int | None = None) -> str:
-    """A table for a terminal; without its ``width`` lines are as long as they need to be.
-
-    Columns that do not fit are left out from the right, and named.
-    """
+    """A table for a terminal; without its ``width`` lines are as long as they need to be."""
     # Characters differ in width on a terminal, so len() would misalign the columns.
     from rich.cells import cell_len
 
     (columns, grid), notes = _grid(table), notes_of(table)
     widths = [max(map(cell_len, cells)) for cells in zip(*grid, strict=True)]
-    if width is not None:
-        ends = accumulate(one + len(BETWEEN) for one in widths)
-        fitting = max(sum(end - len(BETWEEN) <= width for end in ends), 1)
-        if left_out := ", ".join(column.name for column in columns[fitting:]):
-            notes.insert(0, f"wider than the terminal, so without {left_out}: --format csv has all")
-        columns = columns[:fitting]
+    fitting = [*range(len(columns))] if width is None else _fitting(columns, widths, width)
+    if hidden := [column.name for place, column in enumerate(columns) if place not in fitting]:
+        number = f"{len(hidden)} column{'s' * (len(hidden) > 1)}"
+        notes.insert(0, f"{number} hidden: --wide shows {', '.join(hidden)}")
     lines = []
     for cells in grid if columns else ():
         texts = []
-        for column, cell, of in zip(columns, cells, widths, strict=False):
-            blank = " " * (of - cell_len(cell))
-            texts.append(cell + blank if column.kind == "text" else blank + cell)
+        for place in fitting:
+            blank = " " * (widths[place] - cell_len(cells[place]))
+            text = columns[place].kind == "text"
+            texts.append(cells[place] + blank if text else blank + cells[place])
         lines.append(BETWEEN.join(texts))
     lines[1:1] = ["─" * max(map(cell_len, lines))] if lines else []
     said = [table.heading, *(f"  {note}" for note in notes)]
@@ -94,6 +96,25 @@ def as_text(table: Table, width: int | None = None) -> str:
             for text in said
         ]
     return "\n".join([said[0], *(line.rstrip() for line in lines), *said[1:]])
+
+
+def _fitting(columns: Sequence[Column], widths: Sequence[int], width: int) -> list[int]:
+    """The places of the columns that fit a terminal; of equal weight, the right ones go first."""
+    fitting = [*range(len(columns))]
+    for place in sorted(fitting, key=lambda place: (_weight(columns[place]), -place))[:-1]:
+        if sum(widths[each] + len(BETWEEN) for each in fitting) - len(BETWEEN) <= width:
+            break
+        fitting.remove(place)
+    return fitting
+
+
+def _weight(column: Column) -> int:
+    """How much a reader misses a column: what names a row and what is found weigh most."""
+    if (column.name, column.kind) in ASIDE:
+        return 0
+    if column.kind in {"text", "p", "verdict"} or column.name in FINDINGS:
+        return 3
+    return 2 if column.kind == "interval" else 1
 
 
 def as_csv(table: Table) -> str:

@@ -43,17 +43,35 @@ def test_the_docs_list_the_tables_and_figures_as_the_explorer_does():
         assert "\n".join(["|---|---|", *rows, ""]) in text
 
 
-@pytest.mark.parametrize("width", [60, 120])
+def hidden_in(table, width):
+    """The lines of a table on a terminal, and the columns that they say are hidden."""
+    lines = render([table], TableFormat.TEXT, width).splitlines()
+    rest = " ".join(lines)
+    said = re.search(r"  (\d+) columns? hidden: --wide shows ((?:\w+, +)*\w+)", rest)
+    names = re.split(", +", said[2]) if said else []
+    assert len(names) == (int(said[1]) if said else 0)
+    return lines, names
+
+
+@pytest.mark.parametrize("width", [60, 100, 120])
 def test_a_table_fits_the_terminal_and_names_the_columns_that_do_not(tables, width):
     for table in tables.values():
-        lines = render([table], TableFormat.TEXT, width).splitlines()
+        lines, hidden = hidden_in(table, width)
         assert all(len(line) <= width for line in lines), table.name
         if not table.rows:
             continue
-        left_out = re.search(r"so without (.*?): --format csv", " ".join(map(str.strip, lines)))
-        assert bool(left_out) == (len(as_text(table).splitlines()[2]) > width), table.name
-        if left_out:
-            assert {*left_out[1].split(", ")} <= {column.name for column in table.columns}
+        assert bool(hidden) == (len(as_text(table).splitlines()[2]) > width), table.name
+        assert {*hidden} <= {column.name for column in table.columns}
+
+
+def test_a_terminal_of_100_columns_shows_estimates_differences_p_and_verdicts(tables):
+    for name in ("verdicts", "contrasts", "factors", "indicators", "who-first"):
+        _, hidden = hidden_in(tables[name], 100)
+        kinds = {column.name: column.kind for column in tables[name].columns}
+        assert hidden, name
+        findings = {"estimate", "value", "b", "difference", "p", "p_holm", "state"}
+        assert not findings & {*hidden}, name
+        assert not {"p", "verdict"} & {kinds[column] for column in hidden}, name
 
 
 def test_the_score_counts_the_marks_beside_it_and_disagreeing_rules_are_marked(study, tables):
