@@ -18,6 +18,8 @@ Estimator = Literal["proportion", "mean", "median"]
 SHOWN = {"tables": ("proportion", "mean"), "criticality": ("median",)}
 # The trials that a metric may be of, in SQL.
 STATUS = {"finished": "status = 'finished'", "ended": "status <> 'failed'"}
+# Of every measure, its interval and its differences, wherever they are printed.
+DECIMALS = 2
 INTERVALS = "Wilson for rates, Student's t for means, order statistics for medians"
 # What the analysis finds out of each trial that no column of the database has: whether it collided
 # by the rule of its scenario, and by that of the human experiment.
@@ -46,7 +48,6 @@ class Metric:
     value: str
     estimator: Estimator = "mean"
     trials: Literal["finished", "ended"] = "finished"
-    decimals: int = 2
     paper_of_drivers: str = ""
     paper_of_humans: str = ""
     shown: bool = True

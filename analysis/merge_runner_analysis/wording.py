@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from merge_runner.study.file import BASELINE
-from merge_runner_analysis.metrics import BOXES, GAP, LEFT_FIRST
+from merge_runner_analysis.metrics import BOXES, DECIMALS, GAP, LEFT_FIRST
 
 TABLE = "verdicts"
 # Kinds of drivers: language models are in the headline, scripts that pose as one are not.
@@ -21,6 +21,7 @@ SHOWN, WEAKER, STRONGER, UNLIKE, OPEN = "shown", "weaker", "stronger", "unlike",
 DIFFERS = frozenset({WEAKER, STRONGER, UNLIKE})
 ENOUGH = 20  # trials with an outcome; with fewer of them a headline says nothing of likeness
 MOST_COLLISIONS = 25.0  # percent; with more of them collisions come first in a sentence
+MISSING, MINUS = "–", "−"
 
 Values = Mapping[str, Any]
 
@@ -32,10 +33,9 @@ class Measure:
     ``trait`` names what humans do, ``label`` and ``unit`` head a column, ``rests_on`` is the column
     in which its trials have a value, or "finished", and ``rule`` says how its state is set.
     ``told`` is the sentence of a difference, with the fields ``of`` (driver) and ``humans``, each a
-    value with its interval, and ``decimals`` are those of its values there. ``says`` has by state
-    the driver's part of a sentence, with the values of its row as fields, its ``rate`` and ``more``
-    or less. ``ends`` are those of its axis. ``margin``: so far from 0, where the humans are, it
-    still is alike.
+    value with its interval. ``says`` has by state the driver's part of a sentence, with the fields
+    ``of``, ``humans``, its ``rate`` and ``more`` or less. ``ends`` are those of its axis.
+    ``margin``: so far from 0, where the humans are, it still is alike.
     """
 
     name: str
@@ -47,7 +47,6 @@ class Measure:
     told: str
     ends: tuple[float, float]
     says: Mapping[str, str] = field(default_factory=dict)
-    decimals: int = 1
     margin: float | None = None
 
 
@@ -107,7 +106,7 @@ MEASURES = {
             "corrected p below .05",
             "leaves a gap of {of} m, humans {humans} m",
             (0.0, 8.0),
-            {UNLIKE: "leaves {estimate:.1f} m, humans {human:.1f} m"},
+            {UNLIKE: "leaves {of} m, humans {humans} m"},
         ),
         Measure(
             "gap-headway",
@@ -123,7 +122,6 @@ MEASURES = {
                 STRONGER: "leaves more gap per headway than humans",
                 UNLIKE: "leaves less gap per headway than humans",
             },
-            decimals=2,
         ),
         Measure(
             "gap-velocity",
@@ -135,7 +133,7 @@ MEASURES = {
             "5 %; unlike: corrected p of being within below .05",
             "moves its gap by up to {of} m by relative velocity alone, humans by up to {humans} m",
             (0.0, 3.0),
-            {UNLIKE: "moves its gap by {estimate:.1f} m by relative velocity alone"},
+            {UNLIKE: "moves its gap by {of} m by relative velocity alone"},
             margin=1.0,
         ),
         Measure(
@@ -204,13 +202,14 @@ def sentence(verdicts: Mapping[str, Values]) -> str:
 
 def _part(values: Values) -> str:
     says = MEASURES[str(values["measure"])].says.get(str(values.get("state")), "")
+    of, humans = (number(values.get(name)) for name in ("estimate", "human"))
     more = "more" if (values.get("estimate") or 0.0) > 0 else "less"
-    return says.format(**values, more=more, rate=share(values, 0))
+    return says.format(of=of, humans=humans, more=more, rate=share(values))
 
 
 def _between(values: Values) -> str:
     """Of a rate with undecided trials, what it lies between."""
-    return f" ({share(values, 0)} % of trials)" if values.get("undecided") else ""
+    return f" ({share(values)} % of trials)" if values.get("undecided") else ""
 
 
 def _percent(collisions: Values, count: int) -> float:
@@ -219,13 +218,11 @@ def _percent(collisions: Values, count: int) -> float:
     return 100 * count / ended if ended else 0.0
 
 
-def share(collisions: Values, decimals: int = 1) -> str:
-    """A rate in percent, or ``14 to 68`` where trials are undecided."""
+def share(collisions: Values) -> str:
+    """A rate in percent, or ``13.64 to 68.18`` where trials are undecided."""
     k, undecided = collisions.get("k") or 0, collisions.get("undecided") or 0
-    least = number(_percent(collisions, k), decimals)
-    if not undecided:
-        return least
-    return f"{least} to {number(_percent(collisions, k + undecided), decimals)}"
+    least = number(_percent(collisions, k))
+    return f"{least} to {number(_percent(collisions, k + undecided))}" if undecided else least
 
 
 def differs(values: Values) -> bool:
@@ -308,30 +305,36 @@ def _count(drivers: Mapping[str, Mapping[str, Values]], unlike: int) -> str:
 
 
 def told(values: Values) -> str:
-    """The sentence of one difference: ``collides in 68 [47, 84] % of trials, ... (n = 22)``.
+    """The sentence of one difference: ``collides in 68.18 [47.32, 83.64] % ... (n = 22)``.
 
     A driver's interval beside a margin has the level of its row, which is named if not 95 %.
     """
     measure = MEASURES[str(values["measure"])]
-    of = with_interval(values["estimate"], values["ci"], measure.decimals)
+    of = with_interval(values["estimate"], values["ci"])
     level = values.get("level") if measure.margin is not None and values["ci"] else None
     own = "" if level is None or f"{level:.4g}" == "95" else f"; its interval at {level:.4g} %"
-    humans = with_interval(values["human"], values["human_ci"], measure.decimals)
+    humans = with_interval(values["human"], values["human_ci"])
     return f"{measure.told.format(of=of, humans=humans)} (n = {values['n']}{own})"
 
 
-def with_interval(value: float | None, ci: Sequence[float] | None, decimals: int) -> str:
-    """``68.2 [47.3, 83.6]``; an en dash where there is no value."""
-    if value is None:
-        return "–"
-    ends = "" if ci is None else f" [{number(ci[0], decimals)}, {number(ci[1], decimals)}]"
-    return f"{number(value, decimals)}{ends}"
+def with_interval(value: float | None, ci: Sequence[float] | None) -> str:
+    """``68.18 [47.32, 83.64]``; an en dash where there is no value."""
+    return number(value) if value is None else f"{number(value)} {brackets(ci)}".rstrip()
 
 
-def number(value: float, decimals: int) -> str:
-    """A number with a true minus sign, and never minus zero."""
-    text = f"{value:.{decimals}f}"
-    return text.lstrip("-") if not float(text) else text.replace("-", "−")
+def brackets(ci: Sequence[float] | None) -> str:
+    """``[47.32, 83.64]``, or nothing."""
+    return "" if ci is None else f"[{', '.join(map(number, ci))}]"
+
+
+def number(value: float | None, decimals: int = DECIMALS, unit: str = "") -> str:
+    """A number as pages and sentences print it: with a true minus sign, and never minus zero."""
+    return MISSING if value is None else f"{value:z.{decimals}f}{unit}".replace("-", MINUS)
+
+
+def p_value(p: float | None) -> str:
+    """A p of three decimals, or that it is smaller."""
+    return "<0.001" if p is not None and p < 0.001 else number(p, 3)
 
 
 def verdict_word(values: Values) -> str:

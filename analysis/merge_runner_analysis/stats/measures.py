@@ -105,7 +105,7 @@ def undecided_note(group: Group, metric: Metric) -> str:
     every = n + cut_off
     said = (
         f"{metric.heading}: {cut_off} of {every} trials are undecided, since another collision "
-        f"rule ended them; between {100 * k / every:.1f} and {100 * (k + cut_off) / every:.1f} %"
+        f"rule ended them; between {100 * k / every:.2f} and {100 * (k + cut_off) / every:.2f} %"
     )
     if metric is BOXES:
         said += '. A study whose [scenario] has collision_rule = "rectangle" decides them'

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.metrics import (
+    DECIMALS,
     INTERVALS,
     RULES_NOTE,
     Metric,
@@ -49,8 +50,8 @@ def metric_table(name: str, groups: list[Group], place: str, *notes: str) -> Tab
             meaning = f"median over the {of}: {meaning}"
             columns.append(Optional(f"{one.name}_n", "n", "count", 0, of, rests_on=rests_on))
         columns += [
-            Column(one.name, one.heading, kind, one.decimals, meaning, counts, rests_on=rests_on),
-            interval(f"{one.name}_ci", f"of {one.label}", one.decimals, rests_on),
+            Column(one.name, one.heading, kind, DECIMALS, meaning, counts, rests_on=rests_on),
+            interval(f"{one.name}_ci", f"of {one.label}", rests_on=rests_on),
         ]
     rows = []
     for group in groups:

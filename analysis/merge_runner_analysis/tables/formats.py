@@ -16,8 +16,8 @@ from merge_runner.prompts.blocks import title_of
 from merge_runner.text_safety import csv_writer, in_spreadsheet
 from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables.model import Column, Row, Table, Value
+from merge_runner_analysis.wording import MISSING, p_value
 
-MISSING = "–"
 BETWEEN = "   "
 # A narrow terminal shows these columns last, and those that say what is found first.
 ASIDE = {
@@ -240,20 +240,14 @@ def shown_value(column: Column, value: Value) -> str:
     if value is None:
         return "" if column.kind == "text" else MISSING
     if isinstance(value, tuple):
-        return f"[{', '.join(_rounded(end, column.digits) for end in value)}]"
+        return f"[{', '.join(f'{end:z.{column.digits}f}' for end in value)}]"
     if isinstance(value, bool):
         return "✓" if value else "✗"
     if column.name == "setting":
         return title_of(str(value))
-    if column.kind == "p" and isinstance(value, float) and value < 0.001:
-        return "<0.001"
-    return _rounded(value, column.digits) if isinstance(value, float) else str(value)
-
-
-def _rounded(value: float, digits: int) -> str:
-    text = f"{value:.{digits}f}"
-    # A small negative value that rounds to zero would otherwise be shown as -0.00.
-    return text.lstrip("-") if float(text) == 0 else text
+    if column.kind == "p" and isinstance(value, float):
+        return p_value(value)
+    return f"{value:z.{column.digits}f}" if isinstance(value, float) else str(value)
 
 
 def table_view(table: Table, link: Callable[[Table, Row, Column], object]) -> dict[str, object]:

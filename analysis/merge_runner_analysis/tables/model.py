@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import TypeAdapter
 
+from merge_runner_analysis.metrics import DECIMALS
+
 if TYPE_CHECKING:
     from merge_runner_analysis.grouping import Group
 
@@ -35,7 +37,7 @@ class Column:
     name: str
     heading: str
     kind: Kind = "text"
-    digits: int = 2
+    digits: int = DECIMALS
     meaning: str = ""
     counts: str = ""
     optional: bool = False
@@ -46,7 +48,7 @@ class Column:
 Optional = partial(Column, optional=True)
 
 
-def interval(name: str, meaning: str, digits: int = 2, rests_on: str = "") -> Column:
+def interval(name: str, meaning: str, digits: int = DECIMALS, rests_on: str = "") -> Column:
     """The column of a 95 % interval."""
     return Optional(name, "95 % CI", "interval", digits, meaning, rests_on=rests_on)
 

@@ -40,7 +40,7 @@ VERDICT_COLUMNS = (
     interval("human_ci", "of the humans"),
     Optional("difference", "difference", "number", 2, "driver minus humans"),
     Optional("difference_ci", "CI", "interval", 2, "of the difference, at the level of the row"),
-    Optional("level", "level", "number", 1, "of the interval that the verdict rests on, in %"),
+    Optional("level", "level", "number", 2, "of the interval that the verdict rests on, in %"),
     Optional("p", "p", "p", 3, "of no difference; with a margin (I4, I5) of being within it"),
     Optional("p_holm", "Holm", "p", 3, "corrected over the measures of the driver"),
     Optional("detectable", "detectable", "number", 2, "smallest difference found with power .8"),

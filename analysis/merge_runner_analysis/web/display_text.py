@@ -9,8 +9,8 @@ from contextlib import suppress
 from decimal import Decimal
 
 from merge_runner.text_safety import in_spreadsheet
+from merge_runner_analysis.wording import MINUS
 
-MINUS = "−"
 NEGATIVE = re.compile(r"(?<![\w-])-(?=\d)")
 SHOWN = 20_000
 BEGINNING = 800
@@ -21,11 +21,6 @@ _HIDDEN = {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}
 # Letters and marks that show nothing either: fillers, joiners, and selectors of variants.
 _BLANK = {0x034F, 0x115F, 0x1160, 0x17B4, 0x17B5, 0x2800, 0x3164, 0xFFA0}
 _BLANK.update(range(0x180B, 0x1810), range(0xFE00, 0xFE10), range(0xE0100, 0xE01F0))
-
-
-def shown_number(value: float | None, decimals: int = 2, unit: str = "") -> str:
-    """A number with its unit, as all pages print it; an en dash where there is none."""
-    return "–" if value is None else f"{value:.{decimals}f}{unit}".replace("-", MINUS)
 
 
 def with_minus(text: str) -> str:

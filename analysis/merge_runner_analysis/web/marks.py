@@ -13,6 +13,7 @@ from merge_runner_analysis.wording import (
     WEAKER,
     Measure,
     Values,
+    brackets,
     number,
     share,
     verdict_word,
@@ -20,7 +21,6 @@ from merge_runner_analysis.wording import (
 )
 
 SHAPES = {SHOWN: "like", WEAKER: "weaker", STRONGER: "stronger", UNLIKE: "unlike", OPEN: "open"}
-LARGE_PERCENT = 10.0  # from here on a share of collisions has no decimals
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,20 +94,15 @@ def cells(verdicts: dict[str, Values]) -> dict[str, Cell]:
 
 def _cell(measure: Measure, values: Values) -> Cell:
     value, ci = values.get("estimate"), values.get("ci")
-    is_large = (value or 0.0) >= LARGE_PERCENT
-    decimals = {"gap-headway": 2, "collisions": 0 if is_large else 1}.get(measure.name, 1)
-    text = "–" if value is None else number(value, decimals)
-    if values.get("undecided"):
-        text = share(values, 0)
     word = verdict_word(values) if values.get("kind") != "humans" else ""
-    whole = share(values) if values.get("undecided") else with_interval(value, ci, 2)
+    whole = share(values) if values.get("undecided") else with_interval(value, ci)
     said = [f"{whole} {measure.unit}", word, f"n = {values['n']}", values["note"]]
     return Cell(
         measure,
         values,
         mark(measure, values),
-        text,
-        "" if ci is None else f"[{number(ci[0], decimals)}, {number(ci[1], decimals)}]",
+        share(values) if values.get("undecided") else number(value),
+        brackets(ci),
         word,
         "; ".join(filter(None, said)),
     )

@@ -12,8 +12,9 @@ import jinja2
 from jinja2.bccache import Bucket
 from markupsafe import Markup
 
-from merge_runner_analysis.web.display_text import MINUS, shown_number, visible, with_minus
+from merge_runner_analysis.web.display_text import visible, with_minus
 from merge_runner_analysis.web.urls import Links
+from merge_runner_analysis.wording import MINUS, number, p_value
 
 TEMPLATES, STATIC = (Path(__file__).with_name(name) for name in ("templates", "static"))
 STYLES = [f"styles/{name}.css" for name in ("base", "answers", "trial", "pages")]
@@ -59,7 +60,8 @@ def environment(
     # Jinja's own format makes markup of its pattern, and escapes number by number.
     made.filters.update(
         format=lambda text, *values: (str(text) % values).replace("-", MINUS),
-        num=shown_number,
+        num=number,
+        p=p_value,
         whole="{:,}".format,
         minus=lambda text: with_minus(str(text)),
     )

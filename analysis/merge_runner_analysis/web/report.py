@@ -36,7 +36,7 @@ from merge_runner_analysis.tables.verdicts import verdicts
 from merge_runner_analysis.web.rendering import STYLES, environment, inlined_texts, policy_of
 from merge_runner_analysis.web.scope import DESCRIPTIONS
 from merge_runner_analysis.web.urls import Links
-from merge_runner_analysis.wording import TABLE, sentences
+from merge_runner_analysis.wording import TABLE, number, sentences
 
 # What each variant asks first: of all of them in the same condition, as far as that was played.
 PROMPTS = """
@@ -265,8 +265,8 @@ def _found(study: Study, origin: Provenance) -> Iterator[tuple[str, str]]:
             yield "Trials failed", f"{failed} of {trials} of {group.id} ({why}{more})"
         fallbacks, decisions = counts["fallback"], counts["decisions"]
         if not group.unjudged and fallbacks > MANY_FALLBACKS * decisions:
-            share = f"{100 * fallbacks / decisions:.1f} %"
-            said = f"{fallbacks} of {decisions} decisions of {group.id} ({share})"
+            share = number(100 * fallbacks / decisions)
+            said = f"{fallbacks} of {decisions} decisions of {group.id} ({share} %)"
             yield "Many fallbacks", said
         if missing := counts[NO_DECISION]:
             yield "Decisions are missing", f"{missing} of {decisions} decisions of {group.id}"

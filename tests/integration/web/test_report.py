@@ -91,7 +91,7 @@ def test_what_went_wrong_stands_at_the_top_before_any_number(page):
     for said in (
         "Another model answered. other was asked for, impostor answered: 3 answers, in sweep-1.",
         "Trials failed. 1 of 44 of other/baseline (no answer after 2 attempts).",
-        "Many fallbacks. 55 of 906 decisions of o3/A2 (6.1 %).",
+        "Many fallbacks. 55 of 906 decisions of o3/A2 (6.07 %).",
         "Attempts of unknown fate. 1 of 896 of o3/A1.",
     ):
         assert said in warnings

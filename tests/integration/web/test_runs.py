@@ -122,7 +122,7 @@ def test_the_page_has_the_numbers_of_the_database_and_every_rate_leads_to_its_tr
         ("faults", failures, attempts, "attempts"),
         ("another model answered", 1, answers, "answers"),
     ):
-        part = f" ({100 * count / of:.1f} %)" if count else ""
+        part = f" ({100 * count / of:.2f} %)" if count else ""
         assert f"{name} {count:,} of {of:,}{part} {things}" in text
     assert "its runs could spend at most 9.00 USD; 1 attempts of unknown cost are not in it" in text
     assert (facts["invalid"], facts["fallbacks"], len(facts["failed"])) == (2, 2, 1)
@@ -209,7 +209,7 @@ def test_runs_show_how_they_ended_and_what_the_audit_finds_and_a_scope_changes_n
     assert all(" ".join(note.split()) in text for note in run.notes)
     said = re.search(r"How each ended .*", whole)[0]
     assert said.split(" To go on")[0] in part
-    assert "30 (3.3 %)" in whole
+    assert "30 (3.33 %)" in whole
     assert ("0 of 3 " in whole, "0 of 3 " in part) == (False, True)
     assert re.search(r"all runs together 3 ", part)
     Store(tmp_path / "none.duckdb")

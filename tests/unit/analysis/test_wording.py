@@ -39,15 +39,15 @@ WILD = driver(collisions="unlike", gap="unlike", collided=10)
         (
             {"wild": WILD},
             "wild does not drive like humans:",
-            "it collides in 1.0 [0.5, 1.5] % of trials, humans in 2.0 % (n = 120).",
+            "it collides in 1.00 [0.50, 1.50] % of trials, humans in 2.00 % (n = 120).",
         ),
         ({"o3": driver()}, "No difference from humans is shown for o3.", ""),
         (
             {"o3": driver(), "wild": WILD},
             "No difference from humans is shown for o3;",
-            "but wild collides in 1.0 [0.5, 1.5] % of trials, humans in 2.0 % (n = 120). 2 of 8 "
-            "comparisons with humans show a difference at 5 %, corrected by Holm within each of 2 "
-            "models.",
+            "but wild collides in 1.00 [0.50, 1.50] % of trials, humans in 2.00 % (n = 120). 2 of "
+            "8 comparisons with humans show a difference at 5 %, corrected by Holm within each of "
+            "2 models.",
         ),
     ],
 )
@@ -113,8 +113,11 @@ def test_an_interval_beside_a_margin_names_its_level_where_that_is_not_95_percen
             "Goes first by headway less than humans. When faster, yields as",
         ),
         (driver(velocity="unlike"), "When faster, does not yield as humans do. "),
-        (driver(50, collided=50, collisions="unlike"), "Collides in 50 % of trials"),
-        (driver(2, collided=1, undecided=1), "ollisions (25 to 50 % of trials) and mean gap: inco"),
+        (driver(50, collided=50, collisions="unlike"), "Collides in 50.00 % of trials"),
+        (
+            driver(2, collided=1, undecided=1),
+            "ions (25.00 to 50.00 % of trials) and mean gap: inco",
+        ),
         ({"": {"note": "not judged: why"}}, "Not judged: why."),
     ],
 )

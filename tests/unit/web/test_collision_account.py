@@ -11,9 +11,9 @@ WORDS = {
     "last have avoided it, by braking or speeding up, the left vehicle was 2.5 m/s faster and the "
     "right one 2.0 m/s faster than at the start; 0.5 m/s or more count as acting.",
     "no action": "Neither acted.",
-    "near miss": "It came close: the gap was 0.4 m at the first merge, then the time to collision "
-    "fell to 0.9 s.",
-    "long wait": "The first vehicle reached the merge point after 12.5 s: 2 times as long as at "
+    "near miss": "It came close: the gap was 0.42 m at the first merge, then the time to collision "
+    "fell to 0.90 s.",
+    "long wait": "The first vehicle reached the merge point after 12.50 s: 2 times as long as at "
     "the initial speeds, or longer.",
 }
 FACTS = {"gap_m": 0.42, "min_ttc_s": 0.9, "time_to_merge_s": 12.5}

@@ -17,6 +17,7 @@ from merge_runner.records import SIDES, Side, other_side
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.geometry import Track
 from merge_runner.scenarios.merge.vehicle import advance, net_acceleration
+from merge_runner_analysis.wording import number
 
 BRAKING, SPEEDING_UP = -1.0, 1.0
 """The hardest actions, as a plan normalises them."""
@@ -207,15 +208,15 @@ def account(course: Course, decisions: Decided, trial: Mapping[str, Any]) -> Acc
     name = trial["account"]
     chances: dict[Side, int | None] = {}
     if name == NEAR_MISS:
-        sentence = f"It came close: the gap was {trial['gap_m']:.1f} m at the first merge"
+        sentence = f"It came close: the gap was {number(trial['gap_m'])} m at the first merge"
         if trial["min_ttc_s"] is not None:
-            sentence += f", then the time to collision fell to {trial['min_ttc_s']:.1f} s"
+            sentence += f", then the time to collision fell to {number(trial['min_ttc_s'])} s"
         sentences = [f"{sentence}."]
     elif name == LONG_WAIT:
         took_s = trial["time_to_merge_s"]
         reached = "Nobody had reached the merge point at the end"
         if took_s is not None:
-            reached = f"The first vehicle reached the merge point after {took_s:.1f} s"
+            reached = f"The first vehicle reached the merge point after {number(took_s)} s"
         times = f"{LONG_WAIT_TIMES:g} times as long as at the initial speeds, or longer"
         sentences = [f"{reached}: {times}."]
     else:

@@ -7,6 +7,7 @@ from merge_runner.prompts.blocks import title_of
 from merge_runner_analysis.web.phrases import condition_text
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.trial.reader import Trial, controlled
+from merge_runner_analysis.wording import number
 
 
 def outcome_text(row: Row) -> str:
@@ -22,8 +23,8 @@ def outcome_text(row: Row) -> str:
         merged = f"The trial ended after {end}; no vehicle merged first."
         return without_first.get(row["status"], merged)
     other = "right" if first == "left" else "left"
-    when = "" if row["time_to_merge_s"] is None else f", after {row['time_to_merge_s']:.1f} s"
-    gap = "" if row["gap_m"] is None else f", with a gap of {row['gap_m']:.1f} m"
+    when = "" if row["time_to_merge_s"] is None else f", after {number(row['time_to_merge_s'])} s"
+    gap = "" if row["gap_m"] is None else f", with a gap of {number(row['gap_m'])} m"
     return f"The {other} vehicle yielded: the {first} one reached the merge point first{when}{gap}."
 
 
@@ -47,7 +48,7 @@ def facts(row: Row) -> list[str]:
         f"{row['condition']}: {condition}",
         row["variant"] and f"{row['variant']}: {prompt}",
         ", ".join(row["levels"] or ()),
-        row["rmse_mps"] is not None and f"RMSE of the speed {row['rmse_mps']:.2f} m/s",
+        row["rmse_mps"] is not None and f"RMSE of the speed {number(row['rmse_mps'])} m/s",
         row["asked"] and f"{row['invalid']} of {row['asked']} decisions invalid",
         row["cost_usd"] is not None and f"{row['cost_usd']:.3f} USD",
         row["caution"] and f"Note: {row['caution']}",

@@ -1,0 +1,168 @@
+"""A value has the same digits on every page, in the report and in text: the CSV's, rounded."""
+
+import csv
+import io
+import re
+from html import unescape
+from math import isnan
+
+import pytest
+
+from merge_runner_analysis import table as table_of
+from merge_runner_analysis.metrics import DECIMALS
+from merge_runner_analysis.study import Study
+from merge_runner_analysis.table_format import TableFormat
+from merge_runner_analysis.tables import TABLES, make_tables
+from merge_runner_analysis.tables.formats import names_of, render, shown_columns
+from merge_runner_analysis.web.report import report_html
+from tests.support.serving import client_of
+
+DECIMAL = re.compile(r"[<-]?\d+\.\d+")
+NUMBERS = {"number", "percent", "interval", "p"}
+
+
+@pytest.fixture(scope="module")
+def study(golden):
+    return Study(golden / "golden.duckdb")
+
+
+@pytest.fixture(scope="module")
+def tables(study):
+    return {table.name: table for table in make_tables(study)}
+
+
+@pytest.fixture(scope="module")
+def client(golden, tables):
+    return client_of(golden / "golden.duckdb")
+
+
+@pytest.fixture(scope="module")
+def report(study, tables):
+    return report_html(study, list(tables.values()), {})
+
+
+def as_csv(table):
+    """The rows of a table's CSV by their ids."""
+    rows = csv.DictReader(io.StringIO(render([table], TableFormat.CSV)))
+    return {row["row"]: row for row in rows}
+
+
+def rounded(value, decimals=DECIMALS):
+    """A value of the CSV as it is to be printed; there is no minus zero."""
+    return re.sub(r"^-(0\.0*)$", r"\1", f"{float(value):.{decimals}f}") if value else "–"
+
+
+def p_value(p):
+    return "<0.001" if float(p) < 0.001 else rounded(p, 3)
+
+
+def expected(column, row):
+    """What a cell with a number is to show of a row of the CSV."""
+    if column.kind == "interval":
+        ends = [row[f"{column.name}_low"], row[f"{column.name}_high"]]
+        return f"[{', '.join(rounded(end, column.digits) for end in ends)}]" if all(ends) else "–"
+    if column.kind == "p" and row[column.name]:
+        return p_value(row[column.name])
+    return rounded(row[column.name], column.digits)
+
+
+def plain(html):
+    """The words of a piece of a page, with a minus sign that Python reads."""
+    return " ".join(unescape(re.sub(r"<[^>]*>", " ", html)).replace("−", "-").split())
+
+
+def rows_of(html, before=""):
+    """The texts of the cells of each row of a table by the row's id, without the word "of"."""
+    return {
+        unescape(name): [plain(cell) for cell in re.findall(r"<t[dh].*?</t[dh]>", row, re.DOTALL)]
+        for name, row in re.findall(rf'<tr id="{before}([^"]+)">(.*?)</tr>', html, re.DOTALL)
+    }
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_tables_numbers_are_those_of_its_csv_in_text_on_its_page_and_in_the_report(
+    name, study, tables, client, report
+):
+    table, shown = tables[name], shown_columns(tables[name])
+    values = as_csv(table)
+    frame = table_of(study, name)
+    assert list(values) == [row.id for row in table.rows] == list(frame.index)
+    page = rows_of(client.get(f"/tables/{name}").text)
+    of_report = rows_of(report, f"{name}/")
+    lines = render([table], TableFormat.TEXT).splitlines()[3 : 3 + len(table.rows)]
+    for line, (row, cells) in zip(lines, values.items(), strict=True):
+        numbers = {c.name: expected(c, cells) for c in shown if c.kind in NUMBERS}
+        in_line = " ".join(line.split())
+        for place, column in enumerate(shown):
+            if column.name in numbers:
+                assert page[row][place] == numbers[column.name], (row, column.name)
+        for text in numbers.values():
+            # The report has the paper's values and differences between them.
+            assert text in of_report[row], (row, text)
+            assert text in in_line
+            in_line = in_line[in_line.index(text) + len(text) :]
+        for column in names_of(table)[1:]:
+            value = frame.loc[row, column]
+            if isinstance(value, float):
+                assert isnan(value) if cells[column] == "" else float(cells[column]) == value
+
+
+def decimals_of(text):
+    return {*DECIMAL.findall(text)}
+
+
+def known_of(row):
+    """All values of a verdict as they are to be printed, a share between its two ends too."""
+    texts = {rounded(v) for name, v in row.items() if re.fullmatch(r"-?[\d.]+(e-?\d+)?", v or "")}
+    texts |= {p_value(row[name]) for name in ("p", "p_holm") if row[name]}
+    if row["undecided"]:
+        k, n = int(row["k"]), int(row["n"]) + int(row["undecided"])
+        texts |= {rounded(100 * k / n), rounded(100 * (k + int(row["undecided"])) / n)}
+    return texts
+
+
+def test_a_verdicts_numbers_are_those_of_the_csv_on_the_page_of_the_study_and_of_each_driver(
+    tables, client
+):
+    verdicts = as_csv(tables["verdicts"])
+    groups = {row.groups[0] for row in tables["verdicts"].rows if row.values.get("measure")}
+    for group in sorted(groups - {"human"}):
+        driver, _, prompt = group.rpartition("/")
+        rows = {name: row for name, row in verdicts.items() if name.rpartition("/")[0] == group}
+        html = client.get("/drivers", params={"variant": prompt, "model": driver}).text
+        (own,) = [
+            row
+            for row in re.findall(
+                r'<tr><th scope="row"><a href="/drivers/.*?</tr>', html, re.DOTALL
+            )
+            if unescape(re.search(r'title="([^"]*)"', row)[1]) == driver
+            and f"variant={prompt}" in unescape(row)
+        ]
+        known = set().union(*map(known_of, rows.values()))
+        sentence = plain(re.search(r'<td class="sentence">(.*?)</td>', own, re.DOTALL)[1])
+        assert decimals_of(sentence) <= known, group
+        page = client.get(f"/drivers/{driver}", params={"variant": prompt}).text
+        for name, row in rows.items():
+            measure = name.rpartition("/")[2]
+            ((cell, words),) = re.findall(
+                rf'#{measure}"\s+title="([^"]*)">(.*?)</a>', own, re.DOTALL
+            ) or [("", "")]
+            line = re.search(rf'<tr id="{measure}">(.*?)</tr>', page, re.DOTALL)[1]
+            printed = [
+                cell.partition(";")[0],
+                words,
+                re.sub(r"<span class=\"ends\">.*?</td>", "", line, flags=re.DOTALL),
+            ]
+            for text in map(plain, printed):
+                assert decimals_of(text) <= known_of(row), (name, text)
+                if row["estimate"] and text:
+                    assert rounded(row["estimate"]) in decimals_of(text), (name, text)
+
+
+def test_the_differences_of_prompts_have_the_digits_of_the_csv(tables, client):
+    text = plain(client.get("/prompts").text)
+    told = [row for row in as_csv(tables["contrasts"]).values() if row["difference"]]
+    for row in told:
+        ends = ", ".join(rounded(row[name]) for name in ("ci_low", "ci_high"))
+        holm = p_value(row["p_holm"])
+        assert f"{rounded(row['difference'])} [{ends}], Holm {holm}" in text
