@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from enum import Enum
+from typing import Any, NamedTuple
 
 from merge_runner.study.file import BASELINE
 from merge_runner_analysis.metrics import BOXES, DECIMALS, GAP, LEFT_FIRST
@@ -24,6 +25,88 @@ MOST_COLLISIONS = 25.0  # percent; with more of them collisions come first in a 
 MISSING, MINUS = "–", "−"
 
 Values = Mapping[str, Any]
+
+
+class Why(Enum):
+    """Why a number is missing, or what is to be known of it, with places for its values."""
+
+    # Fits; ``s`` makes a plural of the first value.
+    NO_FIRST = "no finished trial with a first merger"
+    NO_GAP = "no finished trial with a gap"
+    FEW_FIRST = (
+        "{} finished trial{s} with a first merger, too few or in too few conditions to tell the "
+        "terms apart"
+    )
+    FEW_GAPS = (
+        "{} finished trial{s} with a gap, too few or in too few conditions to tell the terms apart"
+    )
+    SAME_FIRST = "who merged first is the same in all {} trials: nothing to explain"
+    SEPARATION = "separation: no finite estimate of {}; see Firth's fit"
+    NO_LIKELIHOOD = "the maximum likelihood fit does not converge"
+    NO_FIRTH = "Firth's penalised fit does not converge"
+    NO_PROFILE = "no profile of Firth's likelihood converges"
+    INFINITE_GAP = "a gap is not finite"
+    STEADY_GAP = "the gaps vary by less than 1 cm: there is nothing to test"
+    ONE_DECIDES = "a single trial decides a coefficient: no HC3 errors"
+    FEW_PAIRS = "{} pairs are too few for errors by pair"
+    WITHOUT_PAIR = "without {}: {}"
+    BY_PAIRS = "errors by jackknife over {} pairs"
+    NONE_APART = "no two played conditions differ in relative velocity alone"
+    # Indicators.
+    NO_ACTION = "no finished trial with control action"
+    ONE_ACTION = "a single trial, or a single human pair, with control action"
+    NO_TRACES = "as published, no human traces are imported"
+    BY_EYE = "by eye, the paper"
+    CAUTION = "{}"
+    # Measures.
+    CITED = "published, no human traces are imported ({})"
+    PUBLISHED = "humans as published"
+    NOT_PUBLISHED = "{}: no human value is published, and none is imported"
+    OTHER_RULE = "{}: published human collisions are boxes that overlap"
+    OUTCOMES = (
+        "who merged first and {}: the {} published outcomes; the rest: {} imported trials, {} "
+        "finished"
+    )
+    UNDECIDED = (
+        "{}: {} of {} trials are undecided, since another collision rule ended them; between {} "
+        "and {} %"
+    )
+    UNDECIDED_BOXES = (
+        UNDECIDED + '. A study whose [scenario] has collision_rule = "rectangle" decides them'
+    )
+    # Comparisons with humans.
+    OF_HUMANS = "humans: {}"
+    NONE_ENDED = "no trial ended: {}"
+    ONE_GAP = "a single trial has no error"
+    NO_GAP_THERE = "humans: no gap in {} of its conditions"
+    NOBODY_THERE = "no human drove its conditions"
+    NONE_ACTED = "I5 is not compared: no trial acted"
+    FEW_HUMANS = "I5 is not compared: too few human recordings are imported"
+
+
+class Fact(NamedTuple):
+    """What statistics have to say, as a code with its values; as a text it is the sentence."""
+
+    why: Why
+    values: tuple[object, ...] = ()
+
+    def __str__(self) -> str:
+        told = (number(v) if isinstance(v, float) else v for v in self.values)
+        return self.why.value.format(*told, s="" if self.values[:1] == (1,) else "s")
+
+
+def note_of(*remarks: object) -> str:
+    """The note of these remarks, without those that are empty."""
+    return "; ".join(map(str, filter(None, remarks)))
+
+
+INDICATORS = {
+    "I1": "The probability of merging first increases with projected headway advantage.",
+    "I2": "The probability of merging first decreases with relative velocity advantage.",
+    "I3": "The safety gap is moderately positively affected by projected headway.",
+    "I4": "The safety gap is not affected by initial relative velocity difference.",
+    "I5": "Conflicts are resolved with intermittent, piecewise-linear velocity profiles.",
+}
 
 
 @dataclass(frozen=True, slots=True)

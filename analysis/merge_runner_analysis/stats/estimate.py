@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from math import inf
 
+from merge_runner_analysis.wording import Fact
+
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
@@ -15,8 +17,7 @@ class Estimate:
     none or all of them count (Manski 1989). ``se`` is its standard error and ``freedom`` that of
     its Student's t, infinite where the test is another one. ``p`` is two-sided, against 0.
     ``detectable`` is the smallest true value, in either direction, that one test at 5 % finds with
-    a power of 0.8. ``problem`` says why something is missing, and ``source`` cites what is
-    published.
+    a power of 0.8. ``problem`` says why something is missing, and ``source`` that it is published.
     """
 
     value: float | None = None
@@ -30,8 +31,8 @@ class Estimate:
     detectable: float | None = None
     k: int | None = None
     undecided: int = 0
-    problem: str = ""
-    source: str = ""
+    problem: Fact | None = None
+    source: Fact | None = None
 
     def bounds(self) -> tuple[float, float] | None:
         """Both ends of the interval."""

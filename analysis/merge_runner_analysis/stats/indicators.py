@@ -43,19 +43,10 @@ from merge_runner_analysis.stats.regressions import (
     who_first_logit,
 )
 from merge_runner_analysis.study import Study
+from merge_runner_analysis.wording import INDICATORS, Fact, Why
 
 ALPHA = 0.05
-NO_ACTION = "no finished trial with control action"
-PUBLISHED = "as published, no human traces are imported"
-BY_EYE = "by eye, the paper"
-NONE_APART = "no two played conditions differ in relative velocity alone"
-INDICATORS = {
-    "I1": "The probability of merging first increases with projected headway advantage.",
-    "I2": "The probability of merging first decreases with relative velocity advantage.",
-    "I3": "The safety gap is moderately positively affected by projected headway.",
-    "I4": "The safety gap is not affected by initial relative velocity difference.",
-    "I5": "Conflicts are resolved with intermittent, piecewise-linear velocity profiles.",
-}
+PUBLISHED, BY_EYE = Fact(Why.NO_TRACES), Fact(Why.BY_EYE)
 # By indicator: the term that decides it, and the sign that it needs; I4's is to have no effect.
 TESTED = {
     "I1": ("projected_headway", 1),
@@ -69,7 +60,7 @@ class Judgement(NamedTuple):
     """Whether an indicator holds; None where the data cannot tell, for the reason ``why``."""
 
     passed: bool | None
-    why: str = ""
+    why: Fact | None = None
 
 
 def disagree(one: Judgement, other: Judgement) -> bool:
@@ -95,7 +86,7 @@ def _judged(fit: Regression, name: str, *, robust: bool) -> Judgement:
     if not robust:
         return Judgement(term.p >= ALPHA)
     if fit.equivalence_p is None:
-        return Judgement(None, NONE_APART)
+        return Judgement(None, Fact(Why.NONE_APART))
     return Judgement(fit.equivalence_p < ALPHA)
 
 
@@ -166,9 +157,9 @@ def piecewise_constant(study: Study, group: Group) -> Judgement:
     """I5: whether the accelerations of a group are held and jump, rather than move."""
     found = mean_gain(study, group)
     if not found.n:
-        return Judgement(None, NO_ACTION)
+        return Judgement(None, Fact(Why.NO_ACTION))
     if found.low is None:
-        return Judgement(None, "a single trial, or a single human pair, with control action")
+        return Judgement(None, Fact(Why.ONE_ACTION))
     return Judgement(found.low > 0)
 
 
@@ -200,8 +191,8 @@ class Score(NamedTuple):
 
     @property
     def rules(self) -> dict[str, dict[str, Judgement]]:
-        """The verdicts by the name of their rule, as it stands in a sentence."""
-        return {"by the paper's test": self.paper, "by the robust tests": self.robust}
+        """The verdicts by the name of their rule."""
+        return {"paper": self.paper, "robust": self.robust}
 
     @property
     def ceiling(self) -> dict[str, dict[str, float]]:
@@ -244,7 +235,8 @@ def score(study: Study, group: Group) -> Score:
         paper["I5"] = Judgement(bool(row["i5"]), BY_EYE)
         robust["I5"] = Judgement(None, BY_EYE)
     elif group.caution:
-        paper = robust = dict.fromkeys(INDICATORS, Judgement(None, group.caution))
+        caution = Fact(Why.CAUTION, (group.caution,))
+        paper = robust = dict.fromkeys(INDICATORS, Judgement(None, caution))
     else:
         # The paper judged by eye: there is no rule to apply, whatever is driven.
         paper["I5"], robust["I5"] = Judgement(None), piecewise_constant(study, group)

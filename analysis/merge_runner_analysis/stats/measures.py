@@ -12,6 +12,7 @@ from merge_runner_analysis.published import citation, published
 from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.intervals import LEVEL, NOTHING, mean, wilson
 from merge_runner_analysis.stats.intervals import estimate as interval_of
+from merge_runner_analysis.wording import Fact, Why
 
 PAPER = "paper_ablation_quantitative"
 
@@ -97,19 +98,15 @@ def undecided(group: Group, metric: Metric) -> int:
     return int((trials[metric.column].isna() & (trials["status"] != "failed")).sum())
 
 
-def undecided_note(group: Group, metric: Metric) -> str:
-    """What is known of a rate some of whose trials are undecided; empty where none is."""
+def undecided_note(group: Group, metric: Metric) -> Fact | None:
+    """What is known of a rate some of whose trials are undecided; None where none is."""
     if not (cut_off := undecided(group, metric)):
-        return ""
+        return None
     k, n = counts(group, metric)
     every = n + cut_off
-    said = (
-        f"{metric.heading}: {cut_off} of {every} trials are undecided, since another collision "
-        f"rule ended them; between {100 * k / every:.2f} and {100 * (k + cut_off) / every:.2f} %"
-    )
-    if metric is BOXES:
-        said += '. A study whose [scenario] has collision_rule = "rectangle" decides them'
-    return said
+    why = Why.UNDECIDED_BOXES if metric is BOXES else Why.UNDECIDED
+    ends = 100 * k / every, 100 * (k + cut_off) / every
+    return Fact(why, (metric.heading, cut_off, every, *ends))
 
 
 def known(group: Group, metric: Metric) -> bool:
@@ -125,21 +122,18 @@ def estimate_or_reference(group: Group, metric: Metric) -> Estimate | None:
     if known(group, metric) or not metric.paper_of_humans:
         return estimate(group, metric) if known(group, metric) else None
     row = published(PAPER).query("driver == 'human'").iloc[0]
-    return Estimate(float(row[metric.paper_of_humans]), source=citation(PAPER))
+    return Estimate(float(row[metric.paper_of_humans]), source=Fact(Why.CITED, (citation(PAPER),)))
 
 
-def no_human_value(metric: Metric) -> str:
+def no_human_value(metric: Metric) -> Fact:
     """Why the humans have no value of a metric before their recordings are imported."""
-    if metric.value in JUDGED:
-        return f"{metric.heading}: published human collisions are boxes that overlap"
-    return f"{metric.heading}: no human value is published, and none is imported"
+    why = Why.OTHER_RULE if metric.value in JUDGED else Why.NOT_PUBLISHED
+    return Fact(why, (metric.heading,))
 
 
-def outcomes_note(group: Group) -> str:
+def outcomes_note(group: Group) -> Fact | None:
     """What rests on the published outcomes, where only a part of the traces is imported."""
     if not group.measured or group.traced:
-        return ""
-    return (
-        f"who merged first and {BOXES.heading}: the {len(group.outcomes)} published "
-        f"outcomes; the rest: {len(group.trials)} imported trials, {len(group.finished)} finished"
-    )
+        return None
+    sizes = len(group.outcomes), len(group.trials), len(group.finished)
+    return Fact(Why.OUTCOMES, (BOXES.heading, *sizes))

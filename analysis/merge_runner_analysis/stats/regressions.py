@@ -1,6 +1,6 @@
 """The regressions of arXiv 2604.09609 (eqs. 1 and 2), and tests that hold where theirs do not.
 
-A fit that the data do not allow has no terms but a ``problem`` in words. Data frames have the
+A fit that the data do not allow has no terms but a ``problem``. Data frames have the
 columns of ``load_trials``; only finished trials count. Firth's penalised logit is finite under
 separation (Firth 1993; Heinze and Schemper 2002).
 """
@@ -19,6 +19,7 @@ from scipy.optimize import brentq, linprog
 from scipy.special import expit
 
 from merge_runner_analysis.stats import intervals
+from merge_runner_analysis.wording import Fact, Why
 
 Array = NDArray[np.float64]
 
@@ -191,7 +192,7 @@ class Term:
 
 @dataclass(frozen=True, slots=True)
 class Regression:
-    """A fit to ``n`` trials; ``problem`` says why there are no terms, and is else empty.
+    """A fit to ``n`` trials; ``problem`` says why there are no terms.
 
     ``freedom`` is the residual degrees of freedom of a linear fit, infinite where tests are normal;
     ``remark`` is what to know of a fit that has terms. Of a gap alone: the ``covariance`` of its
@@ -204,9 +205,9 @@ class Regression:
 
     n: int
     terms: dict[str, Term]
-    problem: str = ""
+    problem: Fact | None = None
     freedom: float = inf
-    remark: str = ""
+    remark: Fact | None = None
     equivalence_p: float | None = None
     velocity_p: float | None = None
     covariance: Array | None = field(default=None, compare=False)
@@ -325,7 +326,7 @@ def who_first_logit(trials: pd.DataFrame) -> Regression:
         return Regression(len(left), {}, problem)
     fit = Logit(left, design).fit(disp=0, warn_convergence=False)
     if not fit.mle_retvals["converged"] or not np.isfinite(fit.bse).all():
-        return Regression(len(left), {}, "the maximum likelihood fit does not converge")
+        return Regression(len(left), {}, Fact(Why.NO_LIKELIHOOD))
     return Regression(len(left), _terms(WHO_FIRST_TERMS, fit.params, fit.bse))
 
 
@@ -347,7 +348,7 @@ def who_first_firth(trials: pd.DataFrame, less: pd.DataFrame | None = None) -> R
     fit = _cells(design, left).fit()
     tests = [fit.p(place) for place in range(len(WHO_FIRST_TERMS))] if fit else [np.nan]
     if fit is None or not np.isfinite(tests).all():
-        return Regression(n, {}, "Firth's penalised fit does not converge")
+        return Regression(n, {}, Fact(Why.NO_FIRTH))
     found = zip(WHO_FIRST_TERMS, fit.b.tolist(), fit.errors.tolist(), tests, strict=False)
     terms = {name: Term(b, se, None, p) for name, b, se, p in found}
     return Regression(n, terms, profile=fit)
@@ -362,16 +363,16 @@ def gap_ols(trials: pd.DataFrame, measure: str = "gap_m", *, robust: bool = Fals
 
     design, gap, chosen = gap_data(trials, measure)
     if not np.isfinite(gap).all():
-        return Regression(len(gap), {}, "a gap is not finite")
+        return Regression(len(gap), {}, Fact(Why.INFINITE_GAP))
     freedom = len(gap) - design.shape[1]
     if freedom < 1 or np.linalg.matrix_rank(design) < design.shape[1]:
-        return Regression(len(gap), {}, _too_few(len(gap), "with a gap"))
+        return Regression(len(gap), {}, _too_few(len(gap), Why.NO_GAP, Why.FEW_GAPS))
     if np.ptp(gap) < STEADY_GAP_M:
-        return Regression(len(gap), {}, "the gaps vary by less than 1 cm: there is nothing to test")
+        return Regression(len(gap), {}, Fact(Why.STEADY_GAP))
     fit = OLS(gap, design).fit()
     if robust:
         if fit.get_influence().hat_matrix_diag.max() > 1 - 1e-9:
-            return Regression(len(gap), {}, "a single trial decides a coefficient: no HC3 errors")
+            return Regression(len(gap), {}, Fact(Why.ONE_DECIDES))
         fit = fit.get_robustcov_results("HC3", use_t=True)
     covariance = np.asarray(fit.cov_params())
     with_velocity = np.eye(len(GAP_TERMS))[2:]
@@ -397,10 +398,10 @@ def by_pairs(
     used = trials[(trials["status"] == "finished") & trials[measure].notna()]
     whole, pairs = fit(used), used["pair"].dropna().unique()
     if len(pairs) < MIN_PAIRS:
-        return Regression(whole.n, {}, f"{len(pairs)} pairs are too few for errors by pair")
+        return Regression(whole.n, {}, Fact(Why.FEW_PAIRS, (len(pairs),)))
     parts = {pair: fit(used[used["pair"] != pair]) for pair in pairs}
-    lacking = [f"without {pair}: {part.problem}" for pair, part in parts.items() if part.problem]
-    if problem := whole.problem or "".join(lacking[:1]):
+    lacking = [(pair, part.problem) for pair, part in parts.items() if part.problem]
+    if problem := whole.problem or (Fact(Why.WITHOUT_PAIR, lacking[0]) if lacking else None):
         return Regression(whole.n, {}, problem)
     # CV3: the squares of what each pair moves an estimate by, about the whole fit and not the mean.
     b = np.array([[term.b for term in fit.terms.values()] for fit in (whole, *parts.values())])
@@ -408,7 +409,7 @@ def by_pairs(
     apart = b[1:] - b[0]
     covariance = apart.T @ apart * freedom / len(pairs)
     terms = _terms([*whole.terms], b[0], np.sqrt(np.diag(covariance)), freedom)
-    remark = f"errors by jackknife over {len(pairs)} pairs"
+    remark = Fact(Why.BY_PAIRS, (len(pairs),))
     return Regression(whole.n, terms, freedom=freedom, remark=remark, covariance=covariance)
 
 
@@ -421,22 +422,22 @@ def _terms(names: Sequence[str], b: Array, se: Array, freedom: float = inf) -> d
     return found
 
 
-def unfit_for_logit(design: Array, left: Array) -> str:
-    """Why a logit has no finite maximum likelihood estimate, empty where it has."""
+def unfit_for_logit(design: Array, left: Array) -> Fact | None:
+    """Why a logit has no finite maximum likelihood estimate, None where it has."""
     problem = _unidentified(design, left)
     if problem or not any(infinite := _cells(design, left).infinite()):
         return problem
     # The level comes last, as it is said.
     named = np.array([*WHO_FIRST_TERMS[1:], WHO_FIRST_TERMS[0]])[np.roll(infinite, -1)]
-    return f"separation: no finite estimate of {', '.join(named)}; see Firth's fit"
+    return Fact(Why.SEPARATION, (", ".join(named),))
 
 
-def _unidentified(design: Array, left: Array) -> str:
+def _unidentified(design: Array, left: Array) -> Fact | None:
     if len(left) <= design.shape[1] or np.linalg.matrix_rank(design) < design.shape[1]:
-        return _too_few(len(left), "with a first merger")
+        return _too_few(len(left), Why.NO_FIRST, Why.FEW_FIRST)
     if left.min() == left.max():
-        return f"who merged first is the same in all {len(left)} trials: nothing to explain"
-    return ""
+        return Fact(Why.SAME_FIRST, (len(left),))
+    return None
 
 
 def _cells(design: Array, left: Array) -> Counts:
@@ -445,8 +446,5 @@ def _cells(design: Array, left: Array) -> Counts:
     return Counts(cells, trials.astype(float), np.bincount(place, weights=left).astype(float))
 
 
-def _too_few(n: int, what: str) -> str:
-    if n == 0:
-        return f"no finished trial {what}"
-    trials = "trial" if n == 1 else "trials"
-    return f"{n} finished {trials} {what}, too few or in too few conditions to tell the terms apart"
+def _too_few(n: int, none: Why, few: Why) -> Fact:
+    return Fact(few, (n,)) if n else Fact(none)

@@ -45,7 +45,6 @@ from merge_runner_analysis.stats.contrasts import (
 from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.indicators import (
     ALPHA,
-    NONE_APART,
     TESTED,
     fits,
     judge,
@@ -79,10 +78,12 @@ from merge_runner_analysis.wording import (
     STRONGER,
     UNLIKE,
     WEAKER,
+    Fact,
     Measure,
+    Why,
 )
 
-PUBLISHED = "humans as published"
+PUBLISHED = Fact(Why.PUBLISHED)
 # The level of an interval that lies within a margin where two one-sided tests at 5 % say so.
 WITHIN_LEVEL = 1 - 2 * ALPHA
 
@@ -148,7 +149,7 @@ class Comparison:
     own: Estimate
     human: Estimate
     state: str
-    note: str
+    remarks: tuple[Fact | None, ...]
     difference: float | None = None
     interval: Ends = None
     level: float | None = None
@@ -171,10 +172,10 @@ def compared(study: Study, group: Group) -> tuple[Comparison, ...]:
         statistic = STATISTICS[name]
         own, human = statistic.own(both), statistic.human(both)
         test, state = tests.get(name), states.get(name, OPEN if own.undecided else "")
-        why = judgements[statistic.indicator].why if statistic.indicator else ""
-        note = [own.problem, human.problem, "" if own.problem else why]
+        why = judgements[statistic.indicator].why if statistic.indicator else None
+        remarks = own.problem, human.problem, None if own.problem else why
         level = WITHIN_LEVEL if test and test.within else levels.get(name)
-        one = Comparison(measure, own, human, state, "; ".join(filter(None, note)), level=level)
+        one = Comparison(measure, own, human, state, remarks, level=level)
         if test and level is not None:
             ends = test.interval(level)
             one = replace(one, p=test.p, p_holm=p_holm[name], detectable=test.detectable)
@@ -322,14 +323,14 @@ def _likeness(study: Study, group: Group) -> Estimate:
     likeness = less_humans(study, group) if len(group.finished) else None
     if likeness is not None and likeness.value is not None:
         return likeness
-    why = "no trial acted" if study.calibrated else "too few human recordings are imported"
-    return Estimate(n=len(group.finished), problem=f"I5 is not compared: {why}")
+    why = Why.NONE_ACTED if study.calibrated else Why.FEW_HUMANS
+    return Estimate(n=len(group.finished), problem=Fact(why))
 
 
 def _of_fit(human: Group, found: Estimate) -> Estimate:
     """What follows from the humans' regression of the gap, and where that is from."""
     if found.problem:
-        return replace(found, problem=f"humans: {found.problem}")
+        return replace(found, problem=Fact(Why.OF_HUMANS, (found.problem,)))
     return found if _imported(human) else replace(found, source=PUBLISHED)
 
 
@@ -341,8 +342,8 @@ def _imported(human: Group) -> bool:
 def _gap(group: Group) -> Estimate:
     """The mean gap of a driver."""
     found = mean_of(group.finished, GAP.column)
-    problem = "a single trial has no error" if found.n else "no trial finished with a gap"
-    return replace(found, problem=problem) if found.se is None else found
+    why = Why.ONE_GAP if found.n else Why.NO_GAP
+    return replace(found, problem=Fact(why)) if found.se is None else found
 
 
 def human_gap(human: Group, group: Group) -> Estimate:
@@ -357,8 +358,7 @@ def human_gap(human: Group, group: Group) -> Estimate:
         shares = None if gaps is None else gaps["condition"].value_counts()
         there = human.finished.loc[human.finished[GAP.column].notna(), "condition"]
         if shares is not None and (lacking := {*shares.index} - {*there}):
-            problem = f"humans: no gap in {len(lacking)} of its conditions"
-            return Estimate(n=len(there), problem=problem)
+            return Estimate(n=len(there), problem=Fact(Why.NO_GAP_THERE, (len(lacking),)))
         if shares is not None and not len(shares):
             shares = None
         within = there if shares is None else there[there.isin(shares.index)]
@@ -407,8 +407,7 @@ def _slope(group: Group, term: str) -> Estimate:
     fit = fits(group).firth
     ends = fit.interval(term, LEVEL)
     if ends is None:
-        problem = fit.problem or "no profile of Firth's likelihood converges"
-        return Estimate(n=fit.n, problem=problem)
+        return Estimate(n=fit.n, problem=fit.problem or Fact(Why.NO_PROFILE))
     return Estimate(fit.terms[term].b, *ends, fit.n, fit.terms[term].se)
 
 
@@ -424,7 +423,7 @@ def _moved(fit: Regression, group: Group) -> Estimate:
     """The largest difference of gaps that relative velocity alone makes in a group's conditions."""
     moved = fit.moved(group.trials)
     if moved is None:
-        return Estimate(n=fit.n, problem=fit.problem or NONE_APART)
+        return Estimate(n=fit.n, problem=fit.problem or Fact(Why.NONE_APART))
     return Estimate(moved.most, *moved.interval(LEVEL), fit.n)
 
 
@@ -432,7 +431,7 @@ def _collided(group: Group) -> Estimate:
     """The share of ended trials with a collision by the humans' rule, in percent."""
     (k, n), cut_off = counts(group, BOXES), undecided(group, BOXES)
     if not n + cut_off:
-        return Estimate(problem=f"no trial ended: {group.left_out}")
+        return Estimate(problem=Fact(Why.NONE_ENDED, (group.left_out,)))
     found, problem = estimate(group, BOXES), undecided_note(group, BOXES)
     return replace(found, problem=problem, k=k, undecided=cut_off)
 
@@ -443,7 +442,7 @@ def _standardised(both: Both) -> Estimate:
     played = group.ended_outcomes["condition"].value_counts()  # with those that are undecided
     there = human.outcomes[human.outcomes["condition"].isin(played.index)]
     if there.empty:
-        return Estimate(problem="no human drove its conditions")
+        return Estimate(problem=Fact(Why.NOBODY_THERE))
     humans = there.groupby("condition")[BOXES.column].agg(["sum", "size"]).astype(int)
     k, n = humans.to_numpy().T
     rate, as_good_as = weighted(k, n, played[humans.index].to_numpy(float))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from merge_runner_analysis.grouping import Group
-from merge_runner_analysis.stats.indicators import INDICATORS, score
+from merge_runner_analysis.stats.indicators import score
 from merge_runner_analysis.stats.measures import outcomes_note
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.indicators import (
@@ -25,6 +25,7 @@ from merge_runner_analysis.tables.model import (
     Value,
     row_of,
 )
+from merge_runner_analysis.wording import INDICATORS
 
 
 def ablation_qualitative(study: Study) -> Table:

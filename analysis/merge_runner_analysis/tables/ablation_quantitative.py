@@ -68,10 +68,10 @@ def metric_table(name: str, groups: list[Group], place: str, *notes: str) -> Tab
     return Table(name, columns, rows, (f"intervals: {INTERVALS}", *notes))
 
 
-def measured(group: Group, metrics: list[Metric]) -> tuple[dict[str, Estimate], list[str]]:
+def measured(group: Group, metrics: list[Metric]) -> tuple[dict[str, Estimate], list[object]]:
     """What a group comes to by each metric, and remarks on those that are published or missing."""
     found: dict[str, Estimate] = {}
-    remarks = [outcomes_note(group)]
+    remarks: list[object] = [outcomes_note(group)]
     reasons: dict[str, list[str]] = {}
     for metric in metrics:
         one = estimate_or_reference(group, metric)
@@ -80,8 +80,7 @@ def measured(group: Group, metrics: list[Metric]) -> tuple[dict[str, Estimate], 
             continue
         found[metric.name] = one
         if one.source:
-            why = f"published, no human traces are imported ({one.source})"
-            reasons.setdefault(why, []).append(metric.heading)
+            reasons.setdefault(str(one.source), []).append(metric.heading)
         elif one.value is None and one.bounds() is None:
             reasons.setdefault("no trial has it", []).append(metric.heading)
         else:

@@ -9,9 +9,9 @@ from merge_runner.drivers.registry import MOCKS
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.metrics import shown_in
 from merge_runner_analysis.published import HUMAN, citation, printed_value, published
-from merge_runner_analysis.stats.indicators import INDICATORS
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.model import Optional, Row, Table, Value
+from merge_runner_analysis.wording import INDICATORS
 
 PAPER = "paper"
 # The files of the tables that the paper prints. Table V has values of Tables VI and VII.

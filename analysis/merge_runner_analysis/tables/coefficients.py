@@ -37,7 +37,7 @@ Fit = tuple[str, str, dict[str, Regression]]
 BY_PAIR = ", errors by pair"
 
 
-def row_of_term(group: Group, term: str, fit: Fit, rests_on: str, note: str = "") -> Row:
+def row_of_term(group: Group, term: str, fit: Fit, rests_on: str, note: object = "") -> Row:
     """The row of a term by one of a group's fits, of the trials with a value in this column."""
     item, label, found = fit
     values: dict[str, Value] = {
@@ -56,7 +56,7 @@ def row_of_term(group: Group, term: str, fit: Fit, rests_on: str, note: str = ""
     if "hc3_" in found and term == "abs_relative_velocity":
         values["equivalence_p"] = found["hc3_"].equivalence_p
         values["velocity_p"] = found["hc3_"].velocity_p
-    remarks = dict.fromkeys(text for one in found.values() for text in (one.problem, one.remark))
+    remarks = dict.fromkeys(fact for one in found.values() for fact in (one.problem, one.remark))
     return row_of(group, values, *remarks, note, item=item + term, rests_on=rests_on)
 
 

@@ -20,6 +20,7 @@ from merge_runner_analysis.stats.measures import estimate, undecided_note
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.contrasts import FAMILY, SAME_TRIALS, WITHIN
 from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Value, interval
+from merge_runner_analysis.wording import note_of
 
 INTERACTION = " × "
 DIFFERENCES = (
@@ -135,7 +136,7 @@ def _level_row(study: Study, level: Level, first: Level, metric: Metric) -> Row:
         cells |= _difference(study, metric, level, first)
     nothing = "" if found.n or found.bounds() else f"{metric.heading}: no trial with this measure"
     same = "" if level is first else _left_out(study, level, first)
-    note = "; ".join(filter(None, (nothing, undecided_note(level.pooled, metric), same)))
+    note = note_of(nothing, undecided_note(level.pooled, metric), same)
     row_id = f"{level.id}/{metric.name}"
     return Row(row_id, level.groups, cells, note, metric.column, copies=level.copies)
 

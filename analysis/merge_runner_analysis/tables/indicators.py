@@ -6,7 +6,6 @@ from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.metrics import RULES_NOTE, Metric, shown_in
 from merge_runner_analysis.published import HUMAN_GAP_SD_M
 from merge_runner_analysis.stats.indicators import (
-    INDICATORS,
     Score,
     disagree,
     gains,
@@ -28,10 +27,12 @@ from merge_runner_analysis.tables.model import (
     interval,
     row_of,
 )
+from merge_runner_analysis.wording import INDICATORS
 
 # The indicators that rest on who merged first.
 OF_OUTCOMES = ("I1", "I2")
 SCORE = "Score"
+RULES = {"paper": "by the paper's test", "robust": "by the robust tests"}
 RESAMPLED = "share of resampled human data sets of this size that pass"
 NOTES = (
     "✓ by the paper's rule: signs and p < .05 of Wald tests; robust: likelihood-ratio tests of "
@@ -95,7 +96,7 @@ def _verdict_row(study: Study, group: Group, name: str) -> Row:
         **ceiling_values(group, found, name),
         "n": int((trials["status"] == "finished").sum()),
     }
-    remarks = [reasons(found, name)]
+    remarks: list[object] = [reasons(found, name)]
     # I5 compares with human traces directly and has no ceiling.
     if name != "I5":
         remarks.append(no_ceiling(group))
@@ -149,7 +150,7 @@ def reasons(found: Score, *names: str) -> str:
     for rule, judged in found.rules.items():
         for name in names:
             if name in judged and judged[name].why:
-                which.setdefault(f"{rule}: {judged[name].why}", []).append(name)
+                which.setdefault(f"{RULES[rule]}: {judged[name].why}", []).append(name)
     return "; ".join(f"{', '.join(names)} {why}" for why, names in which.items())
 
 

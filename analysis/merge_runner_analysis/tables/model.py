@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import TypeAdapter
 
 from merge_runner_analysis.metrics import DECIMALS
+from merge_runner_analysis.wording import note_of
 
 if TYPE_CHECKING:
     from merge_runner_analysis.grouping import Group
@@ -77,7 +78,7 @@ GROUP_COLUMNS = (Column("driver", "driver"), Column("setting", "setting"))
 def row_of(
     group: Group,
     values: Mapping[str, Value],
-    *remarks: str,
+    *remarks: object,
     item: str = "",
     rests_on: str = FINISHED,
 ) -> Row:
@@ -89,7 +90,7 @@ def row_of(
         f"{group.id}/{item}" if item else group.id,
         (group.id,),
         {"driver": group.label, "setting": group.setting, **values},
-        "; ".join(filter(None, remarks)),
+        note_of(*remarks),
         rests_on if group.measured else "",
     )
 

@@ -23,6 +23,7 @@ from merge_runner_analysis.wording import (
     MOCK,
     PROGRAM,
     TABLE,
+    note_of,
     sentences,
 )
 
@@ -116,17 +117,18 @@ def _compared(group: Group, kind: str, found: Comparison) -> Row:
         "state": found.state or None,
         "rule": measure.rule,
     }
-    return Row(f"{group.id}/{measure.name}", (group.id,), values, found.note, measure.rests_on)
+    note = note_of(*found.remarks)
+    return Row(f"{group.id}/{measure.name}", (group.id,), values, note, measure.rests_on)
 
 
 def _human_rows(study: Study) -> Iterator[Row]:
     for name, found in of_humans(study).items():
         values = _driver(study.human, HUMANS) | {"measure": name, **_known(found)}
-        note = "; ".join(filter(None, (found.problem, found.source)))
         # What is published rests on no trials here.
         rests_on = MEASURES[name].rests_on
         if found.source or not study.human.measured:
             rests_on = ""
+        note = note_of(found.problem, found.source)
         yield Row(f"{HUMAN}/{name}", (HUMAN,), values, note, rests_on)
 
 

@@ -31,5 +31,9 @@ def test_a_metric_that_does_not_fit_is_refused(own_parts, changes, says):
 
 def test_why_humans_have_no_value_is_told_of_collisions_alone_by_their_rule():
     whole = replace(RMSE, name="a_mps", label="a", paper_of_humans="", paper_of_drivers="")
-    assert no_human_value(COLLISIONS).endswith("published human collisions are boxes that overlap")
-    assert no_human_value(whole) == "a (m/s): no human value is published, and none is imported"
+    assert str(no_human_value(COLLISIONS)).endswith(
+        "published human collisions are boxes that overlap"
+    )
+    assert (
+        str(no_human_value(whole)) == "a (m/s): no human value is published, and none is imported"
+    )

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner_analysis.stats.indicators import NONE_APART, Judgement, judge, total
+from merge_runner_analysis.stats.indicators import Judgement, judge, total
 from merge_runner_analysis.stats.regressions import (
     GAP_MARGIN_M,
     Regression,
@@ -18,9 +18,10 @@ from merge_runner_analysis.stats.regressions import (
     gap_design,
     gap_ols,
 )
+from merge_runner_analysis.wording import Fact, Why
 
-SEPARATED = Regression(110, {}, "separation: no finite estimate of projected_headway")
-MISSING = Regression(0, {}, "no finished trial with a gap")
+SEPARATED = Regression(110, {}, Fact(Why.SEPARATION, ("projected_headway",)))
+MISSING = Regression(0, {}, Fact(Why.NO_GAP))
 paper_verdicts = partial(judge, robust=False)
 robust_verdicts = partial(judge, robust=True)
 BOTH = pytest.mark.parametrize("by_rule", [paper_verdicts, robust_verdicts])
@@ -153,7 +154,7 @@ def test_differences_are_of_played_conditions_with_one_projected_headway():
 
 def test_without_conditions_that_differ_in_relative_velocity_alone_i4_is_not_judged():
     fit = replace(gap(), equivalence_p=None)
-    assert robust_verdicts(who_first(), fit)["I4"] == Judgement(None, NONE_APART)
+    assert robust_verdicts(who_first(), fit)["I4"] == Judgement(None, Fact(Why.NONE_APART))
     assert paper_verdicts(who_first(), fit)["I4"].passed is True
 
 
@@ -174,7 +175,7 @@ def test_a_separated_fit_is_neither_a_pass_nor_a_failure_and_no_part_of_the_scor
 
 @BOTH
 def test_a_fit_that_is_missing_leaves_its_indicators_open(by_rule):
-    nobody = Regression(0, {}, "no finished trial with a first merger")
+    nobody = Regression(0, {}, Fact(Why.NO_FIRST))
     first, second = Judgement(None, nobody.problem), Judgement(None, MISSING.problem)
     yes = Judgement(True)
     assert [*by_rule(nobody, gap(se=0.05)).values()] == [first, first, yes, yes]

@@ -69,7 +69,7 @@ def who_first_arrays(trials):
 
 def numbers(fit, names):
     """Estimates, standard errors and p-values of a fit."""
-    assert fit.problem == ""
+    assert fit.problem is None
     assert list(fit.terms) == names
     terms = fit.terms.values()
     return [t.b for t in terms], [t.se for t in terms], [t.p for t in terms]
@@ -77,7 +77,7 @@ def numbers(fit, names):
 
 def no_fit(fit, reason):
     assert fit.terms == {}
-    assert reason in fit.problem
+    assert reason in str(fit.problem)
 
 
 def firthmodels(design, left):
