@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 from merge_runner.errors import UsageError
@@ -31,6 +32,16 @@ def home_of(study: str) -> Path:
     folder = Path(study).absolute().parent
     home = folder.parent if folder.name == "experiments" else folder
     return home.relative_to(Path.cwd()) if home.is_relative_to(Path.cwd()) else home
+
+
+def command_at(command: str, option: str, place: Path | str, usual: Path) -> str:
+    """Return a command as it is to be typed, with an option where its place is not the usual one.
+
+    >>> command_at("merge-runner audit", "--db", "other.duckdb", DEFAULT_DB)
+    'merge-runner audit --db other.duckdb'
+    """
+    at = "" if Path(place) == usual else f" {option} {shlex.quote(str(place))}"
+    return f"{command}{at}"
 
 
 def refuse_another_kind(file: Path, begins: bytes, kind: str) -> None:

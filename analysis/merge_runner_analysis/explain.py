@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from merge_runner.paths import DEFAULT_DB
+from merge_runner.paths import DEFAULT_DB, command_at
 from merge_runner.registry import require
 from merge_runner.text_safety import quoted
 from merge_runner_analysis.cache import remembered
@@ -87,7 +87,7 @@ def explain(study: Study, table: Table, cell: str) -> Explanation:
 
 def sql_command(study: Study) -> str:
     """How a query is run on a study's database."""
-    return "merge-runner sql" + ("" if study.db == DEFAULT_DB else f" --db {study.db}")
+    return command_at("merge-runner sql", "--db", study.db, DEFAULT_DB)
 
 
 def sources_of(

@@ -33,6 +33,7 @@ GRID = (
     "With --first, in the place of the study's conditions: h=FROM:TO:STEP,dv=FROM:TO:STEP, "
     "projected headways in m and relative velocities in m/s; usual: -6:6:2 and -1.6:1.6:0.4."
 )
+RUN_NAME = "What you call this run, as lists of runs and its summary show it."
 SAMPLES = "Another number draws a fresh set of samples."
 ORDER = "Another number draws another order of the trials."
 FIRST = "Only the first decision of both sides."
@@ -74,8 +75,8 @@ def sweep(
         list[str] | None,
         typer.Argument(
             metavar="NAME...",
-            help="experiments/NAME.toml, or a path; baseline if none is named. Several are played "
-            "one after the other.",
+            help="experiments/NAME.toml, or a path; baseline if none is named; to replay also a "
+            "recording, FILE.parquet. Several are played one after the other.",
         ),
     ] = None,
     models: cli.ModelOption = None,
@@ -86,6 +87,7 @@ def sweep(
     repetitions: cli.RepsOption = None,
     conditions: cli.ConditionsOption = None,
     variants: cli.VariantsOption = None,
+    run_name: Annotated[str, cli.option("TEXT", RUN_NAME, "--name", **cli.PLAYED)] = "",
     sample_set: Annotated[int, cli.option("N", SAMPLES, **cli.PLAYED)] = 0,
     order_seed: Annotated[int, cli.option("N", ORDER, **cli.PLAYED)] = 0,
     first: Annotated[bool, cli.flag("--first", FIRST, **cli.PLAYED)] = False,
@@ -117,6 +119,7 @@ def sweep(
     Example: merge-runner sweep baseline --model o3 --dry-run
     """
     from merge_runner.run.plan import Options, make_plan
+    from merge_runner.run.recorded_plans import recorded_plans
 
     studies = studies or ["baseline"]
     if not isfinite(max_cost_usd or 0):
@@ -138,9 +141,14 @@ def sweep(
         dask=dask,
         batch=batch,
         typed=sys.argv[1:],
+        name=run_name,
     )
 
-    def planned(name: str) -> Plan:
+    def plans(name: str) -> list[Plan]:
+        if name.endswith(".parquet"):
+            chosen = (models, only, mirror, repetitions, conditions, variants, first, grid)
+            _refuse_a_part(name, chosen=any((*chosen, sample_set, order_seed)), replay=replay)
+            return [*recorded_plans(Path(name), db=db, trust=trust)]
         plan = make_plan(
             name,
             models or (),
@@ -158,28 +166,43 @@ def sweep(
         )
         if dask is not None and (replay or plan.replays_humans):
             raise UsageError("a replay needs no cluster: leave --dask out")
-        return plan
+        return [plan]
 
     if len(studies) > 1:  # all are looked at before the first one is played
-        ledgers = [planned(name).ledger for name in studies]
+        ledgers = [plan.ledger for name in studies for plan in plans(name)]
         options = replace(options, ledgers=() if max_cost_usd is None else ledgers)
     whole = any(part is not None for part in (repetitions, grid, conditions, variants))
     codes = []
     for name in studies:
         if len(studies) > 1:
             say(f"{name}:")
-        plan = planned(name)
-        codes.append(_play(plan, options, whole=whole, dry_run=dry_run, yes=yes, as_json=as_json))
+        files = [Path(name)] if name.endswith(".parquet") else []
+        played = replace(options, recordings=(*files, *options.recordings))
+        codes += [
+            _play(plan, played, whole=whole, dry_run=dry_run, yes=yes, as_json=as_json)
+            for plan in plans(name)
+        ]
         if codes[-1] not in (0, 1, 4):
             break
     sys.exit(next(filter(None, codes), 0))
+
+
+def _refuse_a_part(recording: str, *, chosen: bool, replay: bool) -> None:
+    """Raise UsageError unless a recording is replayed whole."""
+    if not replay:
+        raise UsageError(f"{recording} is a recording: merge-runner replay {recording}")
+    if chosen:
+        raise UsageError(
+            f"{recording} is replayed as it was played: for a part of it, or other models, name "
+            f"its study: merge-runner replay STUDY --recording {recording}"
+        )
 
 
 @wraps(sweep, assigned=["__annotations__"])
 def replay(**options: Any) -> None:  # noqa: ANN401 # those of sweep
     """Run a study again from recorded replies alone: no key, no network.
 
-    Example: merge-runner replay baseline --model emulator
+    Example: merge-runner replay theirs.parquet
     """
     sweep(**{**options, "replay": True})
 
@@ -342,13 +365,15 @@ def recording_export(
     """
     from merge_runner.llm.cache import ResponseCache
     from merge_runner.results.recording import carried_plugins, export_recording, provenance_of
-    from merge_runner.results.store import recorded_sweeps
+    from merge_runner.results.store import recorded_sweeps, sweeps_with_calls
 
     rows, keys = recorded_sweeps(db, sweeps or ())
     found = " and ".join(row["sweep_id"] for row in rows)
     if not keys:
+        others = " or ".join(f"--sweep {sweep_id}" for sweep_id in sweeps_with_calls(db))
         raise UsageError(
-            f"the sweep {found} made no call: there is nothing to record. --sweep ID names another"
+            f"the sweep {found} made no call: there is nothing to record. "
+            + (f"Name one that did: {others}" if others else f"None in {db} did: programs drove")
         )
     provenance = provenance_of(rows)
     with closing(ResponseCache(cache, read_only=True)) as opened:
@@ -393,15 +418,17 @@ def recording_verify(file: RecordingFile) -> None:
 @recording_app.command("info")
 def recording_info(
     file: RecordingFile,
-    as_json: cli.JsonOption = True,
+    as_json: cli.JsonOption = False,
 ) -> None:
     """Verify a recording and print what it holds.
 
     Example: merge-runner recording info theirs.parquet
     """
-    from merge_runner.results.recording import summarise
+    from merge_runner.results.recording import summarise, summary_lines
 
-    print_out(json.dumps(summarise(file), indent=2, ensure_ascii=False))
+    found = summarise(file)
+    as_text = json.dumps(found, indent=2, ensure_ascii=False) if as_json else ""
+    print_out(as_text or "\n".join(summary_lines(file, found)))
 
 
 def ledger(

@@ -13,6 +13,7 @@ import hashlib
 import json
 import os
 import re
+import shlex
 import sqlite3
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -277,6 +278,36 @@ def summarise(file: Path) -> dict[str, Any]:
     return {**numbers, "cost_usd": round(cost_usd, 6), **counts, **told_of}
 
 
+def summary_lines(file: Path, summary: dict[str, Any]) -> Iterator[str]:
+    """Yield the summary of a recording (``summarise``) for a reader."""
+    for row in sweep_rows(summary["provenance"]):
+        study, trials, models = "unknown", "unknown", ""
+        with suppress(*DAMAGED):
+            study, config = row["name"], json.loads(row["config"])
+            models = config["model"]
+            arms = config.get("arms") or [
+                {"repetitions": n} for n in config["repetitions"].values()
+            ]
+            planned = sum(arm["repetitions"] for arm in arms) * len(config["conditions"])
+            trials = f"{planned} of {models}"
+        asked = (str(row.get(when) or "?")[:16] for when in ("started_at", "ended_at"))
+        yield f"study    {study}"
+        yield f"trials   {trials}"
+        yield f"played   {' to '.join(asked)} UTC"
+    for model, calls in summary["models_requested"].items():
+        yield f"model    {model}: {calls} calls"
+    scripted, calls = summary["scripted"], summary["calls"]
+    if scripted:
+        yield f"         {scripted} of {calls} calls were answered by a scripted stand-in"
+    outcomes = ", ".join(f"{number} {outcome}" for outcome, number in summary["outcomes"].items())
+    usd = f"{summary['cost_usd']:.2f} USD"
+    yield f"calls    {calls} ({outcomes}), {summary['attempts']} attempts, {usd}"
+    if summary["plugins"]:
+        yield f"code     {', '.join(summary['plugins'])}: runs where the study is played again"
+    yield f"digest   {summary['provenance']['content_sha256']} (of its replies)"
+    yield f"again    merge-runner replay {shlex.quote(str(file))}"
+
+
 def _fingerprint(key: str, attempts: str) -> bytes:
     """Return what a recording's hash covers of a row; the key covers the rest."""
     return f"{key} {attempts}\n".encode()
@@ -390,7 +421,7 @@ def provenance_of(sweeps: list[dict[str, Any]]) -> dict[str, str]:
 def carried_plugins(provenance: dict[str, str]) -> list[str]:
     """Return the names of the plug-ins whose source a recording carries, as it says itself."""
     names = set[str]()
-    for row in _rows_of(provenance):
+    for row in sweep_rows(provenance):
         with suppress(*DAMAGED):
             names.update(map(str, json.loads(row["config"])["study"]["plugins"]))
     return sorted(names)
@@ -399,14 +430,14 @@ def carried_plugins(provenance: dict[str, str]) -> list[str]:
 def described_sweeps(provenance: dict[str, str]) -> list[RecordedSweep]:
     """Return the sweeps as a recording says itself, without those whose configuration is odd."""
     sweeps = []
-    for row in _rows_of(provenance):
+    for row in sweep_rows(provenance):
         with suppress(*DAMAGED):
             sweeps.append(RecordedSweep(**{**json.loads(row["config"]), "name": row["name"]}))
     return sweeps
 
 
-def _rows_of(provenance: dict[str, str]) -> list[Any]:
-    """The rows of sweeps that a recording has, as it says itself."""
+def sweep_rows(provenance: dict[str, str]) -> list[Any]:
+    """Return the rows of sweeps that a recording has, as it says itself."""
     with suppress(*DAMAGED):
         return [*json.loads(provenance[SWEEPS])]
     return [provenance]

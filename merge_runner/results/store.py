@@ -66,6 +66,11 @@ FROM decisions JOIN trials USING (trial_id, spec_hash)
 SEMI JOIN (FROM sweep_trials WHERE list_contains(?, sweep_id)) USING (trial_id, spec_hash)
 WHERE call_key IS NOT NULL ORDER BY ALL
 """
+THAT_ASKED = """
+SELECT sweep_id FROM sweeps SEMI JOIN (
+    FROM sweep_trials SEMI JOIN calls USING (trial_id, spec_hash)
+) USING (sweep_id) ORDER BY started_at
+"""
 # The first and the third of these columns order the rows of a trial.
 OF_THE_DIGEST = {
     "trials": "pair, source, model_left, model_right, variant, condition, rep, sample_set, "
@@ -284,6 +289,12 @@ def recorded_sweeps(path: Path, sweep_ids: Sequence[str]) -> tuple[list[dict[str
         rows = [require(sweeps, "sweep", sweep_id, f"in {path}") for sweep_id in wanted]
         keys = connection.execute(CALLS_OF, [wanted]).fetchall()
     return rows, [key for *_, key in keys]
+
+
+def sweeps_with_calls(path: Path) -> list[str]:
+    """Return the ids of the sweeps that asked a model, oldest first; raises UsageError."""
+    with read_database(path) as connection:
+        return [sweep_id for (sweep_id,) in connection.execute(THAT_ASKED).fetchall()]
 
 
 def sweep_facts(path: Path, sweep_id: str) -> dict[str, Any]:

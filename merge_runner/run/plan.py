@@ -87,6 +87,7 @@ class Options:
     ``dry_run`` sends nothing, a ``quiet`` run shows no progress, and one that is to ``keep_going``
     asks a model on that gives no valid decision. In a ``batch`` run all trials ask together, at a
     lower price. ``typed`` are the command's words after the program's name, with which it goes on.
+    ``name`` is what its user calls the run.
     """
 
     db: Path
@@ -105,6 +106,7 @@ class Options:
     dry_run: bool = False
     batch: bool = False
     typed: Sequence[str] = ()
+    name: str = ""
 
     @property
     def connections(self) -> int:
@@ -233,10 +235,14 @@ class Plan(BaseModel):
         return sum(arm.repetitions for arm in self.arms) * len(self.conditions)
 
     @property
-    def usual_calls(self) -> float:
-        """How many calls all trials usually take."""
-        asked = (arm for arm in self.arms for side in SIDES if arm.asked[side] in arm.entries)
-        return sum(a.repetitions * usual_prompts(a) for a in asked) * len(self.conditions)
+    def usual_calls(self) -> dict[str, float]:
+        """How many calls all trials usually take, by the model's name in ``entries``."""
+        calls = dict.fromkeys(self.entries, 0.0)
+        for arm in self.arms:
+            for name in arm.asked.values():
+                if name in arm.entries:
+                    calls[name] += arm.repetitions * usual_prompts(arm) * len(self.conditions)
+        return calls
 
     @property
     def scripted(self) -> bool:

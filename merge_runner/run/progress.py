@@ -16,8 +16,7 @@ from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from io import StringIO
-from itertools import count, groupby
-from operator import itemgetter
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 from urllib.parse import quote
@@ -29,6 +28,7 @@ from merge_runner.drivers.registry import EMULATOR
 from merge_runner.errors import ReplayMiss
 from merge_runner.llm.client import Meter
 from merge_runner.llm.ledger import Ledger
+from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, command_at
 from merge_runner.records import Status
 from merge_runner.results.export import write_table
 from merge_runner.run.estimate import Estimate
@@ -195,7 +195,8 @@ class Progress:
         before = f" (+{self.stored} stored before)" if self.stored else ""
         workers = "" if self.runner.workers is None else f" on {self.runner.workers} workers"
         running = f"{self.runner.running} running{workers}"
-        trials = f"{ended + failed}/{self.planned - self.stored} ended{before}, {running}"
+        total = self.planned - self.stored
+        trials = f"{ended + failed}/{total} ended{before}, {running}"
         cost = f"{meter.cost_usd:.2f} USD"
         if self.cap_usd is not None:
             cost += f", {self.ledger.committed_usd:.2f} of {self.cap_usd:g} over all runs"
@@ -203,6 +204,7 @@ class Progress:
         rows = [
             *dict.fromkeys(("WARNING", text) for text in self._warnings()),
             ("trials", trials),
+            *(("decided", text) for text in self._decided() if ended + failed < total),
             ("failed", str(failed)),
             ("calls", _calls(meter.calls_live, meter.calls_cached, meter.calls_shared)),
             ("cost", cost),
@@ -226,10 +228,26 @@ class Progress:
         Trials that run in step all end late, so early in a run the calls are a better basis.
         """
         total = self.planned - self.stored
-        expected_calls = self.plan.usual_calls * total / self.plan.trials
+        expected_calls = sum(self.plan.usual_calls.values()) * total / self.plan.trials
         by_calls = min(calls / expected_calls, 0.99) if expected_calls else 0.0
         part = max(ended / total, by_calls) if ended < total else 0.0
         return elapsed_s / part - elapsed_s if part else None
+
+    def _decided(self) -> Iterator[str]:
+        """How much of its decisions each model has made, or of all where one drives.
+
+        How many a trial takes is known when it has ended: the share is of the usual number.
+        """
+        part = (self.planned - self.stored) / self.plan.trials
+        expected, made = Counter[str](), Counter[str]()
+        for name, calls in self.plan.usual_calls.items():
+            model = self.plan.registered[name]
+            expected[model] += calls * part
+            if meter := self.runner.meters.get(name):
+                made[model] += meter.calls_live + meter.calls_cached
+        for model, calls in expected.items():
+            share = min(made[model] / calls, 0.99) if calls else 0.0
+            yield f"{f'{model}: ' * (len(expected) > 1)}about {share:.0%} of the decisions"
 
     def _warnings(self) -> Iterator[str]:
         if problem := self.unstored():
@@ -273,7 +291,7 @@ async def show_progress(
 
     ``quiet``: only the clients' messages.
     """
-    live = None
+    live, log = None, Log()
     if not quiet and sys.stderr.isatty():
         from rich.console import Console
         from rich.live import Live
@@ -281,14 +299,14 @@ async def show_progress(
         live = Live(console=Console(stderr=True), auto_refresh=False)
         live.start()  # the text stays below what is printed meanwhile
 
-    def show() -> None:
+    def show(*, ended: bool = False) -> None:
         with suppress(OSError):  # the terminal may be closed
             for note in _notes(progress):
                 say(note)
             if live is not None:
-                live.update(terminal_text(progress), refresh=True)
+                live.update(terminal_text(progress), refresh=not ended)
             elif not quiet:
-                say("; ".join(f"{name}: {text}" for name, text in progress.standing("").rows))
+                log.show(progress)
 
     def publish() -> None:
         write_standing(db, progress.standing(sweep_id))
@@ -312,7 +330,7 @@ async def show_progress(
         yield
     finally:
         following.cancel()
-        show()
+        show(ended=True)  # a terminal is written once more when the display stops
         with suppress(OSError):
             if live is not None:
                 live.stop()
@@ -330,6 +348,23 @@ def terminal_text(progress: Progress) -> Text:
     return Text(
         printable("\n".join([f"{progress.plan.name}: {progress.plan.driver}{mock}", *rows]))
     )
+
+
+@dataclass
+class Log:
+    """The progress as short lines, where no terminal shows it: without what is as it should be."""
+
+    said: str = ""
+
+    def show(self, progress: Progress) -> None:
+        """Say where the sweep stands; once the trials have ended, only what is new."""
+        rows = progress.standing("").rows
+        usual = {("failed", "0"), ("cost", "0.00 USD")}
+        shown = (row for row in rows if row not in usual and row[0] not in {"calls", "time"})
+        line = "; ".join(text if name == "decided" else f"{name}: {text}" for name, text in shown)
+        if line != self.said or progress.doing == "playing":
+            say(f"{line}; {dict(rows)['time']}")
+        self.said = line
 
 
 def _notes(progress: Progress) -> list[str]:
@@ -358,10 +393,12 @@ def as_dict(
     summary: dict[str, Any] = {
         **told,
         "name": plan.name,
+        "run_name": options.name,
         "model": plan.model,
         "driver": plan.driver,
         "scripted": plan.scripted,
         "db": str(options.db),
+        "cache": str(options.cache),
         "trials": {
             "planned": plan.trials,
             "stored_before": progress.stored,
@@ -410,6 +447,8 @@ def as_dict(
 def as_lines(summary: dict[str, Any]) -> Iterator[str]:
     """The summary by ``as_dict`` for a reader."""
     is_stored = summary["audit"] is not None
+    if summary["run_name"]:
+        yield f"run: {summary['run_name']}"
     if is_stored:
         yield from _results(summary)
     yield from _costs(summary)
@@ -418,19 +457,14 @@ def as_lines(summary: dict[str, Any]) -> Iterator[str]:
         yield f"WARNING: a recorded reply was damaged, set aside and asked again: {key}"
     if is_stored:
         yield from _faults(summary)
-        yield f"database: {summary['db']}"
 
 
 def _results(summary: dict[str, Any]) -> Iterator[str]:
     """How the trials ended, or what drivers do first."""
     if looks := summary["first_looks"]:
         yield as_table(looks)
-    for factor, group in groupby(summary["outcomes_by_level"], key=itemgetter("factor")):
-        levels = [{factor: row["level"], **row} for row in group]
-        for row in levels:
-            del row["factor"], row["level"]
-        if len(levels) > 1 and not looks:
-            yield as_table(levels)
+    else:
+        yield _outcomes(summary)
     decisions, invalid = summary["decisions"], summary["invalid_decisions"]
     share = f" ({invalid / decisions:.1%})" if invalid else ""
     missing = summary["no_decision"]
@@ -440,26 +474,38 @@ def _results(summary: dict[str, Any]) -> Iterator[str]:
     )
 
 
+def _outcomes(summary: dict[str, Any]) -> str:
+    """How the trials ended that are stored, in one line."""
+    rows = {(row["factor"], row["level"]): row for row in summary["outcomes_by_level"]}
+    whole = dict(rows.get(("condition", "all"), {"trials": 0}))
+    trials, planned = whole.pop("trials"), summary["trials"]["planned"]
+    of = f" of {planned}" if trials < planned else ""
+    ways = [
+        f"{number} {way}" for way, number in whole.items() if isinstance(number, int) and number
+    ]
+    return f"trials: {trials}{of}" + (f" ({', '.join(ways)})" if ways else "")
+
+
 def _calls(live: int, cached: int, shared: int) -> str:
     """How many calls were asked, and how many had an answer: ``shared`` of them by this run."""
-    text = f"{live} live, {cached - shared} from recordings"
-    return f"{text}, {shared} shared with another trial" if shared else text
+    parts = {"from recordings": cached - shared, "shared with another trial": shared}
+    had = [f"{number} {how}" for how, number in parts.items() if number]
+    return ", ".join([f"{live} asked"] * bool(live or not had) + had)
 
 
 def _costs(summary: dict[str, Any]) -> Iterator[str]:
     number = summary["calls_of_unknown_cost"]
     unknown = f" and {number} calls of unknown cost" if number else ""
     calls = _calls(summary["calls"]["live"], summary["calls"]["cached"], summary["calls_shared"])
-    yield (f"calls: {calls}; cost {summary['cost_usd']:.4f} USD{unknown}")
+    text = f"calls: {calls}; cost {summary['cost_usd']:.4f} USD{unknown}"
     if (expected := summary["estimate"]) is not None:
-        usd = _about(expected["cost_usd"])
-        yield f"estimated before: {expected['calls']} calls, {usd}"
+        text += f"; estimated before: {expected['calls']} calls, {_about(expected['cost_usd'])}"
+    yield text
     spent_usd, aside_usd = summary["sweep_cost_usd"], summary["set_aside_usd"]
-    if spent_usd + aside_usd:
-        yield (
-            f"this sweep over all its runs: {spent_usd:.4f} USD, and {aside_usd:.4f} set aside "
-            "(`merge-runner ledger` says why)"
-        )
+    if aside_usd or round(spent_usd, 4) != round(summary["cost_usd"], 4):
+        ledger = command_at("merge-runner ledger", "--cache", summary["cache"], DEFAULT_CACHE)
+        why = f", and {aside_usd:.4f} set aside (`{ledger}` says why)"
+        yield f"this sweep over all its runs: {spent_usd:.4f} USD{why if aside_usd else ''}"
     if over_usd := summary["over_the_worst_case_usd"]:
         yield (
             f"WARNING: replies cost {over_usd:.4f} USD more than their worst case "
@@ -479,10 +525,12 @@ def _faults(summary: dict[str, Any]) -> Iterator[str]:
         else:
             yield f"{driver}: a scripted stand-in answered, not {model}"
     audit = summary["audit"]
-    checked = ", ".join(f"{n} {what}" for what, n in audit["counts"].items() if n)
-    yield f"audited: {checked}: {len(audit['findings']) or 'no'} findings"
+    audit_it = command_at("merge-runner audit", "--db", summary["db"], DEFAULT_DB)
+    found = f"{len(audit['findings'])} findings, which `{audit_it}` lists"
+    checked = found if audit["findings"] else "no problems"
+    yield f"checked: {checked}; database: {summary['db']}"
     notes = [f"note: {each}" for each in audit["notes"]]
-    yield from first_of(notes, "more notes: `merge-runner audit`", SHOWN)
+    yield from first_of(notes, f"more notes: `{audit_it}`", SHOWN)
     failed = [f"failed: {trial_id}: {error}" for trial_id, error in summary["failed"].items()]
     yield from first_of(failed, "more, in the table trials", SHOWN)
     if failed and summary["exit_code"] != ReplayMiss.exit_code:

@@ -42,7 +42,7 @@ from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LONG_WAIT_S
 from merge_runner.llm.http_outcome import REGISTRY, TransportFailure, if_nobody, set_base_url
 from merge_runner.llm.ledger import Ledger, scopes
-from merge_runner.paths import SHIPPED_RECORDINGS
+from merge_runner.paths import DEFAULT_DB, SHIPPED_RECORDINGS, command_at
 from merge_runner.records import TrialRecord, TrialSpec, canonical_json
 from merge_runner.registry import using
 from merge_runner.results.database import in_thread, unreadable_is_usage
@@ -298,6 +298,7 @@ class Sweep:
                     **self._plan.model_dump(mode="json"),
                     "max_cost_usd": self._options.max_cost_usd,
                     "typed": self._options.typed,
+                    **({"run_name": name} if (name := self._options.name) else {}),
                 }
             ),
             "git_commit": commit,
@@ -460,7 +461,8 @@ class Sweep:
             # Answers from another model are reported elsewhere; only --strict-model stops for them.
             findings = [f for f in audit.findings if f.kind != "served"]
             if findings:
-                self._fail(1, f"the audit found {len(findings)} faults: `merge-runner audit`")
+                audit_it = command_at("merge-runner audit", "--db", store.path, DEFAULT_DB)
+                self._fail(1, f"the audit found {len(findings)} faults: `{audit_it}`")
             self.messages += map(str, findings[:SHOWN])
             if not self._options.replay:
                 self._ledger.read()

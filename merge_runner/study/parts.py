@@ -52,7 +52,7 @@ _importing = threading.RLock()
 
 
 def load_study(
-    name: str,
+    name: str | StudySource,
     models: Sequence[str] | None = None,
     *,
     trust: bool = False,
@@ -64,7 +64,7 @@ def load_study(
     place of the file's own; None: nobody is asked. The user also agrees to where their keys go.
     ``trust`` agrees. Raises UsageError.
     """
-    study = read_study(name)
+    study = read_study(name) if isinstance(name, str) else name
     file = study.file
     asked: set[str] = set()
     if models is not None:

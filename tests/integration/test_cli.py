@@ -123,7 +123,7 @@ def at_a_terminal(*words, cwd):
 async def test_a_quiet_sweep_shows_no_progress(merge_runner):
     quiet = await merge_runner("sweep", "baseline", "--model", "constant", "--reps", 1, "--quiet")
     assert (quiet.code, quiet.err) == (0, "")
-    assert "audited: 11 trials" in quiet.out
+    assert quiet.out.startswith("trials: 11 (")
 
 
 @pytest.mark.parametrize(

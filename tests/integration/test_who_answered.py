@@ -72,7 +72,7 @@ def test_the_emulator_behind_a_models_name_is_stored_as_what_it_is(pointed, prep
         for entry in with_flags
     )
     export_recording(untold, stripped, [entry.request.key for entry in with_flags], {})
-    info = prepare(tmp_path, "recording", "info", untold).summary
+    info = prepare(tmp_path, "recording", "info", untold, "--json").summary
     assert info["scripted"] == info["calls"] == len(with_flags) == summary["calls"]["live"]
     replay = prepare(tmp_path, "replay", "baseline", *MODELS, *SMALL, "--recording", untold)
     assert replay.code == 0, replay.err

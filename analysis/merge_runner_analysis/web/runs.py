@@ -72,6 +72,8 @@ def run_of(row: Row, config: Row, standing: Standing | None, later: str = "") ->
     unless a ``later`` run already did. One that is ``followed`` may have news: it may have slept,
     and go on.
     """
+    if run_name := config.get("run_name"):
+        row = {**row, "name": f"{run_name} ({row['name']})"}
     state, last_word = "stopped" if row["exit_code"] else "finished", row["ended_at"]
     if last_word is None:
         state = "lost"

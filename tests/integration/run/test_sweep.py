@@ -4,6 +4,7 @@ import asyncio
 import fcntl
 import json
 import os
+import re
 import signal
 import termios
 
@@ -23,16 +24,26 @@ PAIR = ("baseline", "--model", "projected-order+emulator", "--model", "constant"
         "--reps", 1, "--conditions", "N_0_0,L_4_0,R_-4_8")  # fmt: skip
 
 
-async def test_a_sweep_stores_every_trial_and_prints_outcomes_and_the_database(merge_runner):
-    run = await merge_runner("sweep", "baseline", "--reps", 1)
+async def test_a_sweep_stores_every_trial_and_its_summary_is_five_lines(merge_runner):
+    run = await merge_runner("sweep", "--reps", 1)
     assert run.code == 0, run.err
-    lines = run.out.splitlines()
-    head = "condition trials left first right first collided timeout failed"
-    assert lines[0].split() == head.split()
-    assert [line.split()[1] for line in lines[1:13]] == ["1"] * 11 + ["11"]
-    assert "database: results/merge.duckdb" in lines
-    assert "scripted stand-in" in run.out
-    assert "11/11 ended" in run.err
+    trials, decisions, calls, who, checked = run.out.splitlines()
+    ways = re.fullmatch(
+        r"trials: 11 \((\d+) left first, (\d+) right first(?:, (\d) collided)?\)", trials
+    )
+    assert sum(map(int, filter(None, ways.groups()))) == 11
+    assert re.fullmatch(r"decisions: (\d+), 0 invalid, 0 fallbacks", decisions)
+    assert re.fullmatch(r"calls: \d+ asked; cost 0.0000 USD", calls)
+    assert who == "The model `emulator` is a scripted stand-in, no language model."
+    assert checked == "checked: no problems; database: results/merge.duckdb"
+    assert run.err.splitlines()[-1].startswith("trials: 11/11 ended, 0 running; ")
+    assert run.err.count("trials: 11/11 ended") == 1
+    named = await merge_runner(
+        "sweep", "--reps", 2, "--conditions", "L_4_0", "--name", "the second"
+    )
+    assert named.out.splitlines()[:2] == ["run: the second", "trials: 2 (2 left first)"]
+    runs = "select config->>'run_name' as name from sweeps order by started_at"
+    assert (await merge_runner("sql", runs)).out.split(maxsplit=1)[1].strip() == "the second"
 
 
 async def test_several_sweeps_are_all_looked_at_and_played_one_after_the_other(merge_runner):
@@ -258,9 +269,9 @@ async def test_a_dry_run_tells_and_touches_nothing_and_counts_trials_that_are_no
 async def test_a_mirrored_pair_replays_to_itself_and_is_one_driver_in_tables_and_summary(
     merge_runner, tmp_path
 ):
-    run = await merge_runner("sweep", *PAIR)
-    counts = {line.split()[0]: line.split()[1] for line in run.out.splitlines() if line}
-    assert (run.code, counts["emulator+projected-order"]) == (0, "6"), run.err
+    run = await merge_runner("sweep", *PAIR, "--json")
+    counts = {row["level"]: row["trials"] for row in run.summary["outcomes_by_level"]}
+    assert (run.code, counts["emulator+projected-order"]) == (0, 6), run.err
     assert (await merge_runner("replay", *PAIR, "--db", "again.duckdb")).code == 0
     digest = results_digest(tmp_path / "results/merge.duckdb")
     assert digest == results_digest(tmp_path / "again.duckdb")

@@ -3,6 +3,7 @@
 import ast
 import json
 import re
+import shutil
 import tomllib
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from merge_runner.config import ModelEntry
 from merge_runner.paths import DEFAULT_DB, home_of
 from merge_runner.results.store import query, results_digest
 from merge_runner.study.file import TEMPLATE, write_folder
+from tests.support.harness import PROJECT
 
 
 @pytest.fixture
@@ -53,7 +55,7 @@ async def test_an_export_names_the_plug_ins_that_it_carries_and_has_no_command_l
     places = ("--db", db, "--cache", played / "cache/responses")
     export = await merge_runner("recording", "export", "mine.parquet", *places)
     assert "the whole source of the study's plug-ins: plugin.py" in export.err
-    told = await merge_runner("recording", "info", "mine.parquet")
+    told = await merge_runner("recording", "info", "mine.parquet", "--json")
     info = json.loads(told.out)
     assert info["plugins"] == ["plugin.py"]
     assert str(tmp_path) not in told.out
@@ -61,6 +63,63 @@ async def test_an_export_names_the_plug_ins_that_it_carries_and_has_no_command_l
     config = json.loads(info["provenance"]["config"])
     [(stored,)] = query(db, "SELECT config FROM sweeps")[1]
     assert json.loads(stored).keys() - config.keys() == {"typed"}
+
+
+async def test_a_recording_alone_replays_its_study_in_an_empty_folder_once_its_code_is_trusted(
+    merge_runner, played, tmp_path
+):
+    mine = shutil.copytree(played, tmp_path / "mine")
+    db = mine / "results/merge.duckdb"
+    places = ("--db", db, "--cache", mine / "cache/responses")
+    (mine / "plugin.py").write_text((mine / "plugin.py").read_text() + "\n# changed\n")
+    sweep = await merge_runner("sweep", "study.toml", *PART, "--trust", cwd=mine)
+    assert sweep.code == 0, sweep.err
+    file = tmp_path / "study.parquet"
+    assert (await merge_runner("recording", "export", file, *places)).code == 0
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    refused = await merge_runner("replay", file, cwd=empty)
+    assert (refused.code, "runs code (plugin.py)" in refused.err) == (2, True)
+    again = await merge_runner("replay", file, "--trust", cwd=empty)
+    assert again.code == 0, again.err
+    assert results_digest(empty / "results/merge.duckdb") == results_digest(db)
+    for words, said in (
+        (("replay", file, "--reps", 1), "replayed as it was played"),
+        (("sweep", file), f"merge-runner replay {file}"),
+    ):
+        run = await merge_runner(*words, cwd=empty)
+        assert (run.code, said in run.err) == (2, True), run.err
+
+
+async def test_the_summary_of_a_recording_says_study_models_trials_calls_dates_and_digest(
+    merge_runner, tmp_path
+):
+    recording = PROJECT / "cache/recordings/smollm2-baseline.parquet"
+    told = (await merge_runner("recording", "info", recording)).out
+    facts = {line.split()[0]: line.split(maxsplit=1)[1] for line in told.splitlines()}
+    assert facts["study"] == "baseline"
+    assert facts["trials"] == "22 of smollm2"
+    assert facts["played"] == "2026-11-22 16:02 to 2026-11-22 16:07 UTC"
+    assert facts["model"] == "SmolLM2-135M-Instruct-Q4_1: 192 calls"
+    assert facts["calls"] == "192 (189 ok, 3 truncated), 193 attempts, 0.00 USD"
+    whole = json.loads((await merge_runner("recording", "info", recording, "--json")).out)
+    assert facts["digest"].split()[0] == whole["provenance"]["content_sha256"]
+    assert len(told.splitlines()) < 10
+    assert facts["again"] == f"merge-runner replay {recording}"
+    # It was made before recordings held their study: this is one of the program's own.
+    run = await merge_runner("replay", recording, "--json")
+    assert (run.code, run.summary["trials"]["planned"]) == (0, 22), run.err
+
+
+async def test_an_export_of_programs_alone_says_which_runs_asked_a_model(merge_runner, tmp_path):
+    part = ("--conditions", "L_4_0", "--reps", 1, "--quiet")
+    await merge_runner("sweep", "baseline", "--model", "idm", *part)
+    nothing = await merge_runner("recording", "export", "a.parquet")
+    assert "None in results/merge.duckdb did: programs drove" in nothing.err
+    asked = (await merge_runner("sweep", "baseline", *part, "--json")).summary["sweep_id"]
+    await merge_runner("sweep", "reference", "--model", "constant", *part)
+    other = await merge_runner("recording", "export", "a.parquet")
+    assert (other.code, f"Name one that did: --sweep {asked}" in other.err) == (2, True), other.err
 
 
 async def test_results_lie_beside_the_study_wherever_it_is_started(merge_runner, played, tmp_path):

@@ -8,7 +8,8 @@ import pytest
 from merge_runner.llm.client import Meter
 from merge_runner.records import Attempt, Usage
 from merge_runner.run.estimate import Estimate
-from merge_runner.run.progress import estimate_lines
+from merge_runner.run.plan import make_plan
+from merge_runner.run.progress import Log, estimate_lines
 from tests.support.standings import progress, runner
 
 
@@ -39,7 +40,7 @@ def test_every_figure_is_that_of_the_meters():
     assert fields["trials"] == "3/10 ended (+7 stored before), 5 running"
     assert fields["failed"] == "1"
     assert fields["WARNING"] == "another model answers: o3 -> gpt-4o"
-    assert fields["calls"] == "34 live, 12 from recordings, 8 shared with another trial"
+    assert fields["calls"] == "34 asked, 12 from recordings, 8 shared with another trial"
     assert fields["cost"] == "1.50 USD, 4.25 of 20 over all runs"
     # 3 of 10 trials have ended but only 46 of 210 calls are made: the larger share tells.
     spent_s, left_s = times(fields["time"])
@@ -54,6 +55,37 @@ def test_the_calls_tell_the_time_left_while_no_trial_has_ended():
     assert left_s == pytest.approx(2 * spent_s, abs=3)
     shown.runner = runner(Meter())
     assert re.fullmatch(r"\d+ s", dict(rows(shown))["time"])
+
+
+def test_each_model_of_several_shows_its_share_of_the_decisions():
+    plan = make_plan("baseline", ["emulator", "random"])
+    of_each = {"emulator": Meter(calls_live=231), "random": Meter(calls_cached=9999)}
+    shown = progress(runner(), plan.trials)
+    shown.plan, shown.runner.meters = plan, of_each
+    assert [text for name, text in rows(shown) if name == "decided"] == [
+        "emulator: about 10% of the decisions",
+        "random: about 99% of the decisions",
+    ]
+    shown.outcome_counts.update(finished=plan.trials)
+    assert "decided" not in dict(rows(shown))
+
+
+def test_a_log_says_in_short_what_is_new_and_its_last_line_once(capsys):
+    shown = progress(runner(running=3), began_at=ago(10))
+    shown.runner.meters = {"emulator": Meter(calls_live=70)}
+    log = Log()
+    log.show(shown)
+    assert re.fullmatch(
+        r"trials: 0/10 ended, 3 running; about 33% of the decisions; \d+ s, about \d+ s left\n",
+        capsys.readouterr().err,
+    )
+    shown.outcome_counts.update(finished=9, failed=1)
+    shown.doing = "checking"
+    for _ in range(3):
+        log.show(shown)
+    assert re.fullmatch(
+        r"trials: 10/10 ended, 3 running; failed: 1; \d+ s\n", capsys.readouterr().err
+    )
 
 
 def test_batches_are_shown_and_that_nobody_need_wait():
