@@ -5,6 +5,7 @@ from __future__ import annotations
 import ipaddress
 import os
 import re
+import sys
 import tomllib
 from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
@@ -417,6 +418,15 @@ def driver_name(model: str, endpoint: str | None) -> str:
     return f"{model} at {host[1]}" if host else model
 
 
+def without_endpoint(driver: str) -> str:
+    """Return a driver's name without its endpoints.
+
+    >>> without_endpoint("bold at localhost:8123 [temperature=0.2]")
+    'bold [temperature=0.2]'
+    """
+    return re.sub(r" at [^\s+]+", "", driver)
+
+
 def both_sides(model: str) -> dict[Side, str]:
     """Who drives on each side, by what ``--model`` says: one name, or two that + joins."""
     left, _, right = model.partition("+")
@@ -484,6 +494,11 @@ def http_url(url: str) -> SplitResult | None:
         return None
     is_written = re.fullmatch("[!-~]+", url) and parts.scheme in ("http", "https")
     return parts if is_host and is_written else None
+
+
+def has_screen(env: Mapping[str, str] = os.environ) -> bool:
+    """Whether a browser could open a window here."""
+    return sys.platform == "darwin" or bool(env.get("DISPLAY") or env.get("WAYLAND_DISPLAY"))
 
 
 def state_folder(env: Mapping[str, str] = os.environ) -> Path:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import json
 import re
+import sys
+import threading
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
@@ -147,6 +149,9 @@ def explain(
     study_file: StudyOption = None,
     trust: TrustOption = False,
     by: ByOption = None,
+    whole: Annotated[
+        bool, flag("--all", "All trials, also those that the value does not count.")
+    ] = False,
     as_json: cli.JsonOption = False,
 ) -> None:
     """Explain a row of a table: its query and its trials.
@@ -164,7 +169,7 @@ def explain(
         shown = {**found._asdict(), "sources": sources}
         print_out(json.dumps(shown, indent=2, ensure_ascii=False))
     else:
-        print_out("\n".join(found.lines()))
+        print_out("\n".join(found.lines(whole=whole)))
 
 
 @app.command(rich_help_panel=PLAY)
@@ -286,6 +291,19 @@ def report(
     print_out(f"wrote {out}{also}")
 
 
+def open_browser(address: str) -> bool:
+    """Open a page in a browser, where somebody sits at a terminal with a screen; return whether."""
+    import webbrowser
+
+    from merge_runner.config import has_screen
+
+    if not (sys.stdout.isatty() and has_screen()):
+        return False
+    # In a thread: the browser asks for a page that is served only once this has returned.
+    threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
+    return True
+
+
 def _selection(
     models: str | None = None,
     where: Sequence[str] | None = None,
@@ -333,6 +351,7 @@ def view(
             "--trials",
         ),
     ] = None,
+    no_open: Annotated[bool, flag("--no-open", "Do not open a browser.")] = False,
     reader: Annotated[
         str | None, option("NAME", "Who writes notes; else your user name.", "--reader")
     ] = None,
@@ -356,7 +375,8 @@ def view(
 
     def announce(address: str) -> None:
         print_out(address)
-        say("open this address in a browser; Ctrl-C ends the explorer")
+        opened = not no_open and open_browser(address)
+        say(f"{'' if opened else 'open this address in a browser; '}Ctrl-C ends the explorer")
 
     def told(pages: int) -> None:
         if pages % TOLD_EVERY == 0:

@@ -50,8 +50,8 @@ class Explanation(NamedTuple):
     sources: tuple[Source, ...]
     command: str
 
-    def lines(self) -> list[str]:
-        """The explanation for a reader; the trials that a value counts come first."""
+    def lines(self, *, whole: bool = False) -> list[str]:
+        """The explanation for a reader: the trials that a value counts, ``whole`` all."""
         lines = [f"{self.cell} = {self.value}", self.meaning]
         if self.note:
             lines.append(f"note: {self.note}")
@@ -62,7 +62,9 @@ class Explanation(NamedTuple):
                 lines.append(f'{self.command} "{source.query}"')
             counted = set(source.numerator)
             lines += [f"* {trial}" for trial in source.trials if trial in counted]
-            lines += [f"  {trial}" for trial in source.trials if trial not in counted]
+            others = [f"  {trial}" for trial in source.trials if trial not in counted]
+            hidden = bool(source.numerator) and not whole
+            lines += [f"and {len(others)} others: --all"] if hidden and others else others
         return lines
 
 

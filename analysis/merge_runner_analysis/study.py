@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from merge_runner.config import without_endpoint
 from merge_runner.errors import UsageError, unknown_name
 from merge_runner.paths import DEFAULT_DB
 from merge_runner.registry import require
@@ -111,6 +113,12 @@ class Study:
         }
         valid = dict.fromkeys([HUMAN, *names.values()])
         wanted = [*valid] if self.selection.models is None else self.selection.models
+        # Where one driver alone is so called without its endpoint, that is enough.
+        short = Counter(map(without_endpoint, valid))
+        full = {
+            without_endpoint(name): name for name in valid if short[without_endpoint(name)] == 1
+        }
+        wanted = [name if name in valid else full.get(name, name) for name in wanted]
         for name in wanted or [""]:
             if name not in valid:
                 raise unknown_name("driver", name, valid, f"in {self.db}")

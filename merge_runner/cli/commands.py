@@ -224,7 +224,8 @@ def _play(
     if dry_run:
         expected = asyncio.run(running.unsent(plan, options, say=say))
         lines = "\n".join(progress.estimate_lines(expected))
-        print_out(json.dumps(asdict(expected)) if as_json else f"{lines}\nNothing was sent.")
+        sent = "\nNothing was sent." if expected.trials else ""
+        print_out(json.dumps(asdict(expected)) if as_json else f"{lines}{sent}")
         return 0
 
     def leave(expected: Estimate) -> None:
@@ -474,6 +475,11 @@ def ledger(
             {"sweep": each.scope, **asdict(each.read()), "reasons": each.reasons()}
             for each in ledgers
         ]
+        # Without a process nothing is awaited, but by a batch: the next run asks for that.
+        if opened.locks.take_all():
+            for reason in (reason for row in rows for reason in row["reasons"]):
+                if reason["outcome"] == "in flight":
+                    reason["outcome"] = "in flight when its process ended"
     if as_json:
         print_out(json.dumps(rows, ensure_ascii=False))
         return

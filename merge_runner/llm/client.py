@@ -73,6 +73,7 @@ if TYPE_CHECKING:
 # For how long connections may be refused at the first call of a run.
 NOBODY_S = 5.0
 # A shorter wait is over before a note of it is read.
+NO_ROOM = "calls: the cap leaves money for few trials at a time"
 LONG_WAIT_S = 5.0
 # How often a format that knows empty answers as a fault is asked again after one; and how many
 # refusals by an endpoint that has answered before mean the configuration.
@@ -381,7 +382,7 @@ class LlmClient:
             call.open = self.rounds.waiting.get(call.request.key)
         if call.open:
             self.money.begin_anew(call.order)
-        with self._waiting(call, "for trials before it to end, under --max-cost", idle=True):
+        with self._waiting(call, NO_ROOM, idle=True):
             await self.money.admit(call.order)
         alone = not self.passed and not call.open  # nobody waits for an answer that may take hours
         telling: asyncio.TimerHandle | None = None

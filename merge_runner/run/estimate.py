@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from statistics import fmean
 
 from merge_runner.config import ModelEntry
@@ -62,6 +62,7 @@ class Estimate:
 
     They are ``measured`` where tokens are those of earlier answers. Calls that are asked singly
     cost ``singly_usd``; in batches they cost less, and take so many ``rounds`` in place of minutes.
+    ``usd_by_model`` has the models of the registry. Of ``planned`` trials some are ``stored``.
     """
 
     driver: str
@@ -75,6 +76,9 @@ class Estimate:
     rounds: int
     free: bool
     measured: bool
+    planned: int = 0
+    stored: int = 0
+    usd_by_model: dict[str, float | None] = field(default_factory=dict)
 
 
 def estimate(
@@ -84,14 +88,16 @@ def estimate(
     trials: int,
     calls: Mapping[str, Mapping[str, float]],
     facts: Mapping[str, Usage | None],
+    stored: int = 0,
 ) -> Estimate:
-    """Return the estimate for the ``trials`` that a live run of a plan has yet to play.
+    """Return the estimate for the ``trials`` that a live run of a plan has yet to ask for.
 
     ``calls`` is roughly how many each model has yet to answer, by arm. ``facts`` is what the cache
     knows about each model's earlier answers to similar requests at its endpoint.
     """
     number = read = written = 0
     usd = singly_usd = 0.0
+    by_model: defaultdict[str, float] = defaultdict(float)
     busy_s: defaultdict[str, float] = defaultdict(float)
     at_once = min(options.connections, 2 * max(trials, 1))
     for label, arm in plan.by_label().items():
@@ -103,7 +109,9 @@ def estimate(
             read += asked * (usage.input_tokens or 0)
             written += asked * (usage.output_tokens or 0)
             singly_usd += asked * call_usd
-            usd += asked * call_usd * _price_factor(entry, options.batch)
+            asked_usd = asked * call_usd * _price_factor(entry, options.batch)
+            usd += asked_usd
+            by_model[plan.registered[name]] += asked_usd
             # An account's limits are those of a model, with whatever parameters it is asked.
             call_s = max(entry.typical_latency_s / at_once, _limited_s(options, entry, usage))
             busy_s[plan.registered[name]] += asked * call_s
@@ -114,13 +122,21 @@ def estimate(
         calls=number,
         input_tokens=read,
         output_tokens=written,
-        cost_usd=None if math.isnan(usd) else round(usd, 2),
-        singly_usd=None if math.isnan(usd) else round(singly_usd, 2),
+        cost_usd=_cents(usd),
+        singly_usd=_cents(singly_usd),
         minutes=round(max(busy_s.values(), default=0.0) / 60, 1),
         rounds=rounds if options.batch else 0,
         free=plan.is_free,
         measured=any(map(facts.get, plan.entries)),
+        planned=plan.trials,
+        stored=stored,
+        usd_by_model={model: _cents(each) for model, each in by_model.items()},
     )
+
+
+def _cents(usd: float) -> float | None:
+    """An amount in USD to the cent; None where a price is unknown, which is NaN."""
+    return None if math.isnan(usd) else round(usd, 2)
 
 
 def trial_costs(

@@ -239,10 +239,10 @@ class Progress:
         How many a trial takes is known when it has ended: the share is of the usual number.
         """
         part = (self.planned - self.stored) / self.plan.trials
-        expected, made = Counter[str](), Counter[str]()
+        expected, made = dict[str, float](), Counter[str]()
         for name, calls in self.plan.usual_calls.items():
             model = self.plan.registered[name]
-            expected[model] += calls * part
+            expected[model] = expected.get(model, 0.0) + calls * part
             if meter := self.runner.meters.get(name):
                 made[model] += meter.calls_live + meter.calls_cached
         for model, calls in expected.items():
@@ -550,23 +550,35 @@ def _about(cost_usd: float | None) -> str:
     return "an unknown price" if cost_usd is None else f"about {cost_usd:.2f} USD"
 
 
+def _by_model(expected: Estimate) -> Iterator[str]:
+    """What each of several models costs."""
+    if len(expected.usd_by_model) > 1:
+        yield from (f"        {name}: {_about(usd)}" for name, usd in expected.usd_by_model.items())
+
+
 def estimate_lines(expected: Estimate) -> Iterator[str]:
     """What a run will take, for a reader."""
     measured = ", as measured before" if expected.measured else ""
     tokens = f"about {expected.input_tokens} in, {expected.output_tokens} out{measured}"
-    yield f"driver  {expected.driver}"
     if not expected.trials:
-        yield "trials  none: all of them are stored"
+        if recorded := expected.planned - expected.stored:
+            stored = f"{expected.stored} trials are stored"
+            yield f"Nothing left to ask: {stored}, and {recorded} are played from recorded replies."
+        else:
+            yield f"Nothing left to play: all {expected.planned} trials are stored."
         return
+    yield f"driver  {expected.driver}"
     yield f"trials  {expected.trials} that have not ended yet"
     yield f"calls   about {expected.calls} that are not recorded yet"
     yield f"tokens  {tokens}"
     if not expected.rounds:
         yield f"cost    {_about(expected.cost_usd)}"
+        yield from _by_model(expected)
         yield f"time    about {expected.minutes} minutes"
         return
     singly = f"{_about(expected.singly_usd)} and {expected.minutes} minutes if asked singly"
     yield f"cost    {_about(expected.cost_usd)} in batches; {singly}"
+    yield from _by_model(expected)
     yield (
         f"time    about {expected.rounds} rounds; each takes as long as its slowest batch: "
         "minutes, an hour, a day at most"

@@ -281,6 +281,7 @@ class Sweep:
             self._plan,
             self._options,
             trials=trials,
+            stored=0 if whole else len(self._stored),
             calls=calls,
             facts=earlier_answers(self._plan, self._cache),
         )

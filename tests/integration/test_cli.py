@@ -12,15 +12,17 @@ import struct
 import subprocess
 import termios
 from contextlib import suppress
+from queue import Queue
 
 import pytest
 import typer.main
 from typer.testing import CliRunner
 
-from merge_runner_analysis.commands import app
+from merge_runner_analysis.commands import app, open_browser
 from merge_runner_analysis.tables import TABLES
 from tests.support import program
 from tests.support.harness import PROGRAM, environment
+from tests.support.studies import damage
 from tests.unit.test_cli import every_command
 
 
@@ -118,6 +120,41 @@ def at_a_terminal(*words, cwd):
                 text += part
     assert process.wait() == 0
     return text.decode().splitlines()
+
+
+def test_explain_shows_the_trials_that_a_share_counts_and_with_all_the_others(run):
+    cell = ("explain", "ablation-quantitative", "smollm2/baseline:collided_percent", *DB)
+    (source,) = json.loads(run(*cell, "--json").out)["sources"]
+    counted = [f"* {trial}" for trial in source["numerator"]]
+    others = {*source["trials"]} - {*source["numerator"]}
+    lines = run(*cell).out.splitlines()
+    assert lines[-len(counted) - 1 :] == [*counted, f"and {len(others)} others: --all"]
+    lines = run(*cell, "--all").out.splitlines()
+    assert {line.strip() for line in lines[-len(others) :]} == others
+
+
+def test_a_driver_is_found_by_its_name_without_the_endpoint_where_one_has_it(golden_copy):
+    elsewhere = "replace(spec::VARCHAR, '\"local\"', '\"http://localhost:8123/v1\"')::JSON"
+    db = golden_copy / "golden.duckdb"
+    damage(db, f"UPDATE specs SET spec = {elsewhere}")
+    words = ("tables", "attempts", "--format", "csv", "--db", db, "--models")
+    found = program.invoke((*words, "smollm2"), cwd=golden_copy, env=environment())
+    assert "\nsmollm2 at localhost:8123/baseline," in found.out, found.err
+    unknown = program.invoke((*words, "smollm"), cwd=golden_copy, env=environment())
+    assert (unknown.code, "smollm2 at localhost:8123" in unknown.err) == (2, True)
+
+
+def test_a_browser_opens_where_there_is_a_screen_and_a_terminal_alone(monkeypatch):
+    opened = Queue()
+    monkeypatch.setattr("webbrowser.open", opened.put)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr("sys.platform", "linux")
+    for screen, terminal in (("", True), (":0", False), (":0", True)):
+        monkeypatch.setenv("DISPLAY", screen)
+        monkeypatch.setattr("sys.stdout.isatty", lambda terminal=terminal: terminal)
+        assert open_browser("http://127.0.0.1:1/") == bool(screen and terminal)
+    assert opened.get(timeout=5) == "http://127.0.0.1:1/"
+    assert opened.empty()
 
 
 async def test_a_quiet_sweep_shows_no_progress(merge_runner):

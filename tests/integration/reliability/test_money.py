@@ -143,9 +143,11 @@ async def test_what_a_run_has_in_flight_is_not_released_and_stays_set_aside_when
         refused = await merge_runner("ledger", "--release", "baseline/o3/set0", "--yes")
         process.kill()
         await process.wait()
+        gone = await merge_runner("ledger")
         run = await merge_runner(*sweep, **env)
     assert run.code == 0, run.err
     assert "  in flight  3  " in told.out
+    assert "  in flight when its process ended  3  " in gone.out
     assert refused.code == 2
     assert "another merge-runner works with" in refused.err
     assert run.summary["attempts_of_unknown_cost"] == 3

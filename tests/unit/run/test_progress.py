@@ -107,10 +107,26 @@ def test_replies_that_cost_more_than_is_counted_are_a_warning():
     assert "tiers = { priority = 2.0 }" in warning
 
 
-@pytest.mark.parametrize(
-    ("trials", "told"), [(0, "none: all of them are stored"), (3, "3 that have not ended yet")]
-)
-def test_a_dry_run_says_how_many_trials_are_left(trials, told):
-    left = Estimate("o3", trials, 18 * trials, 0, 0, 0.0, None, 0.1 * trials, 0, True, False)
-    assert [*estimate_lines(left)][:2] == ["driver  o3", f"trials  {told}"]
-    assert trials or len([*estimate_lines(left)]) == 2
+def expected(trials, **more):
+    return Estimate(
+        "o3", trials, 18 * trials, 0, 0, 1.5, None, 0.1 * trials, 0, True, False, **more
+    )
+
+
+def test_a_dry_run_says_how_many_trials_are_left():
+    assert [*estimate_lines(expected(3))][:2] == ["driver  o3", "trials  3 that have not ended yet"]
+    assert [*estimate_lines(expected(0, planned=110, stored=110))] == [
+        "Nothing left to play: all 110 trials are stored."
+    ]
+    assert [*estimate_lines(expected(0, planned=110, stored=100))] == [
+        "Nothing left to ask: 100 trials are stored, and 10 are played from recorded replies."
+    ]
+
+
+def test_an_estimate_says_what_each_of_several_models_costs():
+    lines = [*estimate_lines(expected(3, usd_by_model={"o3": 1.25, "o4": None}))]
+    assert lines[lines.index("cost    about 1.50 USD") + 1 :][:2] == [
+        "        o3: about 1.25 USD",
+        "        o4: an unknown price",
+    ]
+    assert not any("o3:" in line for line in estimate_lines(expected(3, usd_by_model={"o3": 1.5})))
