@@ -21,7 +21,12 @@ HUMANS, LANGUAGE_MODEL, PROGRAM, MOCK = "humans", "language model", "program", "
 SHOWN, WEAKER, STRONGER, UNLIKE, OPEN = "shown", "weaker", "stronger", "unlike", "inconclusive"
 DIFFERS = frozenset({WEAKER, STRONGER, UNLIKE})
 ENOUGH = 20  # trials with an outcome; with fewer of them a headline says nothing of likeness
-MOST_COLLISIONS = 25.0  # percent; with more of them collisions come first in a sentence
+# The collision rules that trials may be played by, as sentences name them.
+PLAYED_RULES = {
+    "euclid2d": "the paper's rule",
+    "rectangle": "people's rule at its steps",
+    "shared_lane": "the rule of its scenario",
+}
 MISSING, MINUS = "–", "−"
 
 Values = Mapping[str, Any]
@@ -115,10 +120,10 @@ class Measure:
 
     ``trait`` names what humans do, ``label`` and ``unit`` head a column, ``rests_on`` is the column
     in which its trials have a value, or "finished", and ``rule`` says how its state is set.
-    ``told`` is the sentence of a difference, with the fields ``of`` (driver) and ``humans``, each a
-    value with its interval. ``says`` has by state the driver's part of a sentence, with the fields
-    ``of``, ``humans``, its ``rate`` and ``more`` or less. ``ends`` are those of its axis.
-    ``margin``: so far from 0, where the humans are, it still is alike.
+    ``told`` is a difference in a headline, with the fields ``it`` (the driver), ``own`` and
+    ``people``: counts of trials, or values with their intervals. ``says`` has by state the driver's
+    part of a sentence, with ``of``, ``humans`` and ``more`` or less. ``ends`` are those of its
+    axis. ``margin``: so far from 0, where the humans are, it still is alike.
     """
 
     name: str
@@ -133,52 +138,51 @@ class Measure:
     margin: float | None = None
 
 
-def _trait(does: str, does_not: str) -> dict[str, str]:
-    """The driver's part of a sentence by the state of a trait that humans have."""
-    return {
-        SHOWN: f"{does} as humans do",
-        WEAKER: f"{does} less than humans",
-        STRONGER: f"{does} more than humans",
-        UNLIKE: f"{does_not} as humans do",
-    }
-
-
 MEASURES = {
     measure.name: measure
     for measure in (
         Measure(
             "headway",
             "The one who is ahead goes first (I1)",
-            "who goes first by headway",
+            "who goes first, by who is ahead",
             "log-odds per m",
             LEFT_FIRST.column,
             "Firth's fit: above 0, likelihood-ratio test at 5 %",
-            "gains {of} log-odds of going first per m of headway, humans {humans}",
+            "with {it} the one ahead went first in {own} trials, with people in {people}",
             (-0.25, 2.5),
-            _trait("goes first by headway", "does not go first by headway"),
+            {
+                SHOWN: "the one ahead goes first, as with people",
+                WEAKER: "who goes first depends less on who is ahead than with people",
+                STRONGER: "who goes first depends more on who is ahead than with people",
+                UNLIKE: "who is ahead does not decide who goes first, as it does with people",
+            },
         ),
         Measure(
             "velocity",
             "The faster one yields (I2)",
-            "who goes first by relative velocity",
+            "who goes first, by who is faster",
             "log-odds per m/s",
             LEFT_FIRST.column,
             "Firth's fit: below 0, likelihood-ratio test at 5 %",
-            "changes its log-odds of going first by {of} per m/s of relative velocity, humans by "
-            "{humans}",
+            "with {it} the slower one went first in {own} trials side by side, with people in "
+            "{people}",
             (-6.5, 3.0),
-            _trait("when faster, yields", "when faster, does not yield"),
+            {
+                SHOWN: "the faster one yields, as with people",
+                WEAKER: "who goes first depends less on who is slower than with people",
+                STRONGER: "who goes first depends more on who is slower than with people",
+                UNLIKE: "the faster one does not yield, as it does with people",
+            },
         ),
         Measure(
             "collisions",
             "Collisions by the humans' rule",
-            "collisions",
+            "crashes",
             "% of trials",
             BOXES.column,
             "corrected p below .05",
-            "collides in {of} % of trials, humans in {humans} %",
+            "{it} crashed in {own} trials, people in {people}",
             (0.0, 30.0),
-            {UNLIKE: "collides in {rate} % of trials"},
         ),
         Measure(
             "gap",
@@ -187,36 +191,36 @@ MEASURES = {
             "m",
             GAP.column,
             "corrected p below .05",
-            "leaves a gap of {of} m, humans {humans} m",
+            "{it} left {own} m at the merge point, people {people} m",
             (0.0, 8.0),
-            {UNLIKE: "leaves {of} m, humans {humans} m"},
+            {UNLIKE: "leaves {of} m at the merge point, {more} than people ({humans} m)"},
         ),
         Measure(
             "gap-headway",
             "More headway, more gap (I3)",
-            "gap by headway",
+            "gap, by headway",
             "m per m",
             GAP.column,
             "HC3 errors: above 0 at 5 %",
-            "leaves {of} m more per m of headway, humans {humans} m",
+            "with {it} each metre of headway adds {own} m to the gap, with people {people} m",
             (-0.6, 1.0),
             {
-                WEAKER: "leaves less gap per headway than humans",
-                STRONGER: "leaves more gap per headway than humans",
-                UNLIKE: "leaves less gap per headway than humans",
+                WEAKER: "each metre of headway adds less to its gap than to people's",
+                STRONGER: "each metre of headway adds more to its gap than to people's",
+                UNLIKE: "headway does not add to its gap as to people's",
             },
         ),
         Measure(
             "gap-velocity",
             "Relative velocity leaves the gap as it is (I4)",
-            "gap moved by relative velocity",
+            "gap, by who is faster",
             "m at most",
             GAP.column,
             "HC3 errors: largest difference of predicted gaps within 1 m, two one-sided tests at "
             "5 %; unlike: corrected p of being within below .05",
-            "moves its gap by up to {of} m by relative velocity alone, humans by up to {humans} m",
+            "with {it} who is faster moves the gap by up to {own} m, with people by {people} m",
             (0.0, 3.0),
-            {UNLIKE: "moves its gap by {of} m by relative velocity alone"},
+            {UNLIKE: "who is faster moves its gap by {of} m"},
             margin=1.0,
         ),
         Measure(
@@ -227,13 +231,17 @@ MEASURES = {
             "finished",
             "within 0.5 SD, two one-sided tests at 5 %; unlike: corrected p of being within below "
             ".05",
-            "holds its accelerations {of} human SD more than humans do",
+            "{it} holds its accelerations otherwise than people do, by {own} of their SD",
             (-2.0, 3.0),
-            {UNLIKE: "holds accelerations {more}"},
+            {UNLIKE: "holds accelerations {more} than people"},
             margin=0.5,
         ),
     )
 }
+# Who went first where a state of who goes first is counted.
+FIRST = {"headway": "the one ahead", "velocity": "side by side, the slower one"}
+# What a person sees at once comes first in a headline, what is fitted last.
+SEEN_FIRST = ("collisions", "headway", "velocity", "gap", "gap-headway", "gap-velocity", "held")
 
 
 def by_group(rows: Iterable[Any]) -> dict[str, dict[str, Values]]:
@@ -257,47 +265,71 @@ def sentences(rows: Iterable[Any]) -> list[str]:
     # A study may call its first prompt otherwise.
     models = {n.removesuffix(suffix): of for n, of in judged.items() if n.endswith(suffix)}
     return [
-        " ".join(filter(None, headline(models or judged))),
+        " ".join(filter(None, headline(models or judged, kinds.values()))),
         *(f"{name}: {sentence(of)}" for name, of in groups.items() if kinds[name] != HUMANS),
     ]
 
 
 def sentence(verdicts: Mapping[str, Values]) -> str:
-    """One driver beside the humans in a sentence or a few, of the states of its measures."""
+    """One driver beside people in a few sentences: its crashes, then the states of its measures."""
     if "" in verdicts:
         return f"{capital(verdicts['']['note'])}."
-    state = {name: values.get("state") for name, values in verdicts.items()}
-    parts = {name: _part(values) for name, values in verdicts.items()}
-    if state.get("headway") == state.get("velocity") == SHOWN:
-        parts |= {"headway": "goes first as humans do", "velocity": ""}
-    if _percent(verdicts["collisions"], verdicts["collisions"].get("k") or 0) > MOST_COLLISIONS:
-        parts = {"collisions": parts["collisions"], **parts}
+    parts = [crashes(verdicts["collisions"]), *map(_part, verdicts.values())]
     unclear = [
-        MEASURES[name].label + _between(verdicts[name])
+        MEASURES[name].label
         for name in ("headway", "velocity", "collisions", "gap")
-        if state.get(name) == OPEN
+        if verdicts[name].get("state") == OPEN
     ]
     if unclear:
-        parts["unclear"] = f"{joined(unclear)}: {OPEN}"
-    text = ". ".join(capital(part) for part in parts.values() if part)
-    return f"{text or 'Nothing can be compared with humans'}."
+        parts.append(f"cannot tell yet: {joined(unclear)}")
+    text = ". ".join(capital(part) for part in parts if part)
+    return f"{text or 'Nothing can be compared with people'}."
 
 
 def _part(values: Values) -> str:
+    """What the state of a measure says; empty where it says nothing."""
     says = MEASURES[str(values["measure"])].says.get(str(values.get("state")), "")
     of, humans = (number(values.get(name)) for name in ("estimate", "human"))
-    more = "more" if (values.get("estimate") or 0.0) > 0 else "less"
-    return says.format(of=of, humans=humans, more=more, rate=share(values))
+    counted, people = values.get("counted"), values.get("human_counted")
+    says = says.format(of=of, humans=humans, more=_more(values))
+    if not (says and counted and people):
+        return says
+    return f"{says} ({FIRST[str(values['measure'])]} in {counted} trials, people in {people})"
 
 
-def _between(values: Values) -> str:
-    """Of a rate with undecided trials, what it lies between."""
-    return f" ({share(values)} % of trials)" if values.get("undecided") else ""
+def _more(values: Values) -> str:
+    """In which direction a driver differs from people."""
+    apart = values.get("difference")
+    apart = values.get("estimate") if apart is None else apart
+    return "more" if (apart or 0.0) > 0 else "less"
+
+
+def crashes(values: Values) -> str:
+    """The crashes by the rule that was played, then by the humans' where that says otherwise.
+
+    ``crashed in 15 of 22 trials by the paper's rule; by people's rule 3 are certain, 12 cannot be
+    told; people in 28 of 990``; empty where no trial ended.
+    """
+    k, undecided = values.get("k") or 0, values.get("undecided") or 0
+    ended = (values["n"] or 0) + undecided
+    if not ended:
+        return ""
+    seen = values.get("counted") or f"{k} of {ended}"
+    text = f"crashed in {seen} trials"
+    if undecided or seen != f"{k} of {ended}":
+        text += f" by {values.get('counted_by') or PLAYED_RULES['shared_lane']}"
+        text += f"; by people's rule {k} are certain"
+        text += f", {undecided} cannot be told" if undecided else ""
+    people = values.get("human_counted")
+    if differs(values):
+        than = f" ({people})" if people else ""
+        return f"{text}, {_more(values)} often than people{than}"
+    return f"{text}; people in {people}" if people else text
 
 
 def _percent(collisions: Values, count: int) -> float:
     """So many trials in percent of all that ended, with the undecided ones."""
-    ended = (collisions["n"] or 0) + (collisions.get("undecided") or 0)
+    ended = _ended(collisions)
     return 100 * count / ended if ended else 0.0
 
 
@@ -313,46 +345,86 @@ def differs(values: Values) -> bool:
     return values.get("state") in DIFFERS
 
 
-def headline(drivers: Mapping[str, Mapping[str, Values]]) -> tuple[str, str]:
-    """The answer of language models in two parts: the claim, and what it rests on most.
+def headline(
+    drivers: Mapping[str, Mapping[str, Values]], kinds: Iterable[Any] = ()
+) -> tuple[str, str]:
+    """The answer of language models in two parts: the claim, and what else is seen at once.
 
-    ``drivers`` are those that are judged, by name: no mock model and no program. Of those with
-    too few outcomes it says the counts alone; of several others how many comparisons it rests on.
+    ``drivers`` are those that are judged, by name: no mock model and no program; ``kinds`` are
+    those of all drivers. Of those with too few outcomes it says the counts alone.
     """
     if not drivers:
-        return "No language model is judged here.", ""
+        return _without_models({*kinds}), ""
     compared = {
         name: of for name, of in drivers.items() if any(v.get("state") for v in of.values())
     }
     if not compared:
-        return "No language model can be compared with humans yet.", ""
-    few = [name for name, of in compared.items() if _outcomes(of) < ENOUGH]
-    enough = {name: of for name, of in compared.items() if name not in few}
-    uncertain = _too_few({name: compared[name] for name in few}) if few else ""
+        return "No language model can be compared with people yet.", ""
+    enough = {name: of for name, of in compared.items() if _enough(of)}
+    few = {name: of for name, of in compared.items() if name not in enough}
+    too_few = [_too_few(few, alone=len(drivers) == 1)] if few else []
+    untold = [f"{name} {crashes(of['collisions'])}." for name, of in few.items()]
     if not enough:
-        return uncertain, ""
+        return " ".join(too_few), " ".join(untold)
     claim, because = _likeness(enough, every=len(enough) == len(drivers))
-    return claim, " ".join(filter(None, [because, uncertain]))
+    return claim, " ".join(filter(None, [because, *too_few, *untold]))
+
+
+def _without_models(kinds: set[str]) -> str:
+    """Who drove where no language model did."""
+    if LANGUAGE_MODEL in kinds:
+        return "No language model is judged here."
+    names = {PROGRAM: "programs", MOCK: "scripted stand-ins"}
+    if drove := [name for kind, name in names.items() if kind in kinds]:
+        return f"Only {joined(drove)} drove here; they tell nothing about a language model."
+    return "No language model drove here."
 
 
 def _likeness(drivers: Mapping[str, Mapping[str, Values]], *, every: bool) -> tuple[str, str]:
     """The two parts of a headline on drivers with trials enough; ``every``: there are no others."""
-    unlike = [
-        (name, values) for name, of in drivers.items() for values in filter(differs, of.values())
+    unlike = {name: found for name, of in drivers.items() if (found := _differing(of))}
+    untold = [
+        f"{name} {crashes(of['collisions'])}."
+        for name, of in drivers.items()
+        if of["collisions"].get("undecided")
     ]
-    count = _count(drivers, len(unlike)) if len(drivers) > 1 else ""
+    if len(drivers) > 1:
+        untold.append(_count(drivers))
+    alike = [name for name in drivers if name not in unlike]
     if not unlike:
-        return f"No difference from humans is shown for {joined([*drivers])}.", count
-    name, values = min(unlike, key=lambda one: one[1]["p_holm"])  # the surest one
-    if others := [name for name in drivers if name not in dict(unlike)]:
-        claim = f"No difference from humans is shown for {joined(others)};"
-        return claim, f"but {name} {told(values)}. {count}"
-    if len(drivers) == 1:
-        return f"{name} does not drive like humans:", f"it {told(values)}."
-    claim = "No language model here drives like humans:"
-    if not every:
-        claim = f"{joined([*drivers])} do not drive like humans:"
-    return claim, f"{name} {told(values)}. {count}"
+        return f"No difference from people is shown for {joined(alike)}.", " ".join(untold)
+    name = min(unlike, key=lambda name: _seen_first(unlike[name][0]))
+    worst = unlike[name][0]
+    if len(drivers) == 1 or alike:
+        claim = f"{name} does not drive like people: {told(worst, 'it')}."
+    else:
+        who = "No language model here drives" if every else f"{joined([*drivers])} do not drive"
+        claim = f"{who} like people: {told(worst, name)}."
+    if alike:
+        untold.insert(0, f"No difference from people is shown for {joined(alike)}.")
+    return claim, " ".join(untold)
+
+
+def _seen_first(values: Values) -> tuple[int, float]:
+    """The place of a difference among others: what is seen at once, then what is surest."""
+    return SEEN_FIRST.index(str(values["measure"])), values["p_holm"]
+
+
+def _differing(verdicts: Mapping[str, Values]) -> list[Values]:
+    """The measures in which a driver differs, of most of its trials, what is seen at once first."""
+    unlike = [values for values in verdicts.values() if differs(values) and _most(values, verdicts)]
+    return sorted(unlike, key=_seen_first)
+
+
+def _most(values: Values, verdicts: Mapping[str, Values]) -> bool:
+    """Whether a measure rests on trials enough, and on half of those that ended at least."""
+    n = values["n"] or 0
+    return n >= ENOUGH and 2 * n >= _ended(verdicts["collisions"])
+
+
+def _ended(collisions: Values) -> int:
+    """How many trials ended, with those that are not known to collide by the humans' rule."""
+    return (collisions["n"] or 0) + (collisions.get("undecided") or 0)
 
 
 def _finished(verdicts: Mapping[str, Values]) -> int:
@@ -360,44 +432,54 @@ def _finished(verdicts: Mapping[str, Values]) -> int:
     return verdicts["gap"]["n"] or 0
 
 
-def _outcomes(verdicts: Mapping[str, Values]) -> int:
-    """How many trials finished, or collided by the humans' rule."""
-    return _finished(verdicts) + (verdicts["collisions"].get("k") or 0)
+def _enough(verdicts: Mapping[str, Values]) -> bool:
+    """Whether so many trials finished, or collided by the humans' rule, that a headline may be.
+
+    A driver that differs in measures of too few trials alone is not said to be alike.
+    """
+    outcomes = _finished(verdicts) + (verdicts["collisions"].get("k") or 0)
+    if outcomes < ENOUGH or 2 * outcomes < _ended(verdicts["collisions"]):
+        return False
+    return bool(_differing(verdicts)) or not any(map(differs, verdicts.values()))
 
 
-def _too_few(drivers: Mapping[str, Mapping[str, Values]]) -> str:
-    """How many trials of each driver finished, and that these tell nothing of likeness."""
-    counts = []
-    for name, of in drivers.items():
-        finished = _finished(of)
-        ended = (of["collisions"]["n"] or 0) + (of["collisions"].get("undecided") or 0)
-        trials = "finished trial" if finished == 1 else "finished trials"
-        others = f" of {ended}" if ended > finished else ""
-        counts.append(f"{name}: {finished} {trials}{others}")
-    them = "it drives" if len(counts) == 1 else "they drive"
-    return f"{joined(counts)}, too few to say whether {them} like humans."
+def _too_few(drivers: Mapping[str, Mapping[str, Values]], *, alone: bool) -> str:
+    """How many trials of each driver finished, of those that ended."""
+    counts = [
+        f"{'' if alone else name} {_finished(of)} of {_ended(of['collisions'])}".strip()
+        for name, of in drivers.items()
+    ]
+    return f"Too few trials finished to say: {joined(counts)}."
 
 
-def _count(drivers: Mapping[str, Mapping[str, Values]], unlike: int) -> str:
+def _count(drivers: Mapping[str, Mapping[str, Values]]) -> str:
     """How many comparisons a headline rests on, and how they are corrected."""
-    tested = sum(v.get("p_holm") is not None for of in drivers.values() for v in of.values())
+    every = [values for of in drivers.values() for values in of.values()]
+    tested = sum(values.get("p_holm") is not None for values in every)
     return (
-        f"{unlike} of {tested} comparisons with humans show a difference at 5 %, corrected by Holm "
-        f"within each of {len(drivers)} models."
+        f"{sum(map(differs, every))} of {tested} comparisons with people show a difference at 5 %, "
+        f"corrected by Holm within each of {len(drivers)} models."
     )
 
 
-def told(values: Values) -> str:
-    """The sentence of one difference: ``collides in 68.18 [47.32, 83.64] % ... (n = 22)``.
+def told(values: Values, it: str) -> str:
+    """One difference in counts or metres: ``it crashed in 24 of 110 trials, people in 28 of 990``.
 
-    A driver's interval beside a margin has the level of its row, which is named if not 95 %.
+    Without counts of who goes first it is what the state says. A driver's interval beside a margin
+    has the level of its row, which is named if not 95 %.
     """
     measure = MEASURES[str(values["measure"])]
-    of = with_interval(values["estimate"], values["ci"])
+    own, people = values.get("counted"), values.get("human_counted")
+    if own is None or people is None:
+        if measure.name in {"headway", "velocity"}:
+            return _part(values)
+        own = with_interval(values["estimate"], values["ci"])
+        people = with_interval(values["human"], values["human_ci"])
+        if measure.name == "collisions":
+            own, people = f"{own} % of its", f"{people} %"
     level = values.get("level") if measure.margin is not None and values["ci"] else None
-    own = "" if level is None or f"{level:.4g}" == "95" else f"; its interval at {level:.4g} %"
-    humans = with_interval(values["human"], values["human_ci"])
-    return f"{measure.told.format(of=of, humans=humans)} (n = {values['n']}{own})"
+    at = "" if level is None or f"{level:.4g}" == "95" else f" (interval at {level:.4g} %)"
+    return f"{measure.told.format(it=it, own=own, people=people)}{at}"
 
 
 def with_interval(value: float | None, ci: Sequence[float] | None) -> str:
@@ -426,9 +508,10 @@ def verdict_word(values: Values) -> str:
     if not state:
         return "not judged"
     if name in {"collisions", "gap"} and state != OPEN:
-        more = "more" if (values["difference"] or 0.0) > 0 else "less"
-        return f"{'fewer' if (more, name) == ('less', 'collisions') else more} than humans"
-    return {SHOWN: "as in humans", UNLIKE: "unlike humans"}.get(str(state), str(state))
+        more = _more(values)
+        return f"{'fewer' if (more, name) == ('less', 'collisions') else more} than people"
+    words = {SHOWN: "as in people", UNLIKE: "unlike people", OPEN: "cannot tell yet"}
+    return words.get(str(state), str(state))
 
 
 def joined(items: Sequence[str]) -> str:

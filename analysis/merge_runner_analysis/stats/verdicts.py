@@ -28,7 +28,7 @@ import pandas as pd
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.grouping import Group
-from merge_runner_analysis.metrics import BOXES, GAP
+from merge_runner_analysis.metrics import BOXES, COLLISIONS, GAP
 from merge_runner_analysis.published import (
     HUMAN_GAP_SD_M,
     PAIRS,
@@ -119,6 +119,15 @@ class Both(NamedTuple):
     likeness: Estimate = Estimate()
 
 
+class Counted(NamedTuple):
+    """How many of ``n`` trials went as a measure has it, and the humans' in these conditions."""
+
+    k: int
+    n: int
+    human_k: int
+    human_n: int
+
+
 @dataclass(frozen=True, slots=True)
 class Statistic:
     """How a measure is estimated of a driver and of humans, and tested: if not said, by Welch.
@@ -143,6 +152,7 @@ class Comparison:
     ``difference`` is driver minus humans with its ``interval``, and is None for a measure with a
     margin. ``p`` is corrected over the driver's measures as ``p_holm``. ``level`` is that of the
     interval that the state rests on: of the difference, or of the estimate beside a margin.
+    ``counted`` is what a person sees of it at once.
     """
 
     measure: Measure
@@ -156,6 +166,7 @@ class Comparison:
     p: float | None = None
     p_holm: float | None = None
     detectable: float | None = None
+    counted: Counted | None = None
 
 
 @remembered
@@ -167,6 +178,7 @@ def compared(study: Study, group: Group) -> tuple[Comparison, ...]:
     states, p_holm = decided(tests)
     levels = holm_levels({name: test.p for name, test in tests.items()}, p_holm)
     judgements = judge(fits(alike).firth, fits(alike).hc3, robust=True)
+    seen = counted(both)
     found = []
     for name, measure in MEASURES.items():
         statistic = STATISTICS[name]
@@ -175,7 +187,7 @@ def compared(study: Study, group: Group) -> tuple[Comparison, ...]:
         why = judgements[statistic.indicator].why if statistic.indicator else None
         remarks = own.problem, human.problem, None if own.problem else why
         level = WITHIN_LEVEL if test and test.within else levels.get(name)
-        one = Comparison(measure, own, human, state, remarks, level=level)
+        one = Comparison(measure, own, human, state, remarks, level=level, counted=seen.get(name))
         if test and level is not None:
             ends = test.interval(level)
             one = replace(one, p=test.p, p_holm=p_holm[name], detectable=test.detectable)
@@ -192,6 +204,34 @@ def of_humans(study: Study) -> dict[str, Estimate]:
     """The humans by measure, over all conditions."""
     both = Both(study.human, study.human)
     return {name: statistic.human(both) for name, statistic in STATISTICS.items()}
+
+
+def counted(both: Both) -> dict[str, Counted]:
+    """What a person counts, by measure; nothing is counted where no trial could go so.
+
+    Crashes by the rule that was played, the humans' by theirs. Who goes first: the one ahead, and
+    where neither is, the slower one.
+    """
+    played = both.human.outcomes["condition"].isin(both.group.ended["condition"])
+    humans = both.human.outcomes[played]
+    crashes = (
+        counts(both.group, COLLISIONS),
+        counts(replace(both.human, published_outcomes=humans), BOXES),
+    )
+    found = {"collisions": crashes} | {
+        name: (_went_first(both.group.trials, name), _went_first(humans, name))
+        for name in ("headway", "velocity")
+    }
+    return {name: Counted(*own, *human) for name, (own, human) in found.items() if own[1]}
+
+
+def _went_first(outcomes: pd.DataFrame, measure: str) -> tuple[int, int]:
+    """In how many trials the one ahead, or side by side the slower one, went first, of how many."""
+    headway, velocity = (np.sign(outcomes[name]) for name in CONDITION)
+    expected = headway if measure == "headway" else -velocity.where(headway == 0, 0)
+    first = outcomes["merged_first"].map({"left": 1, "right": -1})
+    there = first.notna() & (expected != 0)
+    return int((first == expected)[there].sum()), int(there.sum())
 
 
 def in_human_conditions(group: Group) -> Group:

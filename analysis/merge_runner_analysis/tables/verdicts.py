@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from merge_runner.config import ScenarioConfig
 from merge_runner.records import SIDES
 from merge_runner_analysis.drivers import language_models
 from merge_runner_analysis.grouping import Group
@@ -21,6 +22,7 @@ from merge_runner_analysis.wording import (
     LANGUAGE_MODEL,
     MEASURES,
     MOCK,
+    PLAYED_RULES,
     PROGRAM,
     TABLE,
     note_of,
@@ -47,6 +49,9 @@ VERDICT_COLUMNS = (
     Optional("detectable", "detectable", "number", 2, "smallest difference found with power .8"),
     Optional("state", "verdict", meaning="what is shown"),
     Optional("rule", "rule", meaning="how the verdict is set", noted=True),
+    Optional("counted", "counted", meaning="trials that went so, of those that could", noted=True),
+    Optional("counted_by", "by", meaning="collision rule that was played", noted=True),
+    Optional("human_counted", "humans", meaning="the humans' in its conditions", noted=True),
 )
 
 
@@ -55,7 +60,8 @@ def verdicts(study: Study) -> Table:
     rows = [] if study.human not in study.groups else [*_human_rows(study)]
     for group in study.models:
         if not group.caution:
-            rows += [_compared(group, _kind(study, group), one) for one in compared(study, group)]
+            kind, by = _kind(study, group), _played_rule(study, group)
+            rows += [_compared(group, kind, one, by) for one in compared(study, group)]
     rows += [
         Row(group.id, (group.id,), _driver(group, _kind(study, group)), group.unjudged)
         for group in study.unjudged
@@ -101,7 +107,13 @@ def _driver(group: Group, kind: str) -> dict[str, Value]:
     return {"driver": group.label, "setting": group.setting, "kind": kind}
 
 
-def _compared(group: Group, kind: str, found: Comparison) -> Row:
+def _played_rule(study: Study, group: Group) -> str:
+    """The collision rule of a group's scenario, as sentences name it."""
+    scenario = study.frames.specs.get(group.spec_hash, {}).get("scenario", {})
+    return PLAYED_RULES[ScenarioConfig.model_validate(scenario).collision_rule]
+
+
+def _compared(group: Group, kind: str, found: Comparison, played_rule: str) -> Row:
     measure = found.measure
     values: dict[str, Value] = _driver(group, kind) | {
         "measure": measure.name,
@@ -117,6 +129,10 @@ def _compared(group: Group, kind: str, found: Comparison) -> Row:
         "state": found.state or None,
         "rule": measure.rule,
     }
+    if seen := found.counted:
+        values["counted"] = f"{seen.k} of {seen.n}"
+        values["human_counted"] = f"{seen.human_k} of {seen.human_n}"
+        values["counted_by"] = played_rule if measure.rests_on == BOXES.column else None
     note = note_of(*found.remarks)
     return Row(f"{group.id}/{measure.name}", (group.id,), values, note, measure.rests_on)
 

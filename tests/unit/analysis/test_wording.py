@@ -1,94 +1,163 @@
 """The sentences that verdicts are told in, of rows made by hand."""
 
-import pytest
+import re
 
-from merge_runner_analysis.wording import headline, sentence, told
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from merge_runner_analysis.wording import (
+    DIFFERS,
+    MEASURES,
+    OPEN,
+    SHOWN,
+    crashes,
+    headline,
+    sentence,
+    told,
+)
+
+PEOPLE = {"headway": "675 of 704", "velocity": "158 of 173", "collisions": "28 of 990"}
+# What says that a driver differs from people, and in which direction.
+DIRECTION = re.compile(
+    r"\b(more|less|fewer|larger|smaller|otherwise)\b|does not (drive|yield|decide|add)|moves"
+)
 
 
 def row(measure, state="shown", *, n=110, p_holm=0.5, estimate=1.0, ci=(0.5, 1.5), **others):
     return {"measure": measure, "state": state, "n": n, "p_holm": p_holm, "estimate": estimate,
-            "ci": ci, "human": 2.0, "human_ci": None, **others}  # fmt: skip
+            "ci": ci, "human": 2.0, "human_ci": None, "difference": -1.0, **others}  # fmt: skip
 
 
 def driver(finished=110, *, collided=0, undecided=None, **states):
     """The rows of a driver by measure, which have these states or are as in humans."""
     n = finished + collided
     rows = {
-        "headway": row("headway", n=n),
-        "velocity": row("velocity", n=n),
+        "headway": row("headway", n=n, counted="75 of 78"),
+        "velocity": row("velocity", n=n, counted="16 of 19"),
         "collisions": row("collisions", "inconclusive", n=n, k=collided, undecided=undecided),
         "gap": row("gap", "inconclusive", n=finished),
     }
+    raw = f"{collided + (undecided or 0)} of {n + (undecided or 0)}"
+    rows["collisions"] |= {"counted": raw, "counted_by": "the paper's rule"}
+    for name, people in PEOPLE.items():
+        rows[name] |= {"human_counted": people}
     for place, (name, state) in enumerate(states.items(), 1):
         rows[name] |= {"state": state, "p_holm": place / 1000}
     return rows
 
 
-WILD = driver(collisions="unlike", gap="unlike", collided=10)
+WILD = driver(86, collisions="unlike", gap="unlike", collided=24)
 
 
 @pytest.mark.parametrize(
     ("drivers", "claim", "because"),
     [
-        ({}, "No language model is judged here.", ""),
+        ({}, "No language model drove here.", ""),
         (
             {"gpt": {"gap": row("gap", None)}},
-            "No language model can be compared with humans yet.",
+            "No language model can be compared with people yet.",
             "",
         ),
         (
             {"wild": WILD},
-            "wild does not drive like humans:",
-            "it collides in 1.00 [0.50, 1.50] % of trials, humans in 2.00 % (n = 120).",
+            "wild does not drive like people: it crashed in 24 of 110 trials, people in 28 of 990.",
+            "",
         ),
-        ({"o3": driver()}, "No difference from humans is shown for o3.", ""),
+        ({"o3": driver()}, "No difference from people is shown for o3.", ""),
+        (
+            {"o3": driver(headway="weaker", gap="unlike")},
+            "o3 does not drive like people: with it the one ahead went first in 75 of 78 trials, "
+            "with people in 675 of 704.",
+            "",
+        ),
+        (
+            {"o3": driver(gap="unlike", undecided=33)},
+            "o3 does not drive like people: it left 1.00 [0.50, 1.50] m at the merge point, people "
+            "2.00 m.",
+            "o3 crashed in 33 of 143 trials by the paper's rule; by people's rule 0 are certain, "
+            "33 cannot be told; people in 28 of 990.",
+        ),
         (
             {"o3": driver(), "wild": WILD},
-            "No difference from humans is shown for o3;",
-            "but wild collides in 1.00 [0.50, 1.50] % of trials, humans in 2.00 % (n = 120). 2 of "
-            "8 comparisons with humans show a difference at 5 %, corrected by Holm within each of "
-            "2 models.",
+            "wild does not drive like people: it crashed in 24 of 110 trials, people in 28 of 990.",
+            "No difference from people is shown for o3. 2 of 8 comparisons with people show a "
+            "difference at 5 %, corrected by Holm within each of 2 models.",
         ),
     ],
 )
-def test_a_headline_says_the_surest_difference_and_how_many_comparisons_it_rests_on(
-    drivers, claim, because
-):
+def test_a_headline_says_what_a_person_sees_at_once_in_counts_and_metres(drivers, claim, because):
     assert headline(drivers) == (claim, because)
+
+
+@pytest.mark.parametrize(
+    ("kinds", "says"),
+    [
+        (["language model", "mock"], "No language model is judged here."),
+        (["humans", "mock"], "Only scripted stand-ins drove here; they tell nothing about"),
+        (["program", "mock"], "Only programs and scripted stand-ins drove here; they tell"),
+    ],
+)
+def test_where_no_language_model_drove_the_headline_says_who_did(kinds, says):
+    assert headline({}, kinds)[0].startswith(says)
 
 
 @pytest.mark.parametrize(
     ("of", "counts"),
     [
-        (driver(0, undecided=11), "0 finished trials of 11"),
-        (driver(1), "1 finished trial"),
-        (driver(7, undecided=15), "7 finished trials of 22"),
-        (driver(19), "19 finished trials"),
-        (driver(7, undecided=12, collided=3), "7 finished trials of 22"),
+        (driver(0, undecided=11), "0 of 11"),
+        (driver(1), "1 of 1"),
+        (driver(7, undecided=15), "7 of 22"),
+        (driver(19), "19 of 19"),
+        (driver(7, undecided=12, collided=3), "7 of 22"),
+        (driver(50, undecided=60, gap="unlike"), "50 of 110"),
+        (driver(19, collided=91, gap="unlike"), "19 of 110"),
     ],
 )
 def test_of_few_outcomes_a_headline_says_the_counts_alone(of, counts):
-    rest = "too few to say whether it drives like humans."
-    assert headline({"gpt": of}) == (f"gpt: {counts}, {rest}", "")
+    claim, because = headline({"gpt": of})
+    assert claim == f"Too few trials finished to say: {counts}."
+    assert because == f"gpt {crashes(of['collisions'])}."
     claim, because = headline({"wild": WILD, "gpt": of})
-    assert claim == "wild does not drive like humans:"
-    assert because == f"{headline({'wild': WILD})[1]} gpt: {counts}, {rest}"
+    assert claim == headline({"wild": WILD})[0]
+    assert because == (
+        f"Too few trials finished to say: gpt {counts}. gpt {crashes(of['collisions'])}."
+    )
 
 
 @pytest.mark.parametrize("of", [(20, 0), (16, 4), (0, 20)])
 def test_who_collides_has_an_outcome_too(of):
-    claim, _ = headline({"gpt": driver(of[0], collided=of[1], gap="unlike")})
-    assert claim == "gpt does not drive like humans:"
+    claim, _ = headline({"gpt": driver(of[0], collided=of[1], collisions="unlike")})
+    assert claim.startswith("gpt does not drive like people: it crashed in")
 
 
 def test_several_drivers_are_told_together():
     few = {"gpt": driver(7, undecided=15), "o4": driver(2)}
-    assert headline(few)[0] == (
-        "gpt: 7 finished trials of 22 and o4: 2 finished trials, too few to say whether they drive "
-        "like humans."
-    )
-    assert headline({"a": WILD, "b": WILD})[0] == "No language model here drives like humans:"
-    assert headline({"a": WILD, "b": WILD, **few})[0] == "a and b do not drive like humans:"
+    assert headline(few)[0] == "Too few trials finished to say: gpt 7 of 22 and o4 2 of 2."
+    both = {"a": WILD, "b": WILD}
+    crashed = "like people: a crashed in 24 of 110 trials, people in 28 of 990."
+    assert headline(both)[0] == f"No language model here drives {crashed}"
+    assert headline({**both, **few})[0] == f"a and b do not drive {crashed}"
+
+
+@pytest.mark.parametrize(
+    ("of", "says"),
+    [
+        (driver(95, collided=15), "crashed in 15 of 110 trials; people in 28 of 990"),
+        (
+            driver(7, collided=3, undecided=12),
+            "crashed in 15 of 22 trials by the paper's rule; by people's rule 3 are certain, 12 "
+            "cannot be told; people in 28 of 990",
+        ),
+        (
+            driver(109, collided=1, collisions="unlike"),
+            "crashed in 1 of 110 trials, less often than people (28 of 990)",
+        ),
+        (driver(0), ""),
+    ],
+)
+def test_crashes_are_said_raw_then_by_the_humans_rule(of, says):
+    assert crashes(of["collisions"]) == says
 
 
 @pytest.mark.parametrize("measure", ["gap-velocity", "held"])
@@ -99,27 +168,61 @@ def test_several_drivers_are_told_together():
 def test_an_interval_beside_a_margin_names_its_level_where_that_is_not_95_percent(
     measure, level, said
 ):
-    own = f"; its interval at {said} %" if said else ""
-    assert told(row(measure, n=14, level=level)).endswith(f"(n = 14{own})")
-    assert told(row("gap", n=14, level=level)).endswith("(n = 14)")
+    text = told(row(measure, n=14, level=level), "it")
+    assert ("interval at" in text) == bool(said)
+    assert not said or text.endswith(f"(interval at {said} %)")
+    assert "interval at" not in told(row("gap", n=14, level=level), "it")
 
 
 @pytest.mark.parametrize(
     ("of", "says"),
     [
-        (driver(), "Goes first as humans do. Collisions and mean gap: inconclusive."),
+        (
+            driver(),
+            "Crashed in 0 of 110 trials; people in 28 of 990. The one ahead goes first, as with "
+            "people (the one ahead in 75 of 78 trials, people in 675 of 704). The faster one "
+            "yields, as with people (side by side, the slower one in 16 of 19 trials, people in "
+            "158 of 173). Cannot tell yet: crashes and mean gap.",
+        ),
         (
             driver(headway="weaker"),
-            "Goes first by headway less than humans. When faster, yields as",
+            "Who goes first depends less on who is ahead than with people (the one ahead in 75 of",
         ),
-        (driver(velocity="unlike"), "When faster, does not yield as humans do. "),
-        (driver(50, collided=50, collisions="unlike"), "Collides in 50.00 % of trials"),
-        (
-            driver(2, collided=1, undecided=1),
-            "ions (25.00 to 50.00 % of trials) and mean gap: inco",
-        ),
+        (driver(velocity="unlike"), "The faster one does not yield, as it does with people ("),
+        (driver(gap="unlike"), "Leaves 1.00 m at the merge point, less than people (2.00 m)"),
+        (driver(50, collided=50, collisions="unlike"), "Crashed in 50 of 100 trials, less often"),
         ({"": {"note": "not judged: why"}}, "Not judged: why."),
     ],
 )
 def test_a_sentence_tells_the_states_of_the_rows(of, says):
     assert says in sentence(of)
+
+
+@st.composite
+def any_driver(draw):
+    """The rows of a driver with states as their corrected p and their own tests set them."""
+    finished, collided = draw(st.integers(0, 90)), draw(st.integers(0, 90))
+    rows = driver(finished, collided=collided, undecided=draw(st.integers(0, 30)) or None)
+    for name, measure in MEASURES.items():
+        p_holm = draw(st.floats(0, 1))
+        own = [SHOWN] if measure.trait.endswith(")") else [OPEN]
+        states = sorted(DIFFERS) if p_holm < 0.05 else [*own, OPEN]
+        if name in {"collisions", "gap"}:
+            states = ["unlike"] if p_holm < 0.05 else [OPEN]
+        values = rows.get(name, row(name, n=finished))
+        of = {"p_holm": p_holm, "state": draw(st.sampled_from(states))}
+        of |= {"estimate": draw(st.floats(-5, 5)), "difference": draw(st.floats(-5, 5))}
+        rows[name] = {**values, **of}
+    return rows
+
+
+@given(any_driver())
+def test_no_sentence_claims_a_direction_that_the_corrected_p_does_not_carry(of):
+    carried = [name for name, values in of.items() if values["p_holm"] < 0.05]
+    texts = [sentence(of), " ".join(headline({"gpt": of}))]
+    if not carried:
+        assert not any(map(DIRECTION.search, texts)), texts
+    assert "log-odds" not in " ".join(texts)
+    for name in {*of} - {*carried}:
+        alone = {**of, **{one: {**of[one], "state": OPEN, "p_holm": 1.0} for one in carried}}
+        assert not DIRECTION.search(sentence({**alone, name: of[name]}))

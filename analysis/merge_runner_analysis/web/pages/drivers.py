@@ -93,7 +93,7 @@ def _summary(own: Driver) -> str:
     shown = sum(state in {SHOWN, *DIFFERS} - {UNLIKE} for state in traits)
     return (
         f"{shown} of {len(traits)} human traits shown; "
-        f"{[*states.values()].count(OPEN)} of {len(states)} measures inconclusive."
+        f"{[*states.values()].count(OPEN)} of {len(states)} measures cannot be told yet."
     )
 
 
