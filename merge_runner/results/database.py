@@ -304,7 +304,8 @@ def names_of(result: duckdb.DuckDBPyConnection) -> list[str]:
 
 def by_name(result: duckdb.DuckDBPyConnection) -> Iterator[dict[str, Any]]:
     """The rows of a result, each by the names of its columns."""
-    return (dict(zip(names_of(result), row, strict=True)) for row in result.fetchall())
+    names = names_of(result)
+    return (dict(zip(names, row, strict=True)) for row in result.fetchall())
 
 
 def append(

@@ -9,9 +9,8 @@ import shutil
 import tempfile
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Sequence
-from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from fnmatch import fnmatchcase
 from functools import cache, lru_cache
 from html import escape
@@ -31,9 +30,9 @@ from merge_runner_analysis.web.guard import LOOPBACK
 from merge_runner_analysis.web.leaks import refuse_leaks
 from merge_runner_analysis.web.listing import FACTOR
 from merge_runner_analysis.web.offline import linked, page_of_trials, site_of_a_page
-from merge_runner_analysis.web.pages.trial import trial_page
+from merge_runner_analysis.web.pages.trial import READ_AT_ONCE, trial_pages
 from merge_runner_analysis.web.reading import Row
-from merge_runner_analysis.web.site import SCOPE, NotThere, Site
+from merge_runner_analysis.web.site import SCOPE, Site
 from merge_runner_analysis.web.urls import Links, query_of
 
 MOST = 1_000  # trials of drivers; of humans there are at most 990
@@ -48,7 +47,7 @@ FOLLOWED: dict[str, Collection[str]] = {
     "discordant": ("model", "variant"),
 }
 OF_TRIALS = ("trials", "glossary")
-OF_A_TRIAL, MOST_HELPERS = "/trials/", 4
+MOST_HELPERS = 4
 MOMENT = ("side", "decision")  # the script of a trial's page reads these
 POLICY = (
     "default-src 'none'; script-src 'self' file:; style-src 'self' file:; "
@@ -57,7 +56,7 @@ POLICY = (
 HTML = b"<!doctype html"
 OURS = f'{HTML.decode()}>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'.encode()
 INDEX, FILES = "index.html", "files"
-MARK = "\0"  # stands before and after an address until its file is known
+MARK = "\0"  # stands before and after the address of a page until its file is known
 _ODD = re.compile(r"[^A-Za-z0-9_.]+")
 LONGEST_NAME = 120
 
@@ -87,7 +86,7 @@ def export_folder(
         if wanted:
             site.catalogue.keep([row["number"] for row in rows])
         try:
-            asyncio.run(_crawl(site, begin, heads, stage, told))
+            asyncio.run(_crawl(site, rows, begin, heads, stage, told))
         except BrokenProcessPool:
             raise UsageError("nothing was written: a process that helped was ended") from None
     return index
@@ -105,53 +104,72 @@ def export_page(db: Path, file: Path, wanted: Sequence[str]) -> Path:
 
 
 async def _crawl(
-    site: Site, begin: str, heads: tuple[str, ...], stage: Path, told: Callable[[int], object]
+    site: Site,
+    rows: Sequence[Row],
+    begin: str,
+    heads: tuple[str, ...],
+    stage: Path,
+    told: Callable[[int], object],
 ) -> None:
-    """Save the pages to which links lead."""
+    """Save the pages to which links lead, and those of all trials."""
     files, waiting = {begin: INDEX}, deque([begin])
-    names = {INDEX}
-    # Most pages are of trials, and most of the time they are what is waited for.
-    rendering: dict[str, Future[str]] = {}
-    helpers = processes(min(os.cpu_count() or 1, MOST_HELPERS))
+    names, done = {INDEX}, count(1)
     transport = httpx.ASGITransport(explorer(site), raise_app_exceptions=False)
     plain = {"accept-encoding": "identity"}
     client = httpx.AsyncClient(transport=transport, base_url=f"http://{LOOPBACK}", headers=plain)
 
-    async def file_of(address: str) -> str:
-        """Return the file of an address, with the moment that it shows; empty for none."""
-        page, moment = _page_of(address, heads)
-        if page not in files:
-            files[page] = name = _name_of(page, names)
-            names.add(name.lower())
-            if page.startswith(OF_A_TRIAL):
-                rendering[page] = helpers.submit(_trial_page, site.db, heads, page)
-            elif name.endswith(".html"):
-                waiting.append(page)
-            else:  # a style, a script, a table; a figure that cannot be drawn has no file
-                file = await client.get(page)
-                files[page] = "" if file.is_error else name
-                if not file.is_error:
-                    refuse_leaks(site.db, name, file.text)
-                    (stage / name).parent.mkdir(parents=True, exist_ok=True)
-                    (stage / name).write_bytes(file.content)
-        return files[page] and files[page] + moment
+    def named(page: str) -> str:
+        """Return the file of a page that has none yet."""
+        files[page] = name = _name_of(page, names)
+        names.add(name.lower())
+        return name
 
+    async def file_of(page: str) -> str:
+        """Return the file of a page; empty for none."""
+        if page in files:
+            return files[page]
+        name = named(page)
+        if name.endswith(".html"):
+            waiting.append(page)
+            return name
+        # A style, a script, a table; a figure that cannot be drawn has no file.
+        file = await client.get(page)
+        if file.is_error:
+            files[page] = ""
+        else:
+            refuse_leaks(site.db, name, file.text)
+            (stage / name).parent.mkdir(parents=True, exist_ok=True)
+            (stage / name).write_bytes(file.content)
+        return files[page]
+
+    async def save(page: str, text: str) -> None:
+        refuse_leaks(site.db, files[page], text)
+        root = "" if page == begin else "../"
+        parts = text.split(MARK)
+        for place in range(1, len(parts), 2):
+            file = await file_of(parts[place])
+            parts[place] = escape(root + file) if file else ""
+        (stage / files[page]).parent.mkdir(exist_ok=True)
+        (stage / files[page]).write_text(linked("".join(parts)), encoding="utf-8")
+        told(next(done))
+
+    for row in rows:
+        named(Links().trial(row))
+    helpers = processes(min(os.cpu_count() or 1, MOST_HELPERS))
     with ExitStack() as ends:
         ends.callback(helpers.shutdown, cancel_futures=True)
+        # Most pages are of trials, and most of the time they are what is waited for.
+        rendering = deque(
+            helpers.submit(_trial_pages, site.db, heads, rows[first : first + READ_AT_ONCE])
+            for first in range(0, len(rows), READ_AT_ONCE)
+        )
         while waiting or rendering:
-            page = next(iter(rendering), "")
-            if waiting and not (page and rendering[page].done()):
+            if rendering and (rendering[0].done() or not waiting):
+                for page, text in (await asyncio.wrap_future(rendering.popleft())).items():
+                    await save(page, text)
+            else:
                 page = waiting.popleft()
-            text = await asyncio.wrap_future(rendering.pop(page)) if page in rendering else ""
-            text = text or await _served(client, page)
-            refuse_leaks(site.db, files[page], text)
-            root = "" if page == begin else "../"
-            parts = text.split(MARK)
-            for place in range(1, len(parts), 2):
-                file = await file_of(parts[place])
-                parts[place] = escape(root + file) if file else ""
-            (stage / files[page]).write_text(linked("".join(parts)), encoding="utf-8")
-            told(len(files) - len(waiting) - len(rendering))
+                await save(page, await _served(client, page))
 
 
 async def _served(client: httpx.AsyncClient, address: str) -> str:
@@ -169,8 +187,9 @@ def _links(heads: tuple[str, ...]) -> Links:
     """Return links to the pages of an export, between marks: the crawl puts a file for each."""
 
     def leads(address: str) -> str:
+        page, moment = _page_of(address, heads)
         # Markup, so that the marks stay; no page holds this character otherwise.
-        return Markup(f"{MARK}{address}{MARK}") if _page_of(address, heads)[0] else ""  # noqa: S704
+        return Markup(f"{MARK}{page}{MARK}") + moment if page else ""  # noqa: S704
 
     return Links(leads)
 
@@ -184,13 +203,9 @@ def _still(db: Path, heads: tuple[str, ...]) -> Site:
     return site
 
 
-def _trial_page(db: Path, heads: tuple[str, ...], page: str) -> str:
-    """Return the page of a trial; empty where it is not there."""
-    parts = urlsplit(page)
-    name = unquote(parts.path.removeprefix(OF_A_TRIAL))
-    with suppress(NotThere):
-        return trial_page(_still(db, heads), name, dict(parse_qsl(parts.query)))
-    return ""
+def _trial_pages(db: Path, heads: tuple[str, ...], rows: Sequence[Row]) -> dict[str, str]:
+    """Return the pages of trials by their addresses."""
+    return dict(zip(map(Links().trial, rows), trial_pages(_still(db, heads), rows), strict=True))
 
 
 @cache  # pages link to each other

@@ -9,7 +9,7 @@ from urllib.parse import parse_qsl, unquote, urlsplit
 from markupsafe import Markup
 
 from merge_runner_analysis.web.leaks import refuse_leaks
-from merge_runner_analysis.web.pages.trial import trial_page
+from merge_runner_analysis.web.pages.trial import trial_pages
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.rendering import STYLES, inlined_texts, policy_of
 from merge_runner_analysis.web.site import REPLAY, Site
@@ -39,9 +39,7 @@ def site_of_a_page(db: Path, held: Collection[tuple[str, str]]) -> Site:
 def page_of_trials(site: Site, rows: Sequence[Row]) -> str:
     """Return one page with trials; raises UsageError."""
     template = "trial.html" if len(rows) == 1 else "_trial.html"
-    pages = [
-        trial_page(site, row["trial_id"], {"spec": row["spec_hash"]}, template) for row in rows
-    ]
+    pages = list(trial_pages(site, rows, template))
     page = pages[0]
     if len(rows) > 1:
         # Rendered by templates of ours.

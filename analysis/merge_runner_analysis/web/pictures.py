@@ -11,6 +11,7 @@ from math import ceil, floor
 
 from merge_runner.records import SIDES
 from merge_runner_analysis.web.reading import Row
+from merge_runner_analysis.wording import MINUS
 
 SPARK_WIDTH, SPARK_HEIGHT = 96.0, 22.0
 
@@ -65,7 +66,11 @@ def _spark_points(values: Sequence[float], speeds: tuple[int, int]) -> str:
 
 def step_points(values: Sequence[float], width: float, height: float, steps: int) -> str:
     """Points of a step line from -1 to 1, ``steps`` across the width."""
-    x, y = Scale(0, max(steps, 1), 0, width), Scale(-1, 1, height, 0)
-    return " ".join(
-        [f"{x(i):.1f},{y(v):.1f} {x(i + 1):.1f},{y(v):.1f}" for i, v in enumerate(values)]
-    )
+    across = [f"{width * min(i, steps) / steps:.1f}" for i in range(len(values) + 1)]
+    down = [f"{height - height * (min(max(v, -1), 1) + 1) / 2:.1f}" for v in values]
+    return " ".join([f"{across[i]},{y} {across[i + 1]},{y}" for i, y in enumerate(down)])
+
+
+def accelerations(values: Sequence[float], most_mps2: float) -> str:
+    """The accelerations of a plan in m/s², one after another."""
+    return "".join([f"{value * most_mps2:+.2f} " for value in values]).replace("-", MINUS)

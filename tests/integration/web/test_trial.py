@@ -13,7 +13,7 @@ from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner_analysis.humans.archive import open_files
 from merge_runner_analysis.humans.load import import_trials, sort_files
 from merge_runner_analysis.web.reading import reading
-from merge_runner_analysis.web.trial.reader import read_trial
+from merge_runner_analysis.web.trial.reader import read_trials
 from merge_runner_analysis.web.trial.replay import collision_bounds, plan_chart
 from tests.support import recordings
 from tests.support.cases import table
@@ -93,7 +93,7 @@ def test_the_band_of_the_chart_holds_the_headways_that_collide(tmp_path, rule, w
     db = write_study(tmp_path / "t.duckdb", [MEETING, PASSING], scenario)
     assert words in Page(client_of(db).get(f"/trials/{TRIAL}").text).text
     with reading(db) as connection:
-        trial = read_trial(connection, "o3/baseline/N_0_0/rep02", "o3-baseline")
+        (trial,) = read_trials(connection, [("o3/baseline/N_0_0/rep02", "o3-baseline")])
     bounds = collision_bounds(trial)
     places = zip(*(samples["position_m"] for samples in trial.states.values()), strict=True)
     for bound, (left, right) in zip(bounds, places, strict=True):
@@ -126,7 +126,7 @@ def test_beside_humans_who_say_nothing_stands_what_was_measured_from_control_on(
         "JOIN trial_metrics USING (trial_id, spec_hash) ORDER BY ALL",
     )[1]
     with reading(humans) as connection:
-        samples = read_trial(connection, name, spec).states["left"]
+        samples = read_trials(connection, [(name, spec)])[0].states["left"]
     times, accelerations = samples["time_s"], samples["acceleration_mps2"]
     assert min(accelerations) == pytest.approx(-20, abs=0.1)
     own = [a for t, a in zip(times, accelerations, strict=True) if t > 0]

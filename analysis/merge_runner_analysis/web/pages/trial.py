@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from operator import itemgetter
 from typing import Any
@@ -15,11 +15,11 @@ from merge_runner.served_model import Pair
 from merge_runner.text_safety import quoted
 from merge_runner_analysis.web.display_text import clamped, shortened, visible
 from merge_runner_analysis.web.phrases import block_meaning
-from merge_runner_analysis.web.pictures import step_points
+from merge_runner_analysis.web.pictures import accelerations, step_points
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.site import REPLAY, NotThere, Site
 from merge_runner_analysis.web.trial.prompt_parts import parts_of
-from merge_runner_analysis.web.trial.reader import Trial, read_trial
+from merge_runner_analysis.web.trial.reader import Trial, read_trials
 from merge_runner_analysis.web.trial.replay import VIEW_BOX, account_of, plan_chart, replay_data
 from merge_runner_analysis.web.trial.sentences import facts, judged_text, outcome_text, summary
 
@@ -32,7 +32,7 @@ OFFERS = {
 }
 REPLY = "select max_by(reply, attempt) as reply from calls where call_key = '{}'"
 SAMPLES = "from states where trial_id = {} and spec_hash = {} order by step, side"
-FOUND = 12
+FOUND, READ_AT_ONCE = 12, 20
 # An address calls a trial by its name, and by its spec where that name has several.
 NAMED = """
 SELECT trial_id || if(count(*) OVER (PARTITION BY trial_id) = 1, '', '@' || spec_hash) AS key,
@@ -64,7 +64,19 @@ def trial_page(
     site: Site, trial_id: str, asked: Mapping[str, str], template: str = "trial.html"
 ) -> str:
     """Return a trial with all of its decisions, as a page or by another template."""
-    row, trial = found(site, trial_id, asked)
+    (page,) = trial_pages(site, [site.trial(trial_id, asked.get("spec", ""))], template)
+    return page
+
+
+def trial_pages(site: Site, rows: Sequence[Row], template: str = "trial.html") -> Iterator[str]:
+    """Return the pages of trials, of which some are read at once."""
+    for begin in range(0, len(rows), READ_AT_ONCE):
+        some = rows[begin : begin + READ_AT_ONCE]
+        for row, trial in zip(some, read(site, some), strict=True):
+            yield _page(site, row, trial, template)
+
+
+def _page(site: Site, row: Row, trial: Trial, template: str) -> str:
     account = account_of(row, trial)
     return site.render(
         template,
@@ -92,16 +104,10 @@ def trial_page(
     )
 
 
-def found(site: Site, trial_id: str, asked: Mapping[str, str]) -> tuple[Row, Trial]:
-    """The trial that an address names, with what was stored of it; raises NotThere."""
-    row = site.trial(trial_id, asked.get("spec", ""))
-    return row, read(site, row)
-
-
-def read(site: Site, row: Row) -> Trial:
-    """What was stored of a trial."""
+def read(site: Site, rows: Sequence[Row]) -> list[Trial]:
+    """What was stored of trials."""
     with site.catalogue.cursor() as connection:
-        return read_trial(connection, row["trial_id"], row["spec_hash"])
+        return read_trials(connection, [(row["trial_id"], row["spec_hash"]) for row in rows])
 
 
 def panels(site: Site, row: Row, trial: Trial) -> list[Markup]:
@@ -116,6 +122,8 @@ def decision_panel(
 ) -> Markup:
     """What a driver was told, said, planned and did; ``others`` are answers of another model."""
     named = {"side": decision["side"], "decision": decision["decision"]}
+    query = REPLY.format(decision["call_key"])
+    raw = site.at.to("sql.csv", q=query) if site.at.served else ""
     before = decision["before"]
     thoughts = ""
     with suppress(*DAMAGED):  # a reply of a server that failed is any text
@@ -132,9 +140,10 @@ def decision_panel(
         others=others,
         reply=shortened(decision["reply"]) if decision["reply"] else None,
         reasoning=shortened(thoughts) if thoughts else None,
-        raw=site.at.to("sql.csv", q=REPLY.format(decision["call_key"])),
+        raw=raw,
         chart=plan_chart(decision, trial),
         points=step_points,
+        accelerations=accelerations,
     )
     return Markup(panel)  # noqa: S704 # rendered by a template of ours, which escapes
 
@@ -174,7 +183,7 @@ def named(site: Site, key: str) -> Row | None:
 
 
 def _laid(site: Site, row: Row) -> dict[str, Any] | None:
-    trial = read(site, row)
+    (trial,) = read(site, [row])
     if not trial.states:
         return None
     return {

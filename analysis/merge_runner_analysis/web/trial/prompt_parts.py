@@ -84,7 +84,11 @@ def _compared(before: str, now: str) -> tuple[tuple[Change, str], ...]:
     if before == now:
         return (("same", now),)
     old, new = _WORDS.findall(before), _WORDS.findall(now)
-    pieces: list[tuple[Change, str]] = []
+    # Most of a prompt is as before: its beginning need not be searched.
+    pairs = enumerate(zip(old, new, strict=False))
+    begin = next((i for i, (a, b) in pairs if a != b), min(len(old), len(new)))
+    pieces: list[tuple[Change, str]] = [("same", "".join(new[:begin]))] if begin else []
+    old, new = old[begin:], new[begin:]
     for kind, i1, i2, j1, j2 in SequenceMatcher(None, old, new).get_opcodes():
         if kind != "equal" and i1 < i2:
             pieces.append(("gone", "".join(old[i1:i2]).strip()))

@@ -1,9 +1,10 @@
-"""One trial as it is read: its samples, its decisions with their calls, and its task."""
+"""Trials as they are read: their samples, their decisions with their calls, and their tasks."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,19 +16,21 @@ from merge_runner.records import SIDES, Side
 from merge_runner.results.database import by_name, names_of
 from merge_runner_analysis.web.reading import Row, records
 
-ONE = "WHERE trial_id = $trial AND spec_hash = $spec"
+Key = tuple[str, str]
+"""The name of a trial, and its spec."""
+OF_THEM = "WHERE (trial_id, spec_hash) IN (SELECT unnest($trials), unnest($specs))"
 STATES = f"""
-SELECT side, list(time_s ORDER BY step) AS time_s,
+SELECT trial_id, spec_hash, side, list(time_s ORDER BY step) AS time_s,
     list(position_m ORDER BY step) AS position_m, list(velocity_mps ORDER BY step) AS velocity_mps,
     list(acceleration_mps2 ORDER BY step) AS acceleration_mps2
-FROM states {ONE} GROUP BY ALL ORDER BY side
+FROM states {OF_THEM} GROUP BY ALL ORDER BY side
 """  # noqa: S608 # constants
-DECISIONS = f"SELECT *, false AS lost FROM decisions {ONE}"  # noqa: S608 # constants
-CALLS = f"SELECT * EXCLUDE request FROM calls {ONE} ORDER BY attempt"  # noqa: S608 # constants
-PERCEIVED = f"FROM perceptions {ONE}"
+DECISIONS = f"SELECT *, false AS lost FROM decisions {OF_THEM}"  # noqa: S608 # constants
+CALLS = f"SELECT * EXCLUDE request FROM calls {OF_THEM} ORDER BY attempt"  # noqa: S608 # constants
+PERCEIVED = f"FROM perceptions {OF_THEM}"
 TASKS = f"""
-SELECT source, spec
-FROM (FROM trials {ONE}) LEFT JOIN specs USING (spec_hash)
+SELECT trial_id, spec_hash, source, spec
+FROM (FROM trials {OF_THEM}) LEFT JOIN specs USING (spec_hash)
 """  # noqa: S608 # constants
 # Recordings do not describe their task: collisions were judged by the outlines, at 20 Hz.
 HUMAN_TASK = {"collision_rule": "rectangle", "step_s": 0.05}
@@ -65,34 +68,58 @@ class Trial:
         return self.paces[side].interval_steps * self.scenario.step_s
 
 
-def read_trial(connection: DuckDBPyConnection, trial_id: str, spec_hash: str) -> Trial:
-    """Read a trial that is known to be there."""
-    key = {"trial": trial_id, "spec": spec_hash}
-    states, calls, (task,) = (records(connection, sql, key) for sql in (STATES, CALLS, TASKS))
-    result = connection.execute(DECISIONS, key)
+def read_trials(connection: DuckDBPyConnection, keys: Sequence[Key]) -> list[Trial]:
+    """Read trials that are known to be there, by their names and specs."""
+    them = {"trials": [name for name, _ in keys], "specs": [spec for _, spec in keys]}
+    states, calls, tasks = (
+        _by_trial(records(connection, sql, them)) for sql in (STATES, CALLS, TASKS)
+    )
+    result = connection.execute(DECISIONS, them)
     lost = dict.fromkeys(names_of(result)) | {"valid": False, "fallback": False, "lost": True}
-    made = {(row["decision"], row["side"]): row for row in by_name(result)}
+    rows = list(by_name(result))
+    is_told = any(row["other_seen"] is not None for row in rows)
+    decisions = _by_trial(rows)
+    perceived = _by_trial(records(connection, PERCEIVED, them) if is_told else ())
+    return [
+        _trial(tasks[key][0], states[key], decisions[key], calls[key], perceived[key], lost)
+        for key in keys
+    ]
+
+
+def _by_trial(rows: Iterable[Row]) -> dict[Key, list[Row]]:
+    """Return rows by the name and the spec of their trial."""
+    found = defaultdict[Key, list[Row]](list)
+    for row in rows:
+        found[row["trial_id"], row["spec_hash"]].append(row)
+    return found
+
+
+def _trial(
+    task: Row,
+    states: Sequence[Row],
+    decisions: Sequence[Row],
+    calls: Sequence[Row],
+    perceptions: Sequence[Row],
+    lost: Row,
+) -> Trial:
+    """Return a trial of its rows; ``lost`` is the row of a decision without an answer."""
+    made = {(row["decision"], row["side"]): row for row in decisions}
     for call in calls:
         place = call["decision"], call["side"]
         # Where it got no answer the trial ended, and what the other driver decided is never driven.
         row = made.setdefault(place, lost | dict(zip(("decision", "side"), place, strict=True)))
         row.setdefault("attempts", []).append(call)
-    decisions = [made[place] for place in sorted(made)]
-    is_told = any(row["other_seen"] is not None for row in decisions)
-    perceived = {
-        (row["decision"], row["side"]): row
-        for row in (records(connection, PERCEIVED, key) if is_told else ())
-    }
+    perceived = {(row["decision"], row["side"]): row for row in perceptions}
     told = json.loads(task["spec"] or "{}")
     scenario = scenario_of(task["source"], told.get("scenario"))
     trial = Trial(
         scenario,
         {side: pace_of(scenario, told.get(side, {})) for side in SIDES},
         {row["side"]: row for row in states},
-        decisions,
+        [made[place] for place in sorted(made)],
     )
     before: dict[str, Row] = {}
-    for row in decisions:
+    for row in trial.decisions:
         row.setdefault("attempts", [])
         replies = [call["reply"] for call in row["attempts"] if call["reply"] is not None]
         row["reply"] = replies[-1] if replies else None
