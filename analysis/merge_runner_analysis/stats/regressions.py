@@ -9,7 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
+from itertools import combinations
 from math import inf, sqrt
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -34,11 +37,15 @@ STEADY_GAP_M = 0.01
 # Equivalence margin of I4: how far relative velocity alone may move the gap.
 GAP_MARGIN_M = 1.0
 # At its top a likelihood gains less than this by another step; so many steps lead there, or none.
-FLAT, MOST_STEPS = 1e-9, 100
+FLAT, MOST_STEPS, ROUNDING = 1e-9, 100, 1e-11
 # Below this logarithm of its determinant the information is singular but for rounding.
 SINGULAR = -600.0
-# A bound is looked for in steps that widen so much, up to so many standard errors.
+# A bound is looked for in steps that widen so much, up to one of so many standard errors.
 WIDER, FARTHEST = 1.3, 1e5
+# Other maxima are looked for from so many of the likeliest places, up to this much less likely than
+# the first; two are the same whose log-likelihoods differ by less than this.
+LIKELIEST, UNLIKELY, SAME = 20, 10.0, 1e-6
+SCALES = (0.0, 1.0, 3.0, 10.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,32 +56,44 @@ class Counts:
     n: Array
     chosen: Array
 
-    def fit(self, term: int = -1, value: float = 0.0, start: Array | None = None) -> Fit | None:
-        """Return the fit, with one ``term`` held at a value, or None where it does not converge.
+    def fit(self) -> Fit | None:
+        """Return the best fit, or None where none converges."""
+        first = self.climb(np.zeros((1, self.design.shape[1])))
+        return first and self.climb(first.starts())
 
-        Newton's method, with the curvature of the penalty too: far from the estimate and under
-        separation the information misses it. Where the likelihood bends upwards, a step goes uphill
-        all the same (Nocedal and Wright 2006, section 3.4); each is halved until it gains.
+    def climb(self, starts: Array, term: int | None = None, value: float = 0.0) -> Fit | None:
+        """Return the best fit that is reached from ``starts``, (starts, terms), if one converges.
+
+        One ``term`` may be held at a value. The steps are Newton's with the curvature of the
+        penalty, too: far from the estimate and under separation the information misses it. Where
+        the likelihood bends upwards, a step goes uphill all the same (Nocedal and Wright 2006,
+        section 3.4); each is halved until it gains.
         """
-        b = np.zeros(self.design.shape[1]) if start is None else start.copy()
-        free = np.arange(len(b)) != term
-        b[~free] = value
-        here, step = self._penalised(b), np.zeros_like(b)
+        b = starts.copy()
+        free = np.array([place != term for place in range(b.shape[1])])
+        b[:, ~free] = value
+        here = self.penalised(b)
+        regular = np.isfinite(here.likelihood)
+        b, here = b[regular], Penalised(*(part[regular] for part in here))
+        top = np.zeros(len(b), bool)
         for _ in range(MOST_STEPS):
-            if here is None:
-                return None
-            bends, directions = np.linalg.eigh(here.curvature[np.ix_(free, free)])
-            uphill = directions.T @ here.score[free]
-            step[free] = directions @ (uphill / np.maximum(np.abs(bends), FLAT))
-            is_last = here.score @ step < FLAT
-            there = self._penalised(b + step)
-            while not is_last and (there is None or there.likelihood < here.likelihood):
-                step /= 2
-                there = self._penalised(b + step)
+            if top.all():
+                break
+            bends, directions = np.linalg.eigh(here.curvature[:, free][:, :, free])
+            uphill = (here.score[:, None, free] @ directions)[:, 0]
+            uphill /= np.maximum(np.abs(bends), FLAT)
+            step = np.zeros_like(b)
+            step[:, free] = (directions @ uphill[:, :, None])[:, :, 0]
+            top = (here.score * step).sum(axis=1) < FLAT
+            there = self.penalised(b + step)
+            while (lower := there.likelihood < here.likelihood - ROUNDING).any():
+                step[lower] /= 2
+                there = self.penalised(b + step)
             b, here = b + step, there
-            if is_last and here:
-                return Fit(self, b, here)
-        return None
+        if not top.any():
+            return None
+        best = int(np.where(top, here.likelihood, -inf).argmax())
+        return Fit(self, b[best], float(here.likelihood[best]), here.information[best])
 
     def infinite(self) -> NDArray[np.bool_]:
         """Return which coefficients have no finite maximum likelihood estimate, (terms,).
@@ -88,39 +107,49 @@ class Counts:
         )
         return np.asarray(np.abs(found.x) > 1e-4)
 
-    def _penalised(self, b: Array) -> Penalised | None:
-        """Return the log-likelihood of ``b`` with Firth's penalty; None where that is singular.
+    def likelihood(self, b: Array) -> tuple[Array, Array, Array]:
+        """Return the penalised log-likelihoods of ``b`` (starts, terms), weights and information.
 
         The penalty is half the logarithm of the determinant of the information: Jeffreys' prior.
+        Where that is singular the likelihood is minus infinity.
+        """
+        linear = b @ self.design.T
+        p = expit(linear)
+        weights = self.n * p * (1 - p)
+        information = (self.design.T * weights[:, None]) @ self.design
+        with np.errstate(divide="ignore"):
+            sign, penalty = np.linalg.slogdet(information)
+        likelihood = linear @ self.chosen - np.logaddexp(0, linear) @ self.n + penalty / 2
+        likelihood[(sign <= 0) | (penalty < SINGULAR)] = -inf
+        return likelihood, weights, information
+
+    def penalised(self, b: Array) -> Penalised:
+        """Return what is known of the penalised log-likelihoods at ``b``, (starts, terms).
+
         Firth's score adds to each residual the leverage times (1/2 - p): as if each trial were
         split, and half of its leverage had gone either way (Heinze and Schemper 2002).
         """
-        design, linear = self.design, self.design @ b
-        p = expit(linear)
-        weights = self.n * p * (1 - p)
-        information = (design.T * weights) @ design
-        sign, log_determinant = np.linalg.slogdet(information)
-        if sign <= 0 or log_determinant < SINGULAR:
-            return None
-        likelihood = self.chosen @ linear - self.n @ np.logaddexp(0, linear) + log_determinant / 2
-        weighted = design * np.sqrt(weights)[:, None]
-        hat = weighted @ np.linalg.inv(information) @ weighted.T
-        leverage = np.diag(hat)
+        design, p = self.design, expit(b @ self.design.T)
+        likelihood, weights, information = self.likelihood(b)
+        information[np.isinf(likelihood)] = np.eye(len(design.T))
+        weighted = design * np.sqrt(weights)[:, :, None]
+        hat = weighted @ np.linalg.inv(information) @ weighted.transpose(0, 2, 1)
+        leverage = np.diagonal(hat, axis1=1, axis2=2)
         score = (self.chosen - self.n * p + leverage * (0.5 - p)) @ design
-        turned = design * (1 - 2 * p)[:, None]  # as the weights change with the linear predictor
-        second = (design.T * (leverage * (1 - 6 * p * (1 - p)))) @ design
-        penalty = (second - turned.T @ hat**2 @ turned) / 2
-        return Penalised(float(likelihood), score, information - penalty, information)
+        turned = design * (1 - 2 * p)[:, :, None]  # as the weights change with the linear predictor
+        second = (design.T * (leverage * (1 - 6 * p * (1 - p)))[:, None]) @ design
+        penalty = (second - turned.transpose(0, 2, 1) @ hat**2 @ turned) / 2
+        return Penalised(likelihood, score, information - penalty, information)
 
 
-@dataclass(frozen=True, slots=True)
-class Penalised:
-    """A penalised log-likelihood, its gradient (terms,) and less its Hessian, (terms, terms).
+class Penalised(NamedTuple):
+    """Penalised log-likelihoods (starts,), gradients (starts, terms) and less Hessians.
 
-    ``information`` is Fisher's, (terms, terms), without the penalty.
+    These and Fisher's ``information`` without the penalty are (starts, terms, terms). Where the
+    information is singular the likelihood is minus infinity, and the rest has no meaning.
     """
 
-    likelihood: float
+    likelihood: Array
     score: Array
     curvature: Array
     information: Array
@@ -128,56 +157,101 @@ class Penalised:
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """The coefficients ``b`` (terms,) where the penalised log-likelihood is maximal."""
+    """The coefficients ``b`` (terms,) where the penalised log-likelihood is maximal, ``best``.
+
+    ``information`` is Fisher's, (terms, terms), without the penalty.
+    """
 
     counts: Counts
     b: Array
-    top: Penalised
-
-    @property
-    def best(self) -> float:
-        """The penalised log-likelihood."""
-        return self.top.likelihood
+    best: float
+    information: Array
 
     @property
     def errors(self) -> Array:
         """Wald's standard errors, (terms,)."""
-        return np.sqrt(np.diag(np.linalg.inv(self.top.information)))
+        return np.sqrt(np.diag(np.linalg.inv(self.information)))
 
     def p(self, term: int) -> float:
         """Return the p-value of the penalised likelihood ratio against a coefficient of 0."""
-        without = self.counts.fit(term)
+        without = self.profile(term, 0.0)
         return float(stats.chi2.sf(2 * (self.best - without.best), 1)) if without else np.nan
+
+    def profile(self, term: int, value: float) -> Fit | None:
+        """Return the best fit with a term held at a value, or None where none converges."""
+        return self.counts.climb(self.starts(term, value), term, value)
 
     def interval(self, term: int, level: float) -> tuple[float, float] | None:
         """Return the profile interval: what the penalised likelihood ratio does not reject.
 
         None where no bound is found.
         """
-        lost = stats.chi2.ppf(level, 1) / 2
-        near = self.b  # the last profile: far out the other terms are far from the estimate, too
-        # Of symmetric data the best profile may lie on either side.
-        aside = self.b + self.errors, self.b - self.errors
+        lost, error = stats.chi2.ppf(level, 1) / 2, self.errors[term]
+        try:
+            low, high = (self._bound(term, lost, width) for width in (-error, error))
+        except ValueError:  # there is no bound, or a profile does not converge
+            return None
+        return low, high
 
+    def _bound(self, term: int, lost: float, width: float) -> float:
+        """Return the first value to one side whose profile loses so much log-likelihood.
+
+        Followed from value to value, a profile may miss a higher maximum elsewhere, which is
+        therefore looked for at the bound. Raises ValueError where none is found.
+        """
+        followed = np.stack([self.b, self.b])
+
+        @cache
         def excess(value: float) -> float:
-            nonlocal near
-            fits = [self.counts.fit(term, value, start) for start in (near, *aside)]
-            profile = max(filter(None, fits), key=lambda each: each.best, default=None)
+            profile = self.counts.climb(followed, term, value) or self.profile(term, value)
             if profile is None:
                 return np.nan
-            near = profile.b
+            followed[0] = profile.b
             return float(self.best - profile.best - lost)
 
-        bounds = []
-        for width in (-self.errors[term], self.errors[term]):
-            near, inside, farthest = self.b, self.b[term], FARTHEST * abs(width)
-            while excess(inside + width) < 0 and abs(inside - self.b[term]) < farthest:
-                inside, width = inside + width, WIDER * width  # noqa: PLW2901
-            try:
-                bounds.append(float(brentq(excess, inside, inside + width, xtol=1e-9)))
-            except ValueError:  # there is no bound, or a profile does not converge
-                return None
-        return bounds[0], bounds[1]
+        bound, farthest = float(self.b[term]), FARTHEST * abs(width)
+        while True:
+            inside, outside, step = bound, bound + width, width
+            while excess(outside) < 0 and abs(step) < farthest:
+                step *= WIDER
+                inside, outside = outside, outside + step
+            bound = float(brentq(excess, inside, outside, xtol=1e-9))
+            highest = self.profile(term, bound)
+            if highest is None or self.best - highest.best - lost > -SAME:
+                return bound
+            followed = np.concatenate([followed, highest.b[None]])
+            excess.cache_clear()
+
+    def starts(self, term: int | None = None, value: float = 0.0) -> Array:
+        """Return from where all maxima are reached, perhaps with a term held: (starts, terms).
+
+        There may be several of few trials. Far out they lie where two conditions have even chances:
+        of such coefficients, and of all, those nearest to the fit by its information. The latter
+        are also scaled, down to 0, where the likelihood is always known.
+        """
+        held = np.eye(len(self.b))[[] if term is None else [term]]
+        pairs = self.counts.design[[*combinations(range(len(self.counts.design)), 2)]]
+        even = np.concatenate([np.broadcast_to(held, (len(pairs), *held.shape)), pairs], axis=1)
+        values = np.array([value] * len(held) + [0.0, 0.0])
+        nearest = self._nearest(held[None], values[: len(held)])
+        starts = np.vstack([np.outer(SCALES, nearest), self._nearest(even, values)])
+        if term is not None:
+            starts[:, term] = value
+        likelihood = self.counts.likelihood(starts)[0]
+        likeliest = np.argsort(-likelihood)[:LIKELIEST]
+        near = likelihood[likeliest] > likelihood.max() - UNLIKELY
+        return np.asarray(starts[likeliest[near]])
+
+    def _nearest(self, rows: Array, linear: Array) -> Array:
+        """Return the coefficients nearest to the fit at which rows have these linear predictors.
+
+        ``rows`` are (sets, rows, terms), and what is returned (sets, terms).
+        """
+        spread = rows @ np.linalg.inv(self.information)
+        # Of dependent rows the solution is far off, and unlikely.
+        square = spread @ rows.transpose(0, 2, 1) + FLAT * np.eye(len(linear))
+        weights = np.linalg.solve(square, (linear - rows @ self.b)[:, :, None])
+        return np.asarray(self.b + (weights.transpose(0, 2, 1) @ spread)[:, 0])
 
 
 @dataclass(frozen=True, slots=True)
