@@ -14,6 +14,8 @@ Number = Annotated[float, Field(strict=True, ge=-1e6, le=1e6)]
 NotNegative = Annotated[float, Field(strict=True, ge=0, le=1e6)]
 Exponent = Annotated[float, Field(strict=True, ge=-10, le=10)]
 Temperature = Annotated[float, Field(strict=True, ge=0, le=10)]
+# Left out where it is 0, so that the trials of an effect from before it are drawn as they were.
+OfOneDriver = Annotated[Number, Field(exclude_if=lambda value: value == 0.0)]
 
 
 class Persona(BaseModel):
@@ -35,7 +37,8 @@ class PlantedEffect(BaseModel):
     k = exp(-x_temperature (T - 1)) at the request's ``temperature`` T. What is not given is as in
     humans (arXiv 2604.09609, Table III). ``x_noise`` is the standard deviation of what is added to
     the logit of each trial; it flattens the coefficients that a regression finds. ``x_gap_m`` is
-    added to the gap that both aim at.
+    added to the gap that both aim at. ``x_own_first`` is added to the log-odds that the driver goes
+    first that is asked with it, ``x_other_first`` to those of the driver that it meets.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
@@ -46,23 +49,34 @@ class PlantedEffect(BaseModel):
     x_temperature: Exponent = 0.0
     x_noise: NotNegative = 0.0
     x_gap_m: Number = 0.0
+    x_own_first: OfOneDriver = 0.0
+    x_other_first: OfOneDriver = 0.0
     x_persona: Persona | None = None
     temperature: Temperature = 1.0
 
-    def before(self, prompt: str) -> Self:
-        """The effect on the reader of this prompt, without a persona."""
-        persona = self.x_persona
-        if persona is None:
-            return self
-        added = persona.model_dump(exclude={"text"}) if persona.text in prompt else {}
+    def before(self, prompt: str, sign: int = 1) -> Self:
+        """The effect on the reader of this prompt, without a persona, as the left driver has it.
+
+        ``sign`` is 1 where the reader is on the left and -1 where it is on the right.
+        """
+        persona, added = self.x_persona, {}
+        if persona is not None and persona.text in prompt:
+            added = persona.model_dump(exclude={"text"})
         changed = {name: getattr(self, name) + more for name, more in added.items()}
-        return self.model_copy(update={**changed, "x_persona": None})
+        own_first = sign * self.lead
+        update = {**changed, "x_persona": None, "x_own_first": own_first, "x_other_first": 0.0}
+        return self.model_copy(update=update)
+
+    @property
+    def lead(self) -> float:
+        """What is added to the log-odds that the driver goes first that is asked."""
+        return self.x_own_first - self.x_other_first
 
     @property
     def coefficients(self) -> tuple[float, float, float]:
-        """Those of the logit, without noise: the intercept, that of h and that of dv."""
+        """Those of the left driver's logit, without noise: the intercept, that of h and of dv."""
         k = math.exp(-self.x_temperature * (self.temperature - 1))
-        return k * self.x_left_first, k * self.x_headway, k * self.x_relative_speed
+        return k * (self.x_left_first + self.lead), k * self.x_headway, k * self.x_relative_speed
 
 
 PARAMETERS = frozenset(name for name in PlantedEffect.model_fields if name.startswith(PREFIX))

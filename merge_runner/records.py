@@ -225,8 +225,10 @@ class TrialSpec:
     ``seat`` is the source of one that only asks: it ends before its drivers decide again.
     ``order`` is its place in the sweep: lower goes first. ``scripted`` says that the emulator
     takes part, a stand-in and no language model. Humans have a ``pair`` and no ``variant``.
-    ``factors`` are the levels of the study's factors, ``arm`` names their crossing. ``kinematics``
-    are what its condition's name stands for.
+    ``factors`` are the levels of the study's factors, those of ``words`` among them, ``arm`` names
+    their crossing. ``focal`` is the side of the ego where the two drivers are given different
+    things, and ``prompts`` are by side where not both are of the ``variant``. ``kinematics`` are
+    what its condition's name stands for.
     """
 
     trial_id: str
@@ -242,7 +244,10 @@ class TrialSpec:
     scripted: bool = False
     pair: str | None = None
     factors: tuple[tuple[str, str], ...] = ()
+    words: frozenset[str] = frozenset()
     arm: str = ""
+    focal: Side | None = None
+    prompts: dict[Side, str] = field(default_factory=dict)
     kinematics: Condition = field(kw_only=True)
 
 

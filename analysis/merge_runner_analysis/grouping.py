@@ -14,10 +14,11 @@ from typing import Any, NewType
 import pandas as pd
 
 from merge_runner.audit.checks import not_judged
+from merge_runner.planted_effect import PARAMETERS as PLANTED
+from merge_runner.prompts.blocks import BASELINE
 from merge_runner.records import SIDES, Side, canonical_json, spec_hash
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.study.crossing import DEFAULT, MODEL, PROMPT, SELF
-from merge_runner.study.file import BASELINE
 from merge_runner_analysis.drivers import (
     has_chance,
     language_models,
@@ -221,15 +222,19 @@ def _as_seen(stored: Mapping[str, Any] | None, name: str, ego: str) -> dict[str,
     """A spec as the ego sees it: with the ego's driver on the left.
 
     ``image`` is its hash, ``usual`` its hash at the usual mean speed. ``task`` is a hash of what
-    it covers beside the prompt and the mean speed: equal for all prompts and conditions of a study.
+    it covers beside the prompt, the mean speed and what is planted in the emulator: equal for all
+    prompts and conditions of a study.
     """
     spec, image = stored or {}, name
     if ego == "right" and {*SIDES} <= spec.keys():
         spec = {**spec, "left": spec["right"], "right": spec["left"]}
+        if isinstance(blocks := spec.get("prompt_blocks"), dict):
+            spec["prompt_blocks"] = {_turned(block): digest for block, digest in blocks.items()}
         image = spec_hash(canonical_json(spec))
     at_usual = {name: value for name, value in spec.items() if name != MEAN_SPEED}
     usual = spec_hash(canonical_json(at_usual)) if MEAN_SPEED in spec else image
     task = {name: value for name, value in at_usual.items() if name != "prompt_blocks"}
+    task |= {side: _unplanted(task[side]) for side in SIDES if side in task}
     hashed = hashlib.sha256(json.dumps(task, sort_keys=True).encode()).hexdigest()
     return {
         "spec": spec,
@@ -237,6 +242,19 @@ def _as_seen(stored: Mapping[str, Any] | None, name: str, ego: str) -> dict[str,
         "usual": usual,
         "task": name if stored is None else hashed,
     }
+
+
+def _turned(block: str) -> str:
+    """The name of a prompt's block, of which one that a single driver is told names its side."""
+    name, _, side = block.partition("@")
+    return f"{name}@{'left' if side == 'right' else 'right'}" if side else block
+
+
+def _unplanted(driver: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What a spec says of a driver, without what a study plants in the emulator."""
+    if "body" not in driver:
+        return driver
+    return {**driver, "body": {n: x for n, x in driver["body"].items() if n not in PLANTED}}
 
 
 def groups_of(

@@ -13,11 +13,12 @@ from scipy.special import expit
 
 from merge_runner.config import validated
 from merge_runner.planted_effect import PlantedEffect, planted_fields
+from merge_runner.prompts.blocks import BASELINE
 from merge_runner.run.estimate import typical_prompt
 from merge_runner.run.plan import Plan
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.study.crossing import PROMPT, Arm
-from merge_runner.study.file import BASELINE, Effect
+from merge_runner.study.file import Effect
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.published import HUMAN_GAP_SD_M, human_outcomes, published
 from merge_runner_analysis.stats import regressions

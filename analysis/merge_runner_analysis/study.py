@@ -13,10 +13,11 @@ import pandas as pd
 from merge_runner.config import without_endpoint
 from merge_runner.errors import UsageError, unknown_name
 from merge_runner.paths import DEFAULT_DB
+from merge_runner.prompts.blocks import BASELINE
 from merge_runner.registry import require
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.study.crossing import PROMPT, listed_levels
-from merge_runner.study.file import BASELINE, StudySource, read_study
+from merge_runner.study.file import StudySource, read_study
 from merge_runner_analysis.cache import present_state, remembered
 from merge_runner_analysis.frames import KEYS, Order, Studies, read, read_frames, study_name
 from merge_runner_analysis.grouping import (

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, NamedTuple
 
-from merge_runner.study.file import BASELINE
+from merge_runner.prompts.blocks import BASELINE
 from merge_runner_analysis.metrics import BOXES, DECIMALS, GAP, LEFT_FIRST
 
 TABLE = "verdicts"

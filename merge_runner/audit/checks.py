@@ -292,7 +292,7 @@ def _fill(connection: duckdb.DuckDBPyConnection, entries: Iterator[CachedCall]) 
             key = (f"{slot.condition}/rep{slot.repetition:02d}{set_}", endpoint)
             trials[key] = (
                 *(*key, None, "llm", None, None, None, slot.condition, 0.0, 0.0),
-                *(slot.repetition, slot.sample_set, "finished", None, 0.0, None, False),
+                *(slot.repetition, slot.sample_set, "finished", None, 0.0, None, False, None),
             )
             rows += [call_row(key, entry.request, each, cached=True) for each in entry.attempts]
         append(connection, "calls", rows)

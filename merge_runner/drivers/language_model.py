@@ -42,7 +42,7 @@ class LanguageModel:
         """See MakeDriver."""
         seat = take_seat(scenario, spec, side, model_pace(scenario))
         assert spec.variant is not None, "only human trials have no prompt variant"
-        prompt = self.prompts[spec.variant]
+        prompt = self.prompts[spec.prompts.get(side, spec.variant)]
         return LlmDriver(self.ask, spec, seat, prompt, self.decided, self.known)
 
 

@@ -79,7 +79,8 @@ def answer(prompt: str, slot: Slot | None, effect: PlantedEffect | None = None) 
     seen = read_prompt(prompt)
     if isinstance(seen, str):
         return seen
-    planted = None if effect is None else effect.before(prompt)
+    sign = -1 if slot is not None and slot.side == "right" else 1
+    planted = None if effect is None else effect.before(prompt, sign)
     trial: tuple[object, ...] = ()
     if slot is not None:
         trial = (slot.condition, slot.repetition, slot.sample_set)
@@ -186,7 +187,7 @@ def _order(
 def _chance_left_first(effect: PlantedEffect, condition: str, noise: float) -> float:
     kinematics = CONDITIONS.get(condition)
     if kinematics is None:  # a study's own: this process may not know it
-        return 0.5
+        return 1 / (1 + math.exp(-max(effect.lead, -700.0)))
     intercept, of_headway, of_speed = effect.coefficients
     logit = (
         intercept

@@ -3,6 +3,9 @@
 The paper's own wording is not public: this is a reconstruction from its description. A variant is
 the baseline without some blocks and with some others, so that it changes nothing else.
 
+A study's factors of words go on from there: their levels add, replace and remove blocks of any
+variant, whose name is then composed: ``A1 hurry=yes``.
+
 Numbers have two decimals, in m, s, m/s and m/s^2, or in the unit of their name; lists are those of
 Python. What is about the other car is "not seen" while that is so, and without the unit that a
 template has behind it.
@@ -25,6 +28,7 @@ from merge_runner.prompts.state_lines import LINES, NOT_SEEN
 from merge_runner.records import ROADS, Observation, Road
 from merge_runner.registry import Registry, require
 
+BASELINE = "baseline"
 TACTICAL, OUTPUT_FORMAT = "C4", "C5"
 LAST = "the end"
 _UNIT_OF_NOTHING = re.compile(rf"({NOT_SEEN}) (?:m/s\^2|m/s|km/h|mph|m|s)(?![\w/^])")
@@ -274,7 +278,7 @@ for _before, _blocks in ((None, _PAPER), ("C1", _READY)):
 
 VARIANTS = Registry[Variant]("variant")
 for _name, _removed, _title in (
-    ("baseline", (), "Baseline"),
+    (BASELINE, (), "Baseline"),
     ("A1", ("C1",), "A1 (-History)"),
     ("A2", ("C2",), "A2 (-Prev. acc. plan)"),
     ("A3", ("C3.safety",), "A3 (-Safety)"),
@@ -286,6 +290,27 @@ for _name, _removed, _title in (
     VARIANTS.register(_name, Variant(frozenset(_removed), title=_title))
 
 
+Rewording = Callable[[Mapping[str, Block]], dict[str, Block]]
+WORDS = Registry[Mapping[str, Rewording]]("factor of words")
+"""What the levels of a study's factors of words do to the blocks of a prompt, by factor and level.
+
+A level that leaves the prompt as it is has none.
+"""
+
+
+def composed(variant: str, words: Iterable[str]) -> str:
+    """Return the name of a variant with these levels of words: ``A1 hurry=yes``."""
+    names = [name for name in (variant, *words) if name != BASELINE]
+    return " ".join(names) or BASELINE
+
+
+def decomposed(variant: str) -> tuple[str, list[str]]:
+    """Return the variant that a composed one is made from, and its levels of words, in order."""
+    names = variant.split(" ")
+    words = [name for name in names if "=" in name]
+    return (BASELINE if len(words) == len(names) else names[0]), words
+
+
 def title_of(variant: str) -> str:
     """How tables and figures name a variant, which need not be registered here any more."""
     known = VARIANTS.get(variant)
@@ -294,6 +319,22 @@ def title_of(variant: str) -> str:
 
 def blocks_of(variant: str) -> dict[str, Block]:
     """The blocks of a variant by name, in the order of its prompt; raises UsageError."""
+    prompt, words = decomposed(variant)
+    blocks = _variant_blocks(prompt)
+    for word in words:
+        factor, _, level = word.partition("=")
+        blocks = require(WORDS.require(factor), f"level of {factor}", level)(blocks)
+    if not words:
+        return blocks
+    # So that the hash of each added block says what follows it, whatever was added later.
+    following = [*list(blocks)[1:], LAST]
+    return {
+        name: block if block.before is None else replace(block, before=after)
+        for (name, block), after in zip(blocks.items(), following, strict=True)
+    }
+
+
+def _variant_blocks(variant: str) -> dict[str, Block]:
     chosen, known = VARIANTS.require(variant), dict(BLOCKS.items())
     if chosen.blocks:
         return dict(chosen.blocks)
@@ -317,6 +358,7 @@ def with_block(
 ) -> dict[str, Block]:
     """The blocks of a prompt and one more, before or ``after`` its anchor.
 
+    After an anchor it stands behind what levels of words have added there already.
     Without an anchor it stands where it says itself, or before the first block of the paper that
     follows there; else at the end. Raises UsageError for a place that there is not.
     """
@@ -327,6 +369,8 @@ def with_block(
         anchor = next((each for each in later if each in blocks), None)
     names = list(blocks)
     place = len(names) if anchor is None else names.index(anchor) + after
+    while after and place < len(names) and "=" in names[place]:  # as in ``hurry=yes.1``
+        place += 1
     # Where it stands is a part of its hash.
     added = replace(block, before=[*names, LAST][place])
     names.insert(place, name)

@@ -44,6 +44,22 @@ SELECT driver, model, provider, count(*) FILTER (scripted) AS scripted, count(*)
 FROM tried WHERE fate IN ('driven', 'fallback')
 GROUP BY driver, model, provider HAVING bool_or(tried.scripted) ORDER BY ALL;
 
+-- Prompts with which stand-ins drove the same trials: they read nothing of what sets these apart.
+CREATE OR REPLACE TEMP VIEW same_prompts AS
+WITH driven AS (
+    SELECT trial_id, spec_hash, sum(hash(step, side, position_m)) AS trace
+    FROM states SEMI JOIN (FROM played WHERE scripted AND status <> 'failed')
+        USING (trial_id, spec_hash)
+    GROUP BY ALL
+), prompts AS (
+    SELECT variant,
+        list_sort(list(DISTINCT (model_left, model_right, condition, rep, sample_set, trace)))
+            AS trials
+    FROM played JOIN driven USING (trial_id, spec_hash) GROUP BY variant
+)
+SELECT list(variant ORDER BY variant) AS variants
+FROM prompts GROUP BY trials HAVING count(*) > 1 ORDER BY ALL;
+
 CREATE OR REPLACE TEMP VIEW decided AS
 SELECT count(*) AS decisions, count(*) FILTER (NOT valid) AS invalid,
     count(*) FILTER (fallback) AS fallbacks,

@@ -67,7 +67,7 @@ def rows_of(record: TrialRecord) -> dict[str, list[Row]]:
         *(spec.model_left, spec.model_right, spec.variant, spec.condition),
         *(condition.projected_headway_m, condition.relative_velocity_mps),
         *(spec.repetition, spec.sample_set, record.status, record.merged_first),
-        *(record.end_time_s, record.error, record.scripted),
+        *(record.end_time_s, record.error, record.scripted, spec.focal),
     )
     return {
         "trials": [trial],
@@ -84,7 +84,8 @@ def rows_of(record: TrialRecord) -> dict[str, list[Row]]:
 
 def factor_rows(spec: TrialSpec) -> Iterator[Row]:
     """Rows of ``trial_factors``."""
-    return ((spec.trial_id, spec.spec_hash, *level) for level in spec.factors)
+    key = (spec.trial_id, spec.spec_hash)
+    return ((*key, factor, level, factor in spec.words) for factor, level in spec.factors)
 
 
 def _decision_rows(record: TrialRecord) -> Iterator[Row]:

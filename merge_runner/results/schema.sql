@@ -62,16 +62,18 @@ CREATE TABLE trials (
     end_time_s DOUBLE NOT NULL,
     error VARCHAR,
     scripted BOOLEAN NOT NULL,
+    focal VARCHAR,
     PRIMARY KEY (trial_id, spec_hash)
 );
 COMMENT ON TABLE trials IS 'A trial.';
-COMMENT ON COLUMN trials.trial_id IS 'drivers/variant/condition/repetition, and the sample set';
+COMMENT ON COLUMN trials.trial_id IS 'drivers/variant/condition/repetition, and the sample set; the '
+    'variant without levels of words, which stand behind it with those of other factors';
 COMMENT ON COLUMN trials.spec_hash IS 'of what determines the result, but condition and rep';
 COMMENT ON COLUMN trials.pair IS 'human pairs only';
 COMMENT ON COLUMN trials.source IS 'llm, driver, human; seat: asked without the loop';
 COMMENT ON COLUMN trials.model_left IS 'who drove on the left: a model of the registry or a program';
 COMMENT ON COLUMN trials.model_right IS 'who drove on the right';
-COMMENT ON COLUMN trials.variant IS 'of the prompt';
+COMMENT ON COLUMN trials.variant IS 'of the prompt, and the levels of words that it has';
 COMMENT ON COLUMN trials.condition IS 'of the experiment';
 COMMENT ON COLUMN trials.projected_headway_m IS 'of the condition, left minus right';
 COMMENT ON COLUMN trials.relative_velocity_mps IS 'of the condition, left minus right';
@@ -82,18 +84,22 @@ COMMENT ON COLUMN trials.merged_first IS 'left, right, NULL: collided, failed, o
 COMMENT ON COLUMN trials.end_time_s IS 'when the trial ended';
 COMMENT ON COLUMN trials.error IS 'why it failed';
 COMMENT ON COLUMN trials.scripted IS 'a scripted stand-in answered on a side, and no model';
+COMMENT ON COLUMN trials.focal IS 'left, right: the side of the ego, where the two drivers are given '
+    'different words, parameters or perceptions; NULL: they are given the same';
 
 CREATE TABLE trial_factors (
     trial_id VARCHAR NOT NULL,
     spec_hash VARCHAR NOT NULL,
     factor VARCHAR NOT NULL,
-    value VARCHAR NOT NULL
+    value VARCHAR NOT NULL,
+    words BOOLEAN NOT NULL
 );
 COMMENT ON TABLE trial_factors IS 'A level of a factor of a trial''s study.';
 COMMENT ON COLUMN trial_factors.trial_id IS 'of trials';
 COMMENT ON COLUMN trial_factors.spec_hash IS 'of trials';
 COMMENT ON COLUMN trial_factors.factor IS 'as the study''s file names it';
 COMMENT ON COLUMN trial_factors.value IS 'the level: a text as it is, anything else as JSON';
+COMMENT ON COLUMN trial_factors.words IS 'it is a level of words, which the prompt''s variant names';
 
 CREATE TABLE states (
     trial_id VARCHAR NOT NULL,
@@ -247,7 +253,8 @@ FROM (
         driver_name(model_right, spec->>'$.right.endpoint') AS right_driver,
         (spec->'$.left.body') IS NOT NULL AS left_asks,
         (spec->'$.right.body') IS NOT NULL AS right_asks,
-        CASE WHEN opponent = model_right THEN 'left'
+        CASE WHEN focal IS NOT NULL THEN focal
+            WHEN opponent = model_right THEN 'left'
             WHEN opponent = model_left THEN 'right'
             WHEN model_left = model_right THEN 'left'
             WHEN left_asks AND NOT right_asks THEN 'left'
@@ -256,32 +263,34 @@ FROM (
     FROM trials LEFT JOIN specs USING (spec_hash) LEFT JOIN (
         SELECT trial_id, spec_hash, max(value) FILTER (factor = 'opponent') AS opponent,
             string_agg(factor || '=' || value, ', ' ORDER BY factor)
-                FILTER (factor NOT IN ('prompt', 'opponent')) AS levels
+                FILTER (factor NOT IN ('prompt', 'opponent') AND NOT words) AS levels
         FROM trial_factors GROUP BY ALL
     ) USING (trial_id, spec_hash)
 );
 COMMENT ON VIEW trial_drivers IS 'Who drove: two different drivers are joined by a plus, the ego '
     'first, whichever side it sat on; another sample set has its number, and so has each level of a '
-    'study''s factors but the prompt and the opponent, which are named already.';
+    'study''s factors but the prompt, with its words, and the opponent, which are named already.';
 COMMENT ON COLUMN trial_drivers.driver IS 'the model, with its endpoint if that is not the provider''s own';
 COMMENT ON COLUMN trial_drivers.ego IS 'the side of the driver that is named first, whose odds are '
-    'told: of two different ones that which its study does not call the opponent, else a language '
-    'model before a program, else the first in the alphabet; of two equal ones, and of humans, the '
-    'left one';
+    'told: the focal one; else of two different ones that which its study does not call the opponent, '
+    'else a language model before a program, else the first in the alphabet; of two equal ones, and '
+    'of humans, the left one';
 
 CREATE VIEW trial_levels AS
-WITH own AS (FROM trial_factors WHERE factor <> 'prompt')
-FROM own SEMI JOIN trials USING (trial_id, spec_hash)
+WITH own AS (SELECT * EXCLUDE words FROM trial_factors)
+FROM own SEMI JOIN trials USING (trial_id, spec_hash) WHERE factor <> 'prompt'
 UNION ALL
 SELECT trial_id, spec_hash, unnest(['model', 'prompt']),
     unnest([CASE WHEN model_left = model_right OR coalesce(opponent, 'self') <> 'self' THEN one
-        ELSE one || '+' || other END, variant])
+        ELSE one || '+' || other END, coalesce(prompt, variant)])
 FROM (
     SELECT *, CASE ego WHEN 'left' THEN model_left ELSE model_right END AS one,
         CASE ego WHEN 'left' THEN model_right ELSE model_left END AS other
     FROM trials JOIN trial_drivers USING (trial_id, spec_hash)
 ) AS trials LEFT JOIN (
-    SELECT trial_id, spec_hash, value AS opponent FROM own WHERE factor = 'opponent'
+    SELECT trial_id, spec_hash, max(value) FILTER (factor = 'opponent') AS opponent,
+        max(value) FILTER (factor = 'prompt') AS prompt
+    FROM own GROUP BY ALL
 ) USING (trial_id, spec_hash)
 WHERE source <> 'human';
 COMMENT ON VIEW trial_levels IS 'What was designed: a row for each factor of a driven trial, those of its '

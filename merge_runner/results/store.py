@@ -305,7 +305,7 @@ def sweep_facts(path: Path, sweep_id: str) -> dict[str, Any]:
         connection.execute(FACTS.read_text(encoding="utf-8"))
         append(connection, "other_models", other_models(connection))
         facts = next(by_name(connection.execute("FROM decided")))
-        for name in ("outcomes", "failed", "others", "stand_ins"):
+        for name in ("outcomes", "failed", "others", "stand_ins", "same_prompts"):
             facts[name] = connection.execute(f"FROM {name}").fetchall()
         for name in ("levels", "first_looks"):
             facts[name] = list(by_name(connection.execute(f"FROM {name}")))

@@ -13,7 +13,7 @@ from merge_runner.llm.batch.providers import batch_terms
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.ledger import cost_usd
 from merge_runner.prompts.blocks import render_prompt
-from merge_runner.records import Usage, canonical_json, is_scripted, without_prompt
+from merge_runner.records import SIDES, Usage, canonical_json, is_scripted, without_prompt
 from merge_runner.run.plan import Options, Plan, usual_prompts
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
@@ -186,10 +186,12 @@ def _limited_s(options: Options, entry: ModelEntry, usage: Usage) -> float:
 
 
 def typical_prompt(plan: Plan, arm: Arm) -> str:
-    """Return an arm's prompt in the middle of an approach."""
+    """Return an arm's prompt in the middle of an approach, the longest; empty of programs."""
     scenario = arm.scenario
     world = World(scenario, plan.parts.conditions[plan.conditions[0]], TRACK)
     rest = (0.25,) * (scenario.plan_actions - scenario.executed_actions)
-    return render_prompt(
-        world.observe("left"), rest, prompt=plan.parts.prompts[arm.variant], scenario=scenario
-    )
+    names = {arm.prompt(side) for side in SIDES if arm.asked[side] in arm.entries}
+    prompts = (plan.parts.prompts[name] for name in sorted(names))
+    seen = world.observe("left")
+    texts = (render_prompt(seen, rest, prompt=each, scenario=scenario) for each in prompts)
+    return max(texts, key=len, default="")

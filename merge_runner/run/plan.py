@@ -28,7 +28,7 @@ from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError
 from merge_runner.llm.formats import FORMATS, WireFormat
 from merge_runner.llm.models import load_models
-from merge_runner.prompts.blocks import VARIANTS, Prompt, blocks_of, prompt_of
+from merge_runner.prompts.blocks import VARIANTS, Prompt, blocks_of, decomposed, prompt_of
 from merge_runner.records import (
     MOST_REPETITIONS,
     SIDES,
@@ -51,6 +51,7 @@ from merge_runner.scenarios.merge.conditions import (
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 from merge_runner.study.crossing import (
+    FOCAL,
     OPPONENT,
     PROMPT,
     Arm,
@@ -174,7 +175,10 @@ def find_parts(
     with using(catalogue):
         parts = Parts(
             {name: CONDITIONS.require(name, hint) for name in conditions},
-            {name: prompt_of(name) for name in {arm.variant: 0 for arm in arms if arm.entries}},
+            {
+                name: prompt_of(name)
+                for name in dict.fromkeys(chain.from_iterable(map(_read, arms)))
+            },
         )
     return parts.with_code(arms, catalogue, hint)
 
@@ -280,12 +284,11 @@ class Plan(BaseModel):
         These stand in its row, where a change of them is refused; another mean speed does not.
         """
         mean_speed_mps = self.parts.conditions[condition].mean_speed_mps
-        prompts = self.parts.prompts
         return canonical_json(
             {
                 "spec_version": SPEC_VERSION,
                 "scenario": arm.scenario.model_dump(),
-                "prompt_blocks": prompts[arm.variant].digests if arm.entries else {},
+                "prompt_blocks": self._prompt_blocks(arm),
                 "left": self._driver(arm, "left"),
                 "right": self._driver(arm, "right"),
                 "sample_set": self.sample_set,
@@ -313,6 +316,9 @@ class Plan(BaseModel):
                 order=0,
                 scripted=_is_scripted(arm),
                 factors=tuple(arm.factors.items()),
+                words=frozenset(self.study.file.texts),
+                focal=arm.focal,
+                prompts=arm.prompts,
                 arm=arm.label,
                 kinematics=self.parts.conditions[condition],
             )
@@ -338,7 +344,24 @@ class Plan(BaseModel):
             for name, level in sorted(arm.factors.items())
             if name not in (PROMPT, OPPONENT)
         )
-        return f"{seat}{arm.model}/{arm.variant}/{condition}/rep{repetition:02d}{set_}{levels}"
+        prompt, _ = decomposed(arm.variant)
+        focal = f"/{FOCAL}={arm.focal}" if arm.focal else ""
+        return f"{seat}{arm.model}/{prompt}/{condition}/rep{repetition:02d}{set_}{levels}{focal}"
+
+    def _prompt_blocks(self, arm: Arm) -> dict[str, str]:
+        """The digests of the prompt's blocks; one that a single driver is told names its side."""
+        left, right = (
+            self.parts.prompts[arm.prompt(side)].digests if arm.asked[side] in arm.entries else None
+            for side in SIDES
+        )
+        if left is None or right is None:
+            return left or right or {}
+        both = left.items() & right.items()
+        return dict(both) | {
+            f"{name}@{side}": digest
+            for side, digests in (("left", left), ("right", right))
+            for name, digest in digests.items() - both
+        }
 
     def _driver(self, arm: Arm, side: Side) -> dict[str, object]:
         name = arm.asked[side]
@@ -352,6 +375,11 @@ class Plan(BaseModel):
             "headers": sent.headers,
             "body": sent.body,
         }
+
+
+def _read(arm: Arm) -> list[str]:
+    """The variants of the prompts that language models read in an arm."""
+    return [arm.prompt(side) for side in SIDES if arm.asked[side] in arm.entries]
 
 
 def usual_prompts(arm: Arm) -> float:
@@ -505,7 +533,8 @@ def _repetitions(
         raise UsageError(f"--reps is a whole number from 1 to {MOST_REPETITIONS}")
     given, wanted = study.file.repetitions, {}
     for variant in file_prompts(study.file) if variants is None else variants:
-        blocks_of(variant)  # raises where there is none
+        VARIANTS.require(variant)
+        blocks_of(variant)  # raises where it names a block that there is not
         wanted[variant] = chosen or given.get(variant, given.get(EVERY_PROMPT, 0))
     if wanted and all(wanted.values()):
         return wanted

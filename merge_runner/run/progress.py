@@ -438,6 +438,7 @@ def as_dict(
         "no_decision": facts["no_decision"],
         "model_mismatches": {f"{asked} -> {served}": n for asked, served, n in facts["others"]},
         "stand_ins": [row[:3] for row in facts["stand_ins"]],
+        "same_prompts": [variants for (variants,) in facts["same_prompts"]],
         "failed": dict(facts["failed"]),
         "outcomes_by_level": [by_level[place] for place in order if place in by_level],
         "first_looks": facts["first_looks"],
@@ -524,6 +525,11 @@ def _faults(summary: dict[str, Any]) -> Iterator[str]:
             yield f"The model `{model}` is a scripted stand-in, no language model."
         else:
             yield f"{driver}: a scripted stand-in answered, not {model}"
+    for prompts in summary["same_prompts"]:
+        yield (
+            f"{', '.join(prompts)} gave the same trials: the emulator reads no words; plant an "
+            "effect to rehearse (docs/how-to/run-a-study.md)"
+        )
     audit = summary["audit"]
     audit_it = command_at("merge-runner audit", "--db", summary["db"], DEFAULT_DB)
     found = f"{len(audit['findings'])} findings, which `{audit_it}` lists"

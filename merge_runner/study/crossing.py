@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from fractions import Fraction
+from functools import partial
 from itertools import product
 
 from pydantic import JsonValue
@@ -16,12 +17,13 @@ from merge_runner.drivers.pace import pace_of
 from merge_runner.drivers.registry import EMULATOR, PROGRAMS, Program
 from merge_runner.errors import UsageError
 from merge_runner.llm.models import known_parameters, with_parameter
-from merge_runner.prompts.blocks import VARIANTS
+from merge_runner.prompts.blocks import BASELINE, VARIANTS, composed
 from merge_runner.records import SIDES, Side, other_side
 from merge_runner.registry import require
-from merge_runner.study.file import BASELINE, EVERY_PROMPT, StudyFile
+from merge_runner.study.file import EVERY_PROMPT, GivenTo, StudyFile, StudyText
 
 MODEL, PROMPT, OPPONENT, SELF, DEFAULT = "model", "prompt", "opponent", "self", "default"
+FOCAL = "focal"
 PERCEPTION, PERFECT_ONE = "perception", "perfect"
 MOST_TRIALS = 1_000_000
 FINEST = 1_000_000  # steps a second: decimals like 0.05 become the fractions that they stand for
@@ -35,7 +37,9 @@ class Arm:
     ``model`` is what ids of trials say, ``sides`` who drives, by their names in the registry, and
     ``asked`` the same, but by the names in ``entries`` of language models with these parameters.
     ``factors`` are the levels as texts; ``label`` names what sets this arm apart from the others.
-    ``ego`` is the side of the driver whose odds are told (see ``config.ego_side``).
+    ``ego`` is the side of the driver whose odds are told (see ``config.ego_side``). ``focal`` is
+    the same where the two drivers are given different words, parameters or perceptions, else None.
+    ``prompts`` are by side, where not both are of the ``variant``.
     """
 
     model: str
@@ -48,6 +52,12 @@ class Arm:
     factors: dict[str, str] = field(default_factory=dict)
     label: str = ""
     ego: Side = "left"
+    focal: Side | None = None
+    prompts: dict[Side, str] = field(default_factory=dict)
+
+    def prompt(self, side: Side) -> str:
+        """The variant of the prompt of one side."""
+        return self.prompts.get(side, self.variant)
 
     @property
     def is_mixed(self) -> bool:
@@ -66,17 +76,6 @@ class Arm:
         """Who is asked, the ego first."""
         return self.asked[self.ego], self.asked[other_side(self.ego)]
 
-    def turned(self) -> Arm:
-        """The same with the drivers' sides changed."""
-        return replace(
-            self,
-            model="+".join([self.sides["right"], self.sides["left"]]),
-            sides={side: self.sides[other_side(side)] for side in SIDES},
-            asked={side: self.asked[other_side(side)] for side in SIDES},
-            label=f"{self.label} mirrored",
-            ego=other_side(self.ego),
-        )
-
 
 def cross(
     file: StudyFile,
@@ -91,8 +90,8 @@ def cross(
     """The arms of a study, model by model; raises UsageError for a crossing that cannot be.
 
     ``repetitions`` are those of each prompt, ``only`` the levels, as texts, that are wanted. With
-    ``mirror``, or where the file says so, two different drivers are played both ways round. Each
-    arm is played in so many ``conditions``.
+    ``mirror``, or where the file says so, two drivers that differ, or are given different things,
+    are played both ways round. Each arm is played in so many ``conditions``.
     """
     _check_names(file, registry)
     others = {name: levels for name, levels in file.factors.items() if name != PROMPT}
@@ -117,12 +116,13 @@ def cross(
         if any(all(texts[name] in levels for name, levels in row.items()) for row in skip):
             continue
         levels = {name: axes[name][text] for name, text in texts.items()}
-        arm = _arm(file, levels, texts, repetitions[texts[PROMPT]], registry, varying)
-        turned = (mirror or file.mirror) and arm.is_mixed
-        for each in (arm, arm.turned()) if turned else (arm,):
+        make = partial(_arm, file, levels, texts, repetitions[texts[PROMPT]], registry, varying)
+        arm = make()
+        turned = (mirror or file.mirror) and (arm.is_mixed or arm.focal is not None)
+        for each in (arm, make(turned=True)) if turned else (arm,):
             apart = (f"{n}={t}" for n, t in each.factors.items() if n not in (PROMPT, OPPONENT))
             # What comes to the same trials, as a pair that is named both ways, is played once.
-            twin = arms.setdefault((each.model, each.variant, *apart), each)
+            twin = arms.setdefault((each.model, each.variant, each.focal or "", *apart), each)
             if twin.asked != each.asked:
                 raise UsageError(
                     f"the crossings {twin.label!r} and {each.label!r} have the same names, and are "
@@ -130,7 +130,7 @@ def cross(
                 )
     if not arms:
         raise UsageError("nothing is left to play: look at [factors] and skip, and at --only")
-    if mirror and not any(arm.is_mixed for arm in arms.values()):
+    if mirror and not any(arm.is_mixed or arm.focal for arm in arms.values()):
         raise UsageError(
             f"there are no two different drivers to mirror: name them, as --model {models[0]}+OTHER"
         )
@@ -176,8 +176,21 @@ def _check_names(file: StudyFile, registry: Mapping[str, ModelEntry]) -> None:
     """Raise UsageError for a factor that there is not, and for a driver's name that is taken."""
     parameters = sorted(known_parameters(registry.values()))
     valid = dict.fromkeys((PROMPT, OPPONENT, PERCEPTION, *parameters, *ScenarioConfig.model_fields))
+    for name, levels in file.texts.items():
+        if name in (*valid, MODEL, FOCAL):
+            raise UsageError(f"[texts.{name}] needs another name: there is such a factor already")
+        require(file.factors, "factor", name, f"list the levels of {name} in [factors]")
+        listed = dict.fromkeys(map(level_text, file.factors[name]))
+        for level in levels:
+            require(listed, f"level of {name} in [texts.{name}]:", level)
     for name in (*file.factors, *file.effect):
-        require(valid, "factor", name, "models and skip stand above [factors]")
+        hint = f"declare its texts as [texts.{name}.LEVEL]; models and skip stand above [factors]"
+        require(valid | file.texts, "factor", name, hint)
+    for name in file.given_to:
+        if name in file.texts:
+            raise UsageError(f"given_to of {name} stands with its words: in [texts.{name}.LEVEL]")
+        of_a_driver = dict.fromkeys(n for n in file.factors if n in (PERCEPTION, *parameters))
+        require(of_a_driver, "factor in [given_to]:", name, "a parameter, or the perception")
     taken = [f"drivers.{name}" for name in file.drivers if name in registry]
     taken += [f"{PERCEPTION}.{name}" for name in file.perception if name == PERFECT_ONE]
     if taken:
@@ -214,44 +227,143 @@ def _arm(
     repetitions: int,
     registry: Mapping[str, ModelEntry],
     varying: Sequence[str],
+    *,
+    turned: bool = False,
 ) -> Arm:
-    """The arm of these levels, which results name by these ``texts``; raises UsageError."""
+    """The arm of these levels, which results name by these ``texts``; raises UsageError.
+
+    It is ``turned`` where the drivers have changed their sides.
+    """
     model, opponent = texts[MODEL], texts.get(OPPONENT, SELF)
     if opponent != SELF and "+" in model:
         raise UsageError(f"{model} is a pair already, and has no other opponent than {SELF}")
-    changed = {*both_sides(model).values()}
     sides = both_sides(model if opponent == SELF else f"{model}+{opponent}")
     for name in sides.values():
         require({**registry, **PROGRAMS}, "model", name, "two joined by + drive left and right")
-    others = {MODEL, PROMPT, OPPONENT, PERCEPTION, *ScenarioConfig.model_fields}
-    parameters = {n: x for n, x in levels.items() if n not in others and x != DEFAULT}
-    if parameters and not changed & {*registry}:
-        raise UsageError(f"{model} is a program and takes no {min(parameters)}, only {DEFAULT!r}")
-    asked, entries = dict(sides), {}
-    for side, name in sides.items():
-        if name in registry:
-            label, entry = name, registry[name]
-            for parameter, level in parameters.items() if name in changed else ():
-                before, entry = entry, with_parameter(name, entry, parameter, level)
-                label += "" if entry == before else f" {parameter}={texts[parameter]}"
-            asked[side], entries[label] = label, entry
-    labels = (texts[n] if n in (MODEL, PROMPT) else f"{n}={texts[n]}" for n in varying)
+    ego = ego_side(sides, registry, opponent)
+    if turned:
+        sides, ego = {side: sides[other_side(side)] for side in SIDES}, other_side(ego)
+    asked = dict(sides)
+    entries = {side: registry[name] for side, name in sides.items() if name in registry}
+    one_sided = _set_parameters(file, levels, texts, ego, sides, asked, entries)
+    words = {n: file.texts[n][text] for n, text in texts.items() if text in file.texts.get(n, ())}
+    for name, word in words.items():
+        given = _given(word.given_to, ego)
+        if not entries.keys() & {*given}:
+            raise UsageError(
+                f"{sides[given[0]]} is a program and reads no words: leave {name}={texts[name]} "
+                "out there, by skip"
+            )
+        one_sided |= word.given_to != "both"
+    _plant(words.values(), ego, sides, asked, entries)
+    variant = composed(texts[PROMPT], [f"{name}={texts[name]}" for name in words])
+    prompts = {
+        side: composed(
+            texts[PROMPT],
+            [f"{n}={texts[n]}" for n, word in words.items() if side in _given(word.given_to, ego)],
+        )
+        for side in SIDES
+    }
     programs = {name: PROGRAMS[name] for name in sides.values() if name not in registry}
+    scenario = _scenario(file, levels, programs, ego)
+    if file.given_to.get(PERCEPTION, "both") != "both":
+        one_sided |= scenario.perception_left != scenario.perception_right
+    parts = (texts[n] if n in (MODEL, PROMPT) else f"{n}={texts[n]}" for n in varying)
+    label = " ".join(parts) or texts[PROMPT]
     return Arm(
         model="+".join(dict.fromkeys(sides.values())),
         sides=sides,
         asked=asked,
-        entries=entries,
-        scenario=_scenario(file, levels, programs),
-        variant=texts[PROMPT],
+        entries={asked[side]: entry for side, entry in entries.items()},
+        scenario=scenario,
+        variant=variant,
         repetitions=repetitions,
-        factors={name: text for name, text in texts.items() if name in file.factors},
-        label=" ".join(labels) or texts[PROMPT],
-        ego=ego_side(sides, registry, opponent),
+        factors={
+            n: t for n, t in texts.items() if n in file.factors or (n == PROMPT and file.texts)
+        },
+        label=f"{label} mirrored" if turned else label,
+        ego=ego,
+        focal=ego if one_sided else None,
+        prompts={} if {*prompts.values()} == {variant} else prompts,
     )
 
 
-def _scenario(file: StudyFile, levels: Levels, programs: Mapping[str, Program]) -> ScenarioConfig:
+def _given(given_to: GivenTo, ego: Side) -> list[Side]:
+    """The sides that are given something."""
+    return {"both": [*SIDES], "ego": [ego], "other": [other_side(ego)]}[given_to]
+
+
+def _set_parameters(
+    file: StudyFile,
+    levels: Levels,
+    texts: Mapping[str, str],
+    ego: Side,
+    sides: Mapping[Side, str],
+    asked: dict[Side, str],
+    entries: dict[Side, ModelEntry],
+) -> bool:
+    """Set the parameters of these levels in ``entries``, and add them to the names in ``asked``.
+
+    Returns whether one driver alone has such a parameter. Raises UsageError.
+    """
+    others = {MODEL, PROMPT, OPPONENT, PERCEPTION, *ScenarioConfig.model_fields, *file.texts}
+    changed, one_sided = {*both_sides(texts[MODEL]).values()}, False
+    for parameter in (n for n, x in levels.items() if n not in others and x != DEFAULT):
+        given_to = file.given_to.get(parameter, "both")
+        given = _given(given_to, ego)
+        if given_to == "both":  # an opponent keeps its own
+            given = [side for side in given if sides[side] in changed]
+        if not entries.keys() & {*given}:
+            name = texts[MODEL] if given_to == "both" else sides[given[0]]
+            raise UsageError(f"{name} is a program and takes no {parameter}, only {DEFAULT!r}")
+        for side in [side for side in given if side in entries]:
+            before = entries[side]
+            entries[side] = with_parameter(sides[side], before, parameter, levels[parameter])
+            if entries[side] != before:
+                asked[side] += f" {parameter}={texts[parameter]}"
+                one_sided |= given_to != "both"
+    return one_sided
+
+
+def _plant(
+    words: Iterable[StudyText],
+    ego: Side,
+    sides: Mapping[Side, str],
+    asked: dict[Side, str],
+    entries: dict[Side, ModelEntry],
+) -> None:
+    """Plant in the emulator what the ``words`` say of it: on both sides, which act on one plan.
+
+    What makes one driver go first makes the other yield.
+    """
+    scripted = [side for side, entry in entries.items() if entry.provider == EMULATOR]
+    own = {side: _number(entries[side], "x_own_first") for side in scripted}
+    gap_m = 0.0
+    for word in words:
+        gap_m += word.emulator.gap_m
+        for side in own.keys() & {*_given(word.given_to, ego)}:
+            own[side] += word.emulator.own_first
+    for side in scripted:
+        planted = {
+            "x_own_first": own[side],
+            "x_other_first": own.get(other_side(side), 0.0),
+            "x_gap_m": gap_m + _number(entries[side], "x_gap_m"),
+        }
+        for parameter, number in planted.items():
+            if number != _number(entries[side], parameter):
+                entries[side] = with_parameter(sides[side], entries[side], parameter, number)
+                asked[side] += f" {parameter}={number:g}"
+
+
+def _number(entry: ModelEntry, parameter: str) -> float:
+    """A parameter of the emulator that is 0 where it is not given."""
+    number = entry.parameters.get(parameter)
+    return number if isinstance(number, int | float) else 0.0
+
+
+def _scenario(
+    file: StudyFile, levels: Levels, programs: Mapping[str, Program], ego: Side
+) -> ScenarioConfig:
     """The scenario with the switches of these levels, for these programs; raises UsageError."""
     sides = [f"{PERCEPTION}_{side}" for side in SIDES]
     fields = ScenarioConfig.model_fields.keys() - {*sides}
@@ -260,10 +372,11 @@ def _scenario(file: StudyFile, levels: Levels, programs: Mapping[str, Program]) 
     given |= _world_step(validated(ScenarioConfig, given, "factors"), programs)
     known = {PERFECT_ONE: PERFECT, **file.perception}
     hint = f"define another one as [{PERCEPTION}.NAME]"
+    seeing = [f"{PERCEPTION}_{side}" for side in _given(file.given_to.get(PERCEPTION, "both"), ego)]
     for factor in [name for name in (PERCEPTION, *sides) if name in levels]:
         level = level_text(levels[factor])
         perception = require(known, f"level of the factor {factor}:", level, hint).model_dump()
-        given |= dict.fromkeys(sides if factor == PERCEPTION else [factor], perception)
+        given |= dict.fromkeys(seeing if factor == PERCEPTION else [factor], perception)
     scenario = validated(ScenarioConfig, given, "factors")
     for name, program in programs.items():
         pace_of(scenario, program.in_spec(name))

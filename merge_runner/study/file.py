@@ -22,14 +22,17 @@ from merge_runner.config import (
     validated,
 )
 from merge_runner.errors import UsageError, unknown_name
+from merge_runner.planted_effect import Number
+from merge_runner.prompts.blocks import BASELINE
 from merge_runner.records import MOST_REPETITIONS
 from merge_runner.scenarios.merge.conditions import Condition
 
-BASELINE = "baseline"
 EVERY_PROMPT = "every prompt"
 """Stands for a single number of repetitions in ``StudyFile.repetitions``."""
 EVERY_CONDITION = "all"
 """In the list of conditions: the scenario's own ones."""
+GivenTo = Literal["both", "ego", "other"]
+"""Which drivers have a level: both, the one that is asked about, or the one that it meets."""
 ONE_OF_EACH = "give it a block, a text, or merge and straight"
 TEMPLATE = Path(__file__).with_name("template")
 PLUGIN = "plugin.py"
@@ -106,6 +109,37 @@ class StudyPrompt(Frozen):
     title: str = ""
 
 
+class PlantedWords(Frozen):
+    """What the emulator, which reads no words, does where it is given them, for a rehearsal.
+
+    ``own_first`` is added to its log-odds of going first, ``gap_m`` to the gap that both aim at.
+    """
+
+    own_first: Number = 0.0
+    gap_m: Number = 0.0
+
+
+class StudyText(Frozen):
+    """The words of one level of a factor: what it does to any prompt, and who is given it."""
+
+    add: tuple[AddedText, ...] = ()
+    remove: tuple[str, ...] = ()
+    replace: dict[str, RoadTexts] = Field(default_factory=dict)
+    given_to: GivenTo = "both"
+    emulator: PlantedWords = PlantedWords()
+
+    @model_validator(mode="after")
+    def _does_something(self) -> StudyText:
+        if not (self.remove or self.replace or self.add):
+            raise ValueError("it changes no word: give it add, replace or remove, or leave it out")
+        if self.emulator.own_first and self.given_to == "both":
+            raise ValueError(
+                "of two drivers with the same words neither goes first more often: own_first needs "
+                'given_to = "ego" or "other"'
+            )
+        return self
+
+
 class StudyDriver(Frozen):
     """A driver that a study makes of a ``program``: with other parameters, or another clock.
 
@@ -145,6 +179,9 @@ class StudyFile(Frozen):
 
     With ``mirror`` two different drivers are played both ways round. ``perception`` holds by name
     what the levels of the factors perception, perception_left and perception_right stand for.
+    ``texts`` hold the words of a factor by level; a level without any leaves the prompt as it is.
+    ``given_to`` names the driver that has the levels of a parameter or of the perception, where not
+    both have them.
     ``budget`` is what it may cost, in USD over all models, runs and days, ``plugins`` are Python
     files that register drivers, prompt blocks, metrics and so on, beside the study.
     """
@@ -163,6 +200,8 @@ class StudyFile(Frozen):
     primary: Annotated[str, Field(min_length=1)] = "goes_first"
     mirror: bool = False
     prompts: dict[str, StudyPrompt] = Field(default_factory=dict)
+    texts: dict[str, dict[str, StudyText]] = Field(default_factory=dict)
+    given_to: dict[str, GivenTo] = Field(default_factory=dict)
     drivers: dict[str, StudyDriver] = Field(default_factory=dict)
     perception: dict[str, Perception] = Field(default_factory=dict)
     budget: dict[Literal["total_usd"], NotNegative] = Field(default_factory=dict)

@@ -10,6 +10,7 @@ import threading
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib import import_module
 from importlib.abc import InspectLoader
 from importlib.util import module_from_spec, spec_from_loader
@@ -30,9 +31,17 @@ from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
 from merge_runner.llm.models import REGISTRY, read_entries, registry_files
 from merge_runner.paths import SHIPPED_EXPERIMENTS
-from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Block, Variant, blocks_of, with_block
+from merge_runner.prompts.blocks import (
+    BLOCKS,
+    VARIANTS,
+    WORDS,
+    Block,
+    Variant,
+    blocks_of,
+    with_block,
+)
 from merge_runner.records import canonical_json
-from merge_runner.registry import FAULTS, Catalogue, collecting, installing, require
+from merge_runner.registry import FAULTS, NAME, Catalogue, collecting, installing, require
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.source import STUDY_PLUGINS, parsed
 from merge_runner.study.crossing import OPPONENT, chosen_models, level_text
@@ -42,6 +51,7 @@ from merge_runner.study.file import (
     StudyFile,
     StudyPrompt,
     StudySource,
+    StudyText,
     read_study,
 )
 from merge_runner.text_safety import one_line, printable, say
@@ -178,6 +188,15 @@ def catalogue_of(
                 CONDITIONS.register(name, condition)
         for name, prompt in file.prompts.items():
             VARIANTS.register(name, _variant(name, prompt))
+        for factor, texts in file.texts.items():
+            for level in texts:
+                if not NAME.fullmatch(level):
+                    raise UsageError(
+                        f"[texts.{factor}]: the level {level!r} needs a name of letters, digits, _ "
+                        "- and ."
+                    )
+            changes = {lv: partial(_changed, f"{factor}={lv}", text) for lv, text in texts.items()}
+            WORDS.register(factor, changes)
         for name, driver in file.drivers.items():
             changes = driver.model_extra or {}
             try:
@@ -267,16 +286,29 @@ def _run_plugin(name: str, file: str, source: str) -> None:
 
 def _variant(name: str, prompt: StudyPrompt) -> Variant:
     """The variant that a prompt of a study is; raises UsageError."""
-    kind = f"block of the prompt {name}"
     before = blocks_of(prompt.based_on)
+    blocks = _changed(name, prompt, before)
+    return Variant(
+        removes=frozenset(each for each, block in before.items() if blocks.get(each) != block),
+        adds=frozenset(each for each, block in blocks.items() if before.get(each) != block),
+        title=prompt.title,
+        blocks=tuple(blocks.items()),
+    )
+
+
+def _changed(
+    name: str, change: StudyPrompt | StudyText, before: Mapping[str, Block]
+) -> dict[str, Block]:
+    """The blocks of a prompt that is changed to the one of this name; raises UsageError."""
+    kind = f"block of the prompt {name}"
     blocks = dict(before)
-    for each in prompt.remove:
+    for each in change.remove:
         require(blocks, kind, each)
         del blocks[each]
-    for each, texts in prompt.replace.items():
+    for each, texts in change.replace.items():
         block = require(blocks, kind, each)
         blocks[each] = replace(block, merge=texts.merge, straight=texts.straight)
-    for number, added in enumerate(prompt.add, 1):
+    for number, added in enumerate(change.add, 1):
         block_name, anchor = added.block or f"{name}.{number}", added.before or added.after
         if block_name in blocks:
             raise UsageError(f"the prompt {name} adds the block {block_name}, which it has already")
@@ -287,9 +319,4 @@ def _variant(name: str, prompt: StudyPrompt) -> Variant:
         if anchor is not None:
             require(blocks, kind, anchor)
         blocks = with_block(blocks, block_name, block, anchor, after=added.after is not None)
-    return Variant(
-        removes=frozenset(each for each, block in before.items() if blocks.get(each) != block),
-        adds=frozenset(each for each, block in blocks.items() if before.get(each) != block),
-        title=prompt.title,
-        blocks=tuple(blocks.items()),
-    )
+    return blocks

@@ -5,7 +5,7 @@ from __future__ import annotations
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from merge_runner.study.file import BASELINE
+from merge_runner.prompts.blocks import BASELINE
 from merge_runner_analysis.figures.style import (
     LINE_IN,
     LINES,

@@ -14,10 +14,9 @@ from pandas.api.types import is_string_dtype
 
 from merge_runner.drivers.registry import MOCKS
 from merge_runner.errors import UsageError
-from merge_runner.prompts.blocks import title_of
+from merge_runner.prompts.blocks import BASELINE, title_of
 from merge_runner.records import NO_DECISION
 from merge_runner.results.provenance import program
-from merge_runner.study.file import BASELINE
 from merge_runner_analysis.cache import finished, keep_finished
 from merge_runner_analysis.explain import Source, sources_of, sql_command
 from merge_runner_analysis.figures import FIGURES

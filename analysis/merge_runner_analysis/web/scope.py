@@ -9,8 +9,7 @@ from typing import Any
 
 from starlette.datastructures import QueryParams
 
-from merge_runner.prompts.blocks import title_of
-from merge_runner.study.file import BASELINE
+from merge_runner.prompts.blocks import BASELINE, title_of
 from merge_runner_analysis.web.phrases import ordered
 from merge_runner_analysis.web.site import SCOPE, NotThere, Site
 

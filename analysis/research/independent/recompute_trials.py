@@ -71,7 +71,10 @@ def read(db: str, study: str = "") -> pd.DataFrame:
         orders.setdefault(row.study, json.loads(row.levels) if row.levels else {})
     samples = {key: _samples(rows) for key, rows in states.groupby(KEYS)}
     decided = dict(list(decisions.groupby(KEYS)))
-    levels = {key: dict(rows[["factor", "value"]].values) for key, rows in factors.groupby(KEYS)}
+    levels = {
+        key: {row.factor: (row.value, row.words) for row in rows.itertuples()}
+        for key, rows in factors.groupby(KEYS)
+    }
     studies = {key: frozenset(rows["study"]) for key, rows in played.groupby(KEYS)}
     found = []
     for trial in trials.itertuples():
@@ -129,8 +132,9 @@ def _with_cells(trials: pd.DataFrame) -> pd.DataFrame:
     return trials.assign(cell=pd.Series(list(cells), trials.index, dtype=object))
 
 
-def _named(trial, spec, factors, own) -> dict:
+def _named(trial, spec, stored, own) -> dict:
     """The driver's name, the ego's side, and the levels of the trial."""
+    factors = {name: level for name, (level, _) in stored.items()}
     if trial.source == "human":
         return {"driver": "human", "ego": "left", "levels": {}, "programs": False, "asked": {}}
     models = {"left": trial.model_left, "right": trial.model_right}
@@ -143,9 +147,10 @@ def _named(trial, spec, factors, own) -> dict:
             ego = "left" if asking["left"] else "right"
         else:
             ego = min(SIDES, key=models.get)
+    ego = trial.focal or ego
     one, other = models[ego], models["right" if ego == "left" else "left"]
     own_factors = {n: v for n, v in factors.items() if n != "prompt"}
-    shown = {n: v for n, v in own_factors.items() if n != "opponent"}
+    shown = {n: v for n, v in own_factors.items() if n != "opponent" and not stored[n][1]}
     driver = one if one == other else f"{one}+{other}"
     driver += f" [{', '.join(f'{n}={v}' for n, v in sorted(shown.items()))}]" if shown else ""
     model = one if one == other or opponent not in (None, "self") else f"{one}+{other}"
@@ -153,7 +158,7 @@ def _named(trial, spec, factors, own) -> dict:
     return {
         "driver": driver,
         "ego": ego,
-        "levels": {"model": model, "prompt": trial.variant} | own_factors,
+        "levels": {"model": model, "prompt": factors.get("prompt", trial.variant)} | own_factors,
         "programs": not any(asking.values()),
         "asked": {models[side]: (int(n), int(n - valid)) for side, n, valid in asked.itertuples()},
     }

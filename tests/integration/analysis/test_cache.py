@@ -31,7 +31,8 @@ CHANGES = {
     "a fate": "UPDATE calls SET outcome = 'unknown' WHERE attempt = 1 AND decision = 0",
     "an alias": "UPDATE sweeps SET config = '{\"models\": {}}'",
     "a trial of a sweep": "DELETE FROM sweep_trials WHERE trial_id LIKE '%N_0_0/rep01'",
-    "a level": "INSERT INTO trial_factors SELECT trial_id, spec_hash, 'mood', 'good' FROM trials",
+    "a level": "INSERT INTO trial_factors SELECT trial_id, spec_hash, 'mood', 'good', false "
+    "FROM trials",
     "a setting": "UPDATE specs SET spec = '{}'",
     "a trial": "INSERT INTO trials SELECT * REPLACE ('o3/baseline/N_0_0/rep99' AS trial_id, "
     "99 AS rep) FROM trials WHERE trial_id LIKE '%N_0_0/rep01'",

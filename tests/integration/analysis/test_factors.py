@@ -184,7 +184,7 @@ def test_an_interaction_is_the_difference_of_the_differences_in_shared_cells(tmp
     moody = changed(
         write_study(tmp_path / "t.duckdb", drives),
         "INSERT INTO trial_factors SELECT trial_id, spec_hash, 'mood', "
-        "if(rep % 2 = 0, 'late', 'early') FROM trials",
+        "if(rep % 2 = 0, 'late', 'early'), false FROM trials",
     )
     rows = values_of(Study(moody.db, Selection(by="mood")), "factors")
     late, early = (rows[f"mood={m}/prompt=A1/gap_m"]["difference"] for m in ("late", "early"))

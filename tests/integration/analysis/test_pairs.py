@@ -182,7 +182,7 @@ def test_the_program_and_the_database_agree_on_the_ego(tmp_path):
             connection.execute("UPDATE specs SET spec = ?", [json.dumps(spec)])
             connection.execute("DELETE FROM trial_factors")
             connection.execute(
-                "INSERT INTO trial_factors SELECT trial_id, spec_hash, 'opponent', level "
+                "INSERT INTO trial_factors SELECT trial_id, spec_hash, 'opponent', level, false "
                 "FROM trials, (SELECT ?::VARCHAR AS level)",
                 [opponent],
             )

@@ -89,7 +89,8 @@ def test_without_a_choice_tables_say_what_they_pool_and_test_nothing_across_stud
 def test_a_trial_may_have_factors_of_another_study_beside_its_own(copy, prepare, tmp_path):
     changed(
         copy,
-        "INSERT INTO trial_factors SELECT trial_id, spec_hash, 'weather', 'rain' FROM trials",
+        "INSERT INTO trial_factors SELECT trial_id, spec_hash, 'weather', 'rain', false "
+        "FROM trials",
     )
     audit = prepare(tmp_path, "audit", "--db", copy)
     assert audit.code == 0, audit.out
@@ -107,7 +108,7 @@ def test_a_second_study_changes_no_reference(copy):
     study = changed(
         copy,
         "INSERT INTO trial_factors SELECT trial_id, spec_hash, 'perception', "
-        "if(rep % 2 = 0, 'foggy', 'perfect') FROM trials",
+        "if(rep % 2 = 0, 'foggy', 'perfect'), false FROM trials",
         f"UPDATE sweeps SET config = json_merge_patch(config, '{json.dumps({'levels': levels})}') "
         "WHERE started_at = (SELECT max(started_at) FROM sweeps)",
     )

@@ -42,6 +42,7 @@ def plan_of(folder, example, **asked):
         ("Who, how often, where", 2),
         ("What varies", 12 + 6 + 4 + 2),  # those against projected-order both ways round
         ("Prompts", 5),
+        ("Words that cross", 1 + 7 * 2),
         ("The driving task", 1),
         ("What a driver perceives", 2),
         ("Drivers", 3),
@@ -70,7 +71,7 @@ async def test_the_study_of_the_readme_fits_its_cap_with_models_that_answer_in_2
 
 
 def test_every_key_is_explained_and_shown_in_an_example():
-    assert len(EXAMPLES) == PAGE.count("```toml\n") == 7
+    assert len(EXAMPLES) == PAGE.count("```toml\n") == 8
     explained = re.sub(r"```.*?```", "", PAGE, flags=re.DOTALL)
     shown = "\n".join(EXAMPLES.values())
     for key in keys(StudyFile):

@@ -7,8 +7,7 @@ from collections.abc import Collection, Mapping
 from functools import partial
 from typing import Any
 
-from merge_runner.prompts.blocks import Variant, blocks_of
-from merge_runner.study.file import BASELINE
+from merge_runner.prompts.blocks import BASELINE, Variant, blocks_of
 from merge_runner_analysis.metrics import COLLISIONS
 from merge_runner_analysis.tables.formats import printed
 from merge_runner_analysis.tables.model import Row, Table

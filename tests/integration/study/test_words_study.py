@@ -1,0 +1,122 @@
+"""A study of words that are given to one driver, from its file to what is stored and replayed."""
+
+import math
+
+import pytest
+
+from merge_runner.results.store import query, results_digest
+from tests.support.harness import FAST
+
+# A study in 15 lines, but for who is given the hurry and what is planted.
+STUDY = """\
+description = "Does a driver in a hurry go first?"
+models = ["emulator"]
+repetitions = 20
+conditions = ["N_0_0"]
+mirror = true
+[factors]
+persona = ["none", "taxi"]
+hurry = ["no", "yes"]
+opponent = ["self", "projected-order"]
+[texts.persona.taxi]
+add = [{ after = "C3.human", text = "You are a taxi driver." }]
+given_to = "ego"
+[texts.hurry.yes]
+add = [{ after = "C3.human", text = "You are late, and in a hurry." }]
+"""
+PLANTED = STUDY + 'given_to = "ego"\nemulator = { own_first = 1.5 }\n'
+FIRST = """
+SELECT value, focal, count(*) FILTER (merged_first = coalesce(focal, 'left')),
+    count(*) FILTER (merged_first IS NOT NULL)
+FROM trials JOIN trial_levels USING (trial_id, spec_hash)
+WHERE factor = 'hurry' AND model_left = model_right GROUP BY ALL ORDER BY ALL
+"""
+
+
+@pytest.fixture(scope="module")
+def db(prepare, tmp_path_factory):
+    """The study, played in two runs: first a part of it, and then the rest."""
+    folder = tmp_path_factory.mktemp("words")
+    (folder / "words.toml").write_text(PLANTED)
+    for part in (("--only", "hurry=yes"), ()):
+        done = prepare(folder, "sweep", "words.toml", *part, *FAST)
+        assert done.code == 0, done.err
+    return folder / "results/merge.duckdb"
+
+
+def test_the_planted_effect_is_that_of_the_treated_driver_on_both_sides(db):
+    _, rows = query(db, FIRST)
+    shares = {(level, focal): (first, trials) for level, focal, first, trials in rows}
+    assert {*shares} == {("no", None), *((y, s) for y in ("no", "yes") for s in ("left", "right"))}
+    # 43 % for the left one without an effect, in logits -0.3.
+    for side, base in (("left", -0.3), ("right", 0.3)):
+        first, trials = shares["yes", side]
+        share = 1 / (1 + math.exp(-base - 1.5))
+        assert trials >= 36
+        assert first / trials == pytest.approx(
+            share, abs=4 * math.sqrt(share * (1 - share) / trials)
+        )
+
+
+def test_levels_and_the_focal_side_are_stored(db):
+    _, rows = query(
+        db,
+        "SELECT DISTINCT variant, focal, ego, driver, persona.value, hurry.value, prompt.value "
+        "FROM trials JOIN trial_drivers USING (trial_id, spec_hash) "
+        "JOIN trial_levels AS persona USING (trial_id, spec_hash) "
+        "JOIN trial_levels AS hurry USING (trial_id, spec_hash) "
+        "JOIN trial_levels AS prompt USING (trial_id, spec_hash) "
+        "WHERE model_left = model_right AND persona.factor = 'persona' "
+        "AND hurry.factor = 'hurry' AND prompt.factor = 'prompt' ORDER BY ALL",
+    )
+    assert rows == [
+        ("baseline", None, "left", "emulator", "none", "no", "baseline"),
+        *(
+            (variant, side, side, "emulator", persona, hurry, "baseline")
+            for variant, persona, hurry in (
+                ("hurry=yes", "none", "yes"),
+                ("persona=taxi", "taxi", "no"),
+                ("persona=taxi hurry=yes", "taxi", "yes"),
+            )
+            for side in ("left", "right")
+        ),
+    ]
+    _, prompts = query(
+        db,
+        "SELECT DISTINCT side = focal, contains(prompt, 'in a hurry'), "
+        "contains(prompt, 'taxi driver') "
+        "FROM decisions JOIN trials USING (trial_id, spec_hash) "
+        "WHERE variant = 'persona=taxi hurry=yes' AND prompt IS NOT NULL ORDER BY ALL",
+    )
+    assert prompts == [(False, False, False), (True, True, True)]
+
+
+async def test_it_replays_from_its_recording_to_the_same_digest_and_is_audited(
+    merge_runner, db, tmp_path
+):
+    (tmp_path / "words.toml").write_text(PLANTED)
+    cache = db.parents[1] / "cache/responses"
+    recorded = await merge_runner("recording", "export", "r.parquet", "--cache", cache, "--db", db)
+    assert recorded.code == 0, recorded.err
+    again = ("replay", "words.toml", "--recording", "r.parquet", "--db", "again", *FAST)
+    replayed = await merge_runner(*again)
+    assert replayed.code == 0, replayed.err
+    assert results_digest(tmp_path / "again") == results_digest(db)
+    assert query(tmp_path / "again", FIRST) == query(db, FIRST)
+    audit = await merge_runner("audit", "--db", "again")
+    assert audit.code == 0, audit.out
+
+
+async def test_a_run_says_where_several_prompts_gave_the_same_trials(merge_runner, tmp_path):
+    text = STUDY.replace("repetitions = 20", "repetitions = 2") + 'given_to = "ego"\n'
+    (tmp_path / "words.toml").write_text(text)
+    told = await merge_runner("sweep", "words.toml", "--only", "opponent=self", *FAST)
+    assert told.code == 0, told.err
+    assert (
+        "baseline, hurry=yes, persona=taxi, persona=taxi hurry=yes gave the same trials: the "
+        "emulator reads no words; plant an effect to rehearse (docs/how-to/run-a-study.md)"
+    ) in told.err + told.out
+    text = text + "emulator = { own_first = 6 }\n"
+    (tmp_path / "words.toml").write_text(text)
+    told = await merge_runner("sweep", "words.toml", "--only", "opponent=self", *FAST)
+    assert "baseline, persona=taxi gave the same trials" in told.err + told.out
