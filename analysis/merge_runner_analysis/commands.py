@@ -70,7 +70,7 @@ ByOption = Annotated[
     str | None,
     option(
         "FACTOR",
-        "With the table factors: the others at each level of this one, and interactions.",
+        "With the table effects: the other factors at each level of this one, and interactions.",
         "--by",
     ),
 ]
@@ -114,8 +114,8 @@ def tables(
 
     Example: merge-runner tables who-first gap --format csv
     """
-    if by is not None and list(names or ()) != ["factors"]:
-        raise UsageError("--by FACTOR goes with the table factors: tables factors --by FACTOR")
+    if by is not None and (not names or not {*names} <= {"effects", "factors"}):
+        raise UsageError("--by FACTOR goes with the table effects: tables effects --by FACTOR")
     use_study(study_file, trust=trust)
     from merge_runner_analysis.tables import finished_tables
     from merge_runner_analysis.tables.formats import render

@@ -57,12 +57,24 @@ SELECT placed.* EXCLUDE (driver, ego, turned, mean_mps) REPLACE (
     trial_metrics.* EXCLUDE (trial_id, spec_hash) REPLACE (
         if(turned, rmse_right_mps, rmse_left_mps) AS rmse_left_mps,
         if(turned, rmse_left_mps, rmse_right_mps) AS rmse_right_mps
-    ), ego
+    ), ego, cost_usd,
+    CASE WHEN model_left = model_right THEN left_replies + right_replies
+        WHEN turned THEN right_replies ELSE left_replies END AS replies,
+    CASE WHEN model_left = model_right THEN left_valid + right_valid
+        WHEN turned THEN right_valid ELSE left_valid END AS valid_replies
 FROM placed JOIN trial_metrics USING (trial_id, spec_hash)
 LEFT JOIN (
-    SELECT trial_id, spec_hash, bool_or(side = 'left') AS left_scripted,
-        bool_or(side = 'right') AS right_scripted
-    FROM calls WHERE scripted GROUP BY ALL
+    SELECT trial_id, spec_hash, bool_or(scripted AND side = 'left') AS left_scripted,
+        bool_or(scripted AND side = 'right') AS right_scripted,
+        if(count(*) = count(cost_usd), sum(cost_usd), NULL) AS cost_usd
+    FROM calls GROUP BY ALL
+) USING (trial_id, spec_hash)
+LEFT JOIN (
+    SELECT trial_id, spec_hash, count(*) FILTER (side = 'left') AS left_replies,
+        count(*) FILTER (side = 'right') AS right_replies,
+        count(*) FILTER (side = 'left' AND valid) AS left_valid,
+        count(*) FILTER (side = 'right' AND valid) AS right_valid
+    FROM decisions WHERE call_key IS NOT NULL GROUP BY ALL
 ) USING (trial_id, spec_hash)
 LEFT JOIN images ON turned AND headway_m = 0 - projected_headway_m
     AND velocity_mps = 0 - relative_velocity_mps

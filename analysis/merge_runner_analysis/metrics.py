@@ -33,10 +33,13 @@ class Metric:
     ``name`` is that of its columns and rows, and ends with the unit. ``value`` is SQL over the
     columns of ``trials`` and ``trial_metrics``, or one of JUDGED; a subquery over another table
     knows the trial as ``trials.trial_id`` and ``trials.spec_hash``. A proportion is of a BOOLEAN
-    and printed in percent. ``trials`` are those that count, unless their value is NULL.
+    and printed in percent. ``trials`` are those that count, unless their value is NULL. ``weight``
+    is SQL of how much a trial counts in a mean: of a share of its replies, how many these are.
 
     ``label`` and ``unit`` head a column, ``meaning`` says what the number of one trial is, or of
     what a proportion is the share. Raises UsageError where these do not fit together.
+
+    ``least`` is the smallest value that there can be, which intervals and axes do not pass.
 
     ``paper_of_drivers`` and ``paper_of_humans`` are columns of ``paper_ablation_quantitative.csv``.
     """
@@ -46,11 +49,13 @@ class Metric:
     unit: str
     meaning: str
     value: str
+    weight: str = ""
     estimator: Estimator = "mean"
     trials: Literal["finished", "ended"] = "finished"
     paper_of_drivers: str = ""
     paper_of_humans: str = ""
     shown: bool = True
+    least: float | None = None
 
     def __post_init__(self) -> None:
         if not self.name.isidentifier():
@@ -74,13 +79,20 @@ class Metric:
         return self.value if self.value in JUDGED else f"counted_{self.name}"
 
     @property
+    def weight_column(self) -> str:
+        """The column of the trials that holds its weight."""
+        return f"weight_{self.name}"
+
+    @property
     def selected(self) -> str:
-        """Its column as an expression of SQL over ``trials JOIN trial_metrics``."""
+        """Its columns as expressions of SQL over ``trials JOIN trial_metrics``."""
         typed = f"({self.value})::{'BOOLEAN' if self.rate else 'DOUBLE'}"
         there = f"{self.value} IS NOT NULL"
         if not self.value.isidentifier():  # what is no finite number is no value
             there = f"({self.value}) IS NOT NULL" if self.rate else f"isfinite({typed})"
-        return f"CASE WHEN {STATUS[self.trials]} AND {there} THEN {typed} END AS {self.column}"
+        weight = f", ({self.weight})::DOUBLE AS {self.weight_column}" if self.weight else ""
+        counts = f"{STATUS[self.trials]} AND {there}"
+        return f"CASE WHEN {counts} THEN {typed} END AS {self.column}{weight}"
 
 
 METRICS = Registry[Metric]("metric")
@@ -125,9 +137,10 @@ BOXES = register(
 LEFT_FIRST = register(
     Metric(
         name="left_first_percent",
-        label="left first",
+        label="goes first",
         unit="%",
-        meaning="share of finished trials with a first merger in which it is the left vehicle",
+        meaning="share of finished trials with a first merger in which it is the driver that is "
+        "named first, of two equal ones the left one",
         value="merged_first = 'left'",
         estimator="proportion",
         shown=False,
@@ -152,6 +165,7 @@ RMSE = register(
         meaning="RMSE of the speed from the initial speed, mean of both vehicles, to the first "
         "merge",
         value="rmse_mps",
+        least=0.0,
         paper_of_drivers="rmse_mps",
         paper_of_humans="rmse_mps",
     )
@@ -166,6 +180,34 @@ JOINT = register(
         estimator="proportion",
         paper_of_drivers="joint_percent",
         paper_of_humans="joint_percent",
+    )
+)
+
+
+VALID = register(
+    Metric(
+        name="valid_percent",
+        label="valid replies",
+        unit="%",
+        meaning="share of the replies, of two different drivers those to the one that is named "
+        "first, with a valid plan",
+        value="100 * valid_replies / nullif(replies, 0)",
+        weight="replies",
+        trials="ended",
+        shown=False,
+        least=0.0,
+    )
+)
+COST = register(
+    Metric(
+        name="cost_usd",
+        label="cost",
+        unit="USD",
+        meaning="price of the calls of a trial; none where a price is not known",
+        value="cost_usd",
+        trials="ended",
+        shown=False,
+        least=0.0,
     )
 )
 
@@ -197,6 +239,7 @@ for _name, (_label, _meaning) in SURROGATES.items():
             meaning=_meaning,
             value=_name,
             estimator="median",
+            least=0.0,
         )
     )
 RULES_NOTE = (

@@ -53,6 +53,7 @@ def with_metrics(connection: duckdb.DuckDBPyConnection, trials: str) -> pd.DataF
     """
     metrics = [metric for metric in METRICS.values() if metric.value not in JUDGED]
     types = {metric.column: "boolean" if metric.rate else "float" for metric in metrics}
+    types |= {metric.weight_column: "float" for metric in metrics if metric.weight}
     try:
         return _selected(connection, trials, metrics).astype(types)
     except duckdb.Error:

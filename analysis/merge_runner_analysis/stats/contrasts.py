@@ -1,46 +1,39 @@
-"""Differences between two groups of trials: exact tests, least squares, and corrections."""
+"""Differences between two groups of trials within cells: rates, means, and their corrections."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import combinations
+from math import hypot, sqrt
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from scipy import optimize, special, stats
 
-from merge_runner_analysis.cache import remembered
-from merge_runner_analysis.grouping import Group
-from merge_runner_analysis.metrics import Metric
 from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.intervals import (
     LEVEL,
     POWER,
     ROUNDING,
-    difference,
-    melded,
-    newcombe,
+    Z,
     tested,
     two_sided_p,
 )
-from merge_runner_analysis.stats.measures import trials_of, undecided
-from merge_runner_analysis.study import Study, in_one_study
 
 # Where less of a trial's deviation is left over than this, it alone decides the difference.
 LEVERAGE = 1e-9
-# A condition, or a condition and a level of each other factor.
-Cell = str | tuple[str, ...]
+NEAREST = 1e-9  # to a difference, of what it may be instead
+LARGEST_Z = 30.0  # of this quantile p is 0 to 190 digits
+Z_WITH_POWER = Z + float(stats.norm.ppf(POWER))
 
 
 @dataclass(frozen=True, slots=True)
 class Cells:
-    """Two rates by condition: successes and trials of the first, and of the second.
+    """Two rates by cell: successes and trials of the first, and of the second.
 
-    Conditions weigh n m / (n + m), as by Mantel and Haenszel and in least squares.
+    Their difference is that of Mantel and Haenszel: cells weigh n m / (n + m), as in least squares.
     """
 
     a: NDArray[np.int_]
@@ -49,28 +42,49 @@ class Cells:
     m: NDArray[np.int_]
 
     @property
-    def rates(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Both rates with these weights, each with the trials that it is as good as.
+    def shares(self) -> NDArray[np.float64]:
+        """What each cell weighs, of 1."""
+        weights = self.n * self.m / (self.n + self.m)
+        return np.asarray(weights / weights.sum(), dtype=float)
 
-        These are the more, the less of the spread of outcomes lies within conditions. Rates there
-        are of both together and of one trial more, of the overall rate: none is 0 or 1 for sure.
+    @property
+    def difference(self) -> float:
+        """The first rate less the second."""
+        return float(self.shares @ (self.a / self.n - self.b / self.m))
+
+    def variance(self, apart: float) -> float:
+        """Return that of the difference if the rates of every cell are so far apart.
+
+        As Miettinen and Nurminen (1985) have it: of the likeliest such rates, and unbiased however
+        few trials a cell has. Where both rates are equal the test is that of Mantel and Haenszel.
         """
-        every = self.n + self.m
-        weights = self.n * self.m / every
-        shares, rates = weights / weights.sum(), (self.a + self.b) / every
-        overall = float(shares @ rates)
-        within = (self.a + self.b + overall) / (every + 1)
-        spread = float(shares @ (within * (1 - within)))
-        gain = max(1.0, overall * (1 - overall) / spread) if spread else 1.0
-        (one, n), (other, m) = (
-            weighted(self.a, self.n, weights),
-            weighted(self.b, self.m, weights),
-        )
-        return (one, gain * n), (other, gain * m)
+        n, m = self.n, self.m
+        p, q = _likeliest(self.a, n, self.b, m, apart)
+        every = n + m
+        of_cells = (p * (1 - p) / n + q * (1 - q) / m) * every / (every - 1)
+        return float(self.shares**2 @ of_cells)
+
+    def end(self, sign: int, z: float = Z) -> float:
+        """Return the lower end (-1) or the upper one (1) of the score interval at a quantile.
+
+        Beyond it are the differences that are ``z`` of their standard errors from the observed one.
+        """
+        value = self.difference
+
+        def beyond(apart: float) -> float:
+            return sign * (apart - value) - z * sqrt(self.variance(apart))
+
+        far, near = float(sign), value + sign * NEAREST
+        if sign * near >= 1 or beyond(far) <= 0:
+            return far
+        # The side of 0 on which the end lies is what the test of no difference says.
+        if sign * value < 0 and sign * near < 0:
+            far, near = (0.0, near) if beyond(0.0) > 0 else (far, 0.0)
+        return near if beyond(near) >= 0 else float(optimize.brentq(beyond, near, far))
 
     @property
     def p(self) -> float:
-        """Of Fisher's exact test within conditions, two-sided by probability."""
+        """Of Fisher's exact test within cells, two-sided by probability."""
         chances, least = np.ones(1), 0
         for a, n, b, m in zip(self.a, self.n, self.b, self.m, strict=True):
             there = np.arange(max(0, a + b - m), min(n, a + b) + 1)
@@ -79,6 +93,25 @@ class Cells:
         # As likely but for rounding is as likely.
         likely = chances <= chances[self.a.sum() - least] * (1 + 1e-7)
         return min(1.0, float(chances[likely].sum() / chances.sum()))
+
+
+def _likeliest(
+    a: NDArray[np.int_], n: NDArray[np.int_], b: NDArray[np.int_], m: NDArray[np.int_], apart: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The likeliest rates of which the first is by so much larger (Miettinen and Nurminen 1985).
+
+    The second is a root of a cubic, which their appendix gives in closed form.
+    """
+    every, hits = n + m, a + b
+    square = (n + 2 * m) * apart - every - hits
+    linear = (m * apart - every - 2 * b) * apart + hits
+    middle = square / (3 * every)
+    turn = middle**3 - square * linear / (6 * every**2) + b * apart * (1 - apart) / (2 * every)
+    size = np.copysign(np.sqrt(np.maximum(middle**2 - linear / (3 * every), 0)), turn)
+    cubed = np.where(size == 0, 1, size**3)
+    angle = (np.pi + np.arccos(np.clip(turn / cubed, -1, 1))) / 3
+    second = np.clip(2 * size * np.cos(angle) - middle, max(0, -apart), min(1, 1 - apart))
+    return np.clip(second + apart, 0, 1), second
 
 
 def weighted(
@@ -101,30 +134,58 @@ def shared_cells(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Cel
     return Cells(*both) if shared else None
 
 
-def contrast_cells(both: Cells) -> Estimate:
-    """Two rates within conditions: Fisher's exact test, and the interval that agrees with it."""
-    first, second = both.rates
-    found = detectable_rate(int(both.n.sum()), int(both.m.sum()), second[0])
-    ends = melded(first, second, both.p)
-    return Estimate(first[0] - second[0], *ends, p=both.p, detectable=found)
+def contrast_rates(cells: Cells) -> Estimate:
+    """Two rates within cells: the test of Mantel and Haenszel (1959), and its score interval.
 
-
-def difference_of_rates(rates: Sequence[tuple[float, float]]) -> Estimate:
-    """Return a difference of rates, (rate, trials) each, with the interval of ``newcombe``.
-
-    Its p is the level at which that interval leaves 0 out.
+    The interval has the differences that the test of Miettinen and Nurminen (1985) does not reject.
+    ``detectable`` is the one that is so many standard errors from 0 as it takes for the power. None
+    where not even rates of 0 and 1 would be told apart.
     """
-    low, high = newcombe(rates)
-    value = sum(rate for rate, _ in rates[::2]) - sum(rate for rate, _ in rates[1::2])
+    value, se = cells.difference, sqrt(cells.variance(0))
+    ends = cells.end(-1), cells.end(1)
+    p = two_sided_p(value / se) if se else 1.0
+    none = np.zeros_like(cells.n)
+    surest = Cells(cells.n, cells.n, none, cells.m)
+    least = None
+    if two_sided_p(1 / sqrt(surest.variance(0))) < 1 - LEVEL:
+        least = min(
+            (found for sign in (-1, 1) if (found := _detectable(cells, sign))), default=None
+        )
+    return Estimate(value, *ends, se=se, p=p, detectable=least)
 
-    def excludes_zero_by(z: float) -> float:
-        low, high = newcombe(rates, z)
-        return low if value > 0 else -high
 
-    z = 30.0 if value else 0.0  # the largest; of this quantile p is 0 to 190 digits
-    if value and excludes_zero_by(z) <= 0:
-        z = float(optimize.brentq(excludes_zero_by, 0.0, z))
-    return Estimate(value, low, high, p=two_sided_p(z))
+def _detectable(cells: Cells, sign: int) -> float | None:
+    """The smallest difference in this direction that is found with the power."""
+
+    def missing(size: float) -> float:
+        return Z_WITH_POWER * sqrt(cells.variance(sign * size)) - size
+
+    return None if missing(NEAREST) <= 0 else float(optimize.brentq(missing, NEAREST, 1.0))
+
+
+def difference_of_contrasts(one: Cells, other: Cells) -> Estimate:
+    """How far two differences of rates differ: an interaction.
+
+    Its interval follows from those of both (MOVER; Zou and Donner 2008), and p is the level at
+    which that leaves 0 out.
+    """
+    differences = one.difference, other.difference
+    value = differences[0] - differences[1]
+
+    def half(sign: int, z: float) -> float:
+        apart = (one.end(sign, z) - differences[0], other.end(-sign, z) - differences[1])
+        return hypot(*apart)
+
+    def left_out(z: float) -> float:
+        return abs(value) - half(-1 if value > 0 else 1, z)
+
+    z = LARGEST_Z if abs(value) > ROUNDING else 0.0
+    if z and left_out(z) <= 0:
+        z = float(optimize.brentq(left_out, 0.0, z))
+    below, above = half(-1, Z), half(1, Z)
+    least = Z_WITH_POWER / Z * min(below, above)
+    ends = value - below, value + above
+    return Estimate(value, *ends, se=least / Z_WITH_POWER, p=two_sided_p(z), detectable=least)
 
 
 def detectable_rate(n: int, m: int, rate: float) -> float | None:
@@ -221,93 +282,6 @@ def _freedom(
     square = float((n * each) @ apart**2 @ (n * each))
     square += float((n * each**2) @ (own**2 - np.diag(apart) ** 2))
     return mean**2 / square
-
-
-def contrast(
-    study: Study, groups: Sequence[Group], metric: Metric, cell: str = "condition"
-) -> Estimate | None:
-    """The first of two groups minus the second, within the cells that both have.
-
-    Of four groups it is how far the difference of the first two differs from that of the others, in
-    the cells that all have. None where these are of several studies, share no cell or none but
-    copied ones, or have undecided trials; and for medians, which have no test.
-    """
-    frames = trials_by_cell(study, groups, metric, cell, shared=len(groups) > 2)
-    if metric.estimator == "median" or not frames:
-        return None
-    pairs = list(zip(frames[::2], frames[1::2], strict=True))
-    if not metric.rate:
-        one_mean, *other_mean = (contrast_means(*pair, metric.column) for pair in pairs)
-        if one_mean is None or not other_mean:
-            return one_mean
-        return difference(one_mean, other_mean[0]) if other_mean[0] else None
-    cells = [found for pair in pairs if (found := shared_cells(*pair, metric.column))]
-    if len(cells) < len(pairs):
-        return None
-    if len(cells) == 1:
-        return contrast_cells(cells[0])
-    return difference_of_rates([*cells[0].rates, *cells[1].rates[::-1]])
-
-
-def trials_by_cell(
-    study: Study, groups: Sequence[Group], metric: Metric, cell: str, *, shared: bool
-) -> list[pd.DataFrame]:
-    """The trials of each group with a measure, their cell as ``condition``, perhaps as all have.
-
-    Cells of programs that do not heed what the groups differ in are left out. Nothing where the
-    groups are of several studies or have undecided trials.
-    """
-    if not in_one_study(study, *groups) or any(undecided(group, metric) for group in groups):
-        return []
-    every = [
-        pd.DataFrame({"condition": trials[cell], metric.column: trials[metric.column]}).dropna()
-        for trials in (trials_of(group, metric) for group in groups)
-    ]
-    kept = (set.intersection if shared else set.union)(*(set(one["condition"]) for one in every))
-    kept -= copied_cells(study, tuple(groups), cell)
-    return [frame[frame["condition"].isin(kept)] for frame in every]
-
-
-@remembered
-def copied_cells(study: Study, groups: tuple[Group, ...], cell: str) -> set[Cell]:
-    """The cells of programs that do not heed what the groups differ in.
-
-    With the same other levels, all trials of one of two groups are copies of the other's there, in
-    every condition that both have. What they differ by is how often each was drawn, so that nothing
-    can be tested. Conditions are never left out one by one: which of them stay would depend on
-    what happened there.
-    """
-    ways = [_ways(study, group, cell) for group in groups]
-    copied: set[Cell] = set()
-    for one, other in combinations(ways, 2):
-        shared = one.keys() & other.keys()
-        heeded = {
-            _other_levels(each)
-            for each in shared
-            if not (one[each] <= other[each] or other[each] <= one[each])
-        }
-        copied |= {each for each in shared if _other_levels(each) not in heeded}
-    return copied
-
-
-@remembered
-def _ways(study: Study, group: Group, cell: str) -> dict[Cell, set[object]]:
-    """The ways in which the trials of each cell went."""
-    ways: dict[Cell, set[object]] = {}
-    for name, way in zip(group.ended[cell], group.ended["way"], strict=True):
-        ways.setdefault(name, set()).add(way)
-    return ways
-
-
-def _other_levels(cell: Cell) -> Sequence[str]:
-    """Those of a cell of factors; a condition alone has none."""
-    return () if isinstance(cell, str) else cell[1:]
-
-
-def copied_of_shared(study: Study, groups: tuple[Group, ...], cell: str) -> tuple[int, int]:
-    """How many of the cells that groups share are copied ones, and how many they share."""
-    shared = set.intersection(*({*group.ended[cell]} for group in groups))
-    return len(shared & copied_cells(study, groups, cell)), len(shared)
 
 
 def corrected(p: list[float]) -> list[float]:

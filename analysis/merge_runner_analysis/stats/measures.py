@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 from scipy import stats
@@ -40,7 +42,8 @@ def estimate(group: Group, metric: Metric) -> Estimate:
     (Manski 1989): from none of them to all of them.
     """
     if metric.estimator == "mean":
-        return mean_of(trials_of(group, metric), metric.column)
+        trials = trials_of(group, metric)
+        return _ratio(trials, metric) if metric.weight else mean_of(trials, metric.column)
     sample = values(group, metric).to_numpy(float)
     if metric.estimator == "median":
         return median(sample)
@@ -48,7 +51,28 @@ def estimate(group: Group, metric: Metric) -> Estimate:
     if not (every := len(sample) + cut_off):
         return NOTHING
     low, high = wilson(k / every, every)[0], wilson((k + cut_off) / every, every)[1]
-    return Estimate(None if cut_off else 100 * k / every, 100 * low, 100 * high, len(sample))
+    value = None if cut_off else 100 * k / every
+    return Estimate(value, 100 * low, 100 * high, len(sample), k=int(k), undecided=cut_off)
+
+
+def _ratio(trials: pd.DataFrame, metric: Metric) -> Estimate:
+    """A mean in which trials have weights: its interval is that of a ratio of their sums."""
+    known = trials[[metric.column, metric.weight_column]].dropna()
+    value, weight = known[metric.column], known[metric.weight_column]
+    found = mean(linear(value, weight, pd.Series("", known.index)).to_numpy(float))
+    k = round(float((value * weight).sum()) / 100)
+    return replace(found, k=k, weight=float(weight.sum()))
+
+
+def linear(value: pd.Series, weight: pd.Series, cells: pd.Series) -> pd.Series:
+    """Return values with the weighted mean of each cell as their mean, and its error as theirs.
+
+    The usual linear approximation of a ratio (Cochran, Sampling Techniques, 1977, 6.3), so that
+    what clusters in a trial, as its replies do, counts as one observation.
+    """
+    sums = pd.DataFrame({"value": value * weight, "weight": weight}).groupby(cells)
+    ratio = sums["value"].transform("sum") / sums["weight"].transform("sum")
+    return ratio + (value - ratio) * weight / sums["weight"].transform("mean")
 
 
 def mean_of(trials: pd.DataFrame, column: str, shares: pd.Series | None = None) -> Estimate:

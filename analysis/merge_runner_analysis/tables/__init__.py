@@ -48,6 +48,9 @@ TABLES = {
         "Table VI",
     ),
     "ablation-quantitative": Listed("Quantitative measures across prompt ablations", "Table VII"),
+    "effects": Listed(
+        "What each factor changes: its levels against the reference, in every measure"
+    ),
     "contrasts": Listed("Differences between prompts"),
     "factors": Listed("Each factor's levels: every metric, and the difference from the reference"),
     "criticality": Listed("When conflicts are resolved, and how close the vehicles come"),

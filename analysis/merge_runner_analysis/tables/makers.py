@@ -8,9 +8,8 @@ from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.ablation_qualitative import ablation_qualitative
 from merge_runner_analysis.tables.ablation_quantitative import ablation_quantitative
 from merge_runner_analysis.tables.attempts import attempts
-from merge_runner_analysis.tables.contrasts import contrasts
 from merge_runner_analysis.tables.criticality import criticality
-from merge_runner_analysis.tables.factors import factors
+from merge_runner_analysis.tables.effects import contrasts, effects_table, factors
 from merge_runner_analysis.tables.first_action import first_action
 from merge_runner_analysis.tables.gap import gap
 from merge_runner_analysis.tables.indicators import indicators
@@ -25,6 +24,7 @@ MAKERS: dict[str, Callable[[Study], Table]] = {
     "indicators": indicators,
     "ablation-qualitative": ablation_qualitative,
     "ablation-quantitative": ablation_quantitative,
+    "effects": effects_table,
     "contrasts": contrasts,
     "factors": factors,
     "criticality": criticality,

@@ -1,7 +1,7 @@
 """The tables of a results database, recomputed: {table: {row: {column: number or None}}}.
 
-Nothing of the project is imported. Rates are in percent. A row of ``contrasts`` or ``factors`` with
-a p has its ``family``, whose p are corrected together.
+Nothing of the project is imported. Rates are in percent. The corrected p of ``contrasts`` and
+``factors`` are left to a test: their families are all tests of the table ``effects``.
 """
 
 from __future__ import annotations
@@ -330,13 +330,14 @@ def _prompts(groups, orders) -> dict[str, dict]:
         reference = groups.get((driver, listed[0]))
         if reference is None or variant == listed[0] or not _together(orders, trials, reference):
             continue
-        for name, column, kind, shown in METRICS:
-            found = _compared(trials, reference, column, kind) if shown else {}
+        for name, column, kind, shown in _measured(groups):
+            compared = shown or column == "left_first"
+            found = _compared(trials, reference, column, kind) if compared else {}
             if found:
                 frames = [t[t[column].notna()] for t in _otherwise(trials, reference)]
                 shared = {*frames[0]["cell"]} & {*frames[1]["cell"]}
                 sizes = [int(one["cell"].isin(shared).sum()) for one in frames]
-                found |= {"n": sizes[0], "n_reference": sizes[1], "family": (driver, name)}
+                found |= {"n": sizes[0], "n_reference": sizes[1]}
                 rows[f"{driver}/{variant}/{listed[0]}/{name}"] = found
     return rows
 
@@ -364,12 +365,19 @@ def _factors(groups, orders) -> dict[str, dict]:
                 pooled[name] = _with_other_levels(pd.concat(parts), factor)
             pooled = _one_cell(pooled)
             for name in names:
-                for metric, column, kind, _ in METRICS:
+                for metric, column, kind, _ in _measured(groups):
                     row = _level(pooled[name], pooled[names[0]], column, kind, orders)
-                    if row["p"] is not None:
-                        row["family"] = factor + mark, metric
                     rows[f"{factor}={name}{mark}/{metric}"] = row
     return rows
+
+
+def _measured(groups) -> list[tuple[str, str, str, bool]]:
+    """The metrics of which a trial has a value; boxes that were the rule are no second measure."""
+    every = pd.concat([*groups.values()]) if groups else pd.DataFrame()
+    there = [one for one in METRICS if one[1] in every and every[one[1]].notna().any()]
+    if groups and every["collided"].equals(every["boxes"]):
+        there = [one for one in there if one[1] != "boxes"]
+    return there
 
 
 def _one_cell(pooled: dict[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
@@ -401,7 +409,7 @@ def _level(trials, reference, column, kind, orders) -> dict:
     value, low, high, n = _estimate(trials, column, kind)
     ended = int((trials["status"] != "failed").sum())
     row = {"trials": ended, "n": n, "value": value, "ci_low": low, "ci_high": high}
-    names = ("difference", "difference_ci_low", "difference_ci_high", "p", "p_holm")
+    names = ("difference", "difference_ci_low", "difference_ci_high", "p")
     row |= dict.fromkeys(names)
     if trials is reference or not _together(orders, trials, reference):
         return row
@@ -417,14 +425,3 @@ def _level(trials, reference, column, kind, orders) -> dict:
         row |= {"difference": found["difference"], "p": found["p"]}
         row |= {f"difference_{end}": found[end] for end in ("ci_low", "ci_high")}
     return row
-
-
-def correct(rows: dict[str, dict]) -> None:
-    """Fill in the corrected p of each family."""
-    families: dict = {}
-    for row in rows.values():
-        if "family" in row:
-            families.setdefault(row["family"], []).append(row)
-    for family in families.values():
-        for row, p in zip(family, statistics.holm([row["p"] for row in family]), strict=True):
-            row["p_holm"] = p

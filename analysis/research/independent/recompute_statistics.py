@@ -246,7 +246,7 @@ def median_interval(values: np.ndarray) -> tuple[float | None, float | None]:
 
 
 def rates_within(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Series]) -> dict:
-    """Two rates in the cells that both have: Mantel and Haenszel, Fisher, and the melded interval.
+    """Two rates in the cells that both have: Mantel and Haenszel, Miettinen and Nurminen.
 
     Empty where there is no such cell.
     """
@@ -254,23 +254,60 @@ def rates_within(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Se
     if not len(a):
         return {}
     w = n * m / (n + m)
-    w = w / w.sum()
-    p, q = w @ (a / n), w @ (b / m)
-    # What of the spread of outcomes lies within cells makes rates as good as more trials.
-    every, overall = n + m, w @ ((a + b) / (n + m))
-    inside = (a + b + overall) / (every + 1)
-    within = w @ (inside * (1 - inside))
-    more = max(overall * (1 - overall) / within, 1.0) if within else 1.0
-    rates = (p, more / (w**2 @ (1 / n))), (q, more / (w**2 @ (1 / m)))
-    exact = exact_p(one, other, cells)
-    low, high = agreeing(*rates, exact)
+    apart = (w @ (a / n - b / m)) / w.sum()
+    every, hits = n + m, a + b
+    chance = (n * m * hits * (every - hits) / (every**2 * (every - 1.0))).sum()
+    p = 2 * stats.norm.sf(abs((a - n * hits / every).sum()) / np.sqrt(chance)) if chance else 1.0
+
+    def error(at: float) -> float:
+        first, second = _given_difference(a, n, b, m, at)
+        of_cells = first * (1 - first) / n + second * (1 - second) / m
+        return np.sqrt((w**2 * of_cells * every / (every - 1)).sum()) / w.sum()
+
+    ends = []
+    for sign in (-1, 1):
+        # From the far end on: the first difference that the test does not reject.
+        steps = np.concatenate([np.linspace(sign, apart, 400)[:-1], [apart + sign * 1e-9]])
+        missing = [sign * (at - apart) - 1.959963984540054 * error(at) for at in steps]
+        at = next((k for k, value in enumerate(missing) if value <= 0), len(steps) - 1)
+        ends.append(
+            steps[0]
+            if at == 0
+            else optimize.brentq(
+                lambda d, sign=sign: sign * (d - apart) - 1.959963984540054 * error(d),
+                *sorted(steps[at - 1 : at + 1]),
+                xtol=1e-13,
+            )
+        )
+    enough = stats.norm.ppf(0.975) + stats.norm.ppf(0.8)
+    found = [
+        optimize.brentq(lambda size, sign=sign: enough * error(sign * size) - size, 1e-9, 1)
+        for sign in (-1, 1)
+    ]
+    surest = w.sum() / np.sqrt((n**2 * m**2 / (every**2 * (every - 1.0))).sum())
     return {
-        "difference": 100 * (p - q),
-        "ci_low": 100 * low,
-        "ci_high": 100 * high,
-        "p": exact,
-        "detectable": detectable_rate(int(n.sum()), int(m.sum()), q),
+        "difference": 100 * apart,
+        "ci_low": 100 * ends[0],
+        "ci_high": 100 * ends[1],
+        "p": p,
+        "detectable": 100 * min(found) if surest > 1.959963984540054 else None,
     }
+
+
+def _given_difference(a, n, b, m, apart: float) -> tuple[np.ndarray, np.ndarray]:
+    """The likeliest rates of each cell that are so far apart, by bisection."""
+    low = np.full(len(a), max(0.0, -apart))
+    high = np.full(len(a), min(1.0, 1.0 - apart))
+    for _ in range(60):
+        q = (low + high) / 2
+        p = q + apart
+        with np.errstate(divide="ignore", invalid="ignore"):
+            slope = (
+                np.where(a > 0, a / p, 0) - np.where(a < n, (n - a) / (1 - p), 0)
+                + np.where(b > 0, b / q, 0) - np.where(b < m, (m - b) / (1 - q), 0)
+            )  # fmt: skip
+        low, high = np.where(slope > 0, q, low), np.where(slope > 0, high, q)
+    return np.clip((low + high) / 2 + apart, 0, 1), (low + high) / 2
 
 
 def _counts(one: pd.Series, other: pd.Series, cells: tuple) -> list[np.ndarray]:

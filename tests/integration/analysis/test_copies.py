@@ -94,7 +94,7 @@ def test_no_interaction_is_made_of_copies(db):
     found = rows("factors", db, ["one", "two"], by="prompt")
     row = found["prompt=A1/model=two/interaction/gap_m"]
     assert row.values.get("p") is None
-    assert "the same ones at two levels" in row.note
+    assert SAME in row.note
 
 
 def test_a_program_that_heeds_a_level_in_some_conditions_is_compared_in_all(tmp_path):

@@ -5,17 +5,21 @@ from math import sqrt
 import numpy as np
 import pandas as pd
 import pytest
-from scipy import stats
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import optimize, stats
+from statsmodels.stats.contingency_tables import StratifiedTable
 from statsmodels.stats.multitest import multipletests
 
-from analysis.research.independent.recompute_statistics import exact_p, means_within
+from analysis.research.independent.recompute_statistics import means_within
 from merge_runner_analysis.stats import intervals
 from merge_runner_analysis.stats.contrasts import (
-    contrast_cells,
+    Cells,
     contrast_means,
+    contrast_rates,
     corrected,
     detectable_rate,
-    difference_of_rates,
+    difference_of_contrasts,
     rejected,
     shared_cells,
 )
@@ -44,40 +48,118 @@ STRATA = [
 ]
 
 
+def difference_at(cells, apart):
+    """The observed difference less another one, in standard errors if that one is true."""
+    return (cells.difference - apart) / sqrt(cells.variance(apart))
+
+
 @pytest.mark.parametrize("strata", STRATA)
-def test_rates_are_compared_by_fishers_test_within_conditions_and_the_interval_that_agrees(strata):
-    one, other = trials(strata)
-    found = contrast_cells(shared_cells(one, other, "hit"))
+def test_shares_are_compared_by_the_test_of_mantel_and_haenszel_and_its_score_interval(strata):
+    cells = shared_cells(*trials(strata), "hit")
+    found = contrast_rates(cells)
     weights = [n * m / (n + m) for _, n, _, m in strata.values()]
     apart = [a / n - b / m for a, n, b, m in strata.values()]
     assert found.value == pytest.approx(np.average(apart, weights=weights))
-    assert found.p == pytest.approx(by_cells(exact_p, one, other, "hit"))
-    assert found.low <= found.value <= found.high
-    assert (found.p < 0.05) == (not found.low <= 0 <= found.high)
+    tables = [np.array([[a, n - a], [b, m - b]]) for a, n, b, m in strata.values()]
+    expected = StratifiedTable(tables).test_null_odds(correction=False).pvalue
+    assert found.p == pytest.approx(expected)
+    for end in (found.low, found.high):
+        assert abs(end) == 1 or abs(difference_at(cells, end)) == pytest.approx(intervals.Z)
+
+
+SIZES = st.integers(1, 12)
+
+
+@st.composite
+def cells_of(draw):
+    """The counts of up to five cells."""
+    sizes = draw(st.lists(st.tuples(SIZES, SIZES), min_size=1, max_size=5))
+    counts = [(draw(st.integers(0, n)), n, draw(st.integers(0, m)), m) for n, m in sizes]
+    return Cells(*map(np.array, zip(*counts, strict=True)))
+
+
+@given(cells_of(), cells_of())
+def test_an_interval_of_shares_leaves_0_out_exactly_where_p_is_below_5_percent(one, other):
+    for found in (contrast_rates(one), difference_of_contrasts(one, other)):
+        assert found.low <= found.value <= found.high
+        assert found.low < found.high
+        assert (found.p < 0.05) == (found.low > 0 or found.high < 0)
+
+
+GAPS = st.dictionaries(
+    st.sampled_from("abcd"), st.lists(st.floats(-20, 20), min_size=1, max_size=6), min_size=1
+)
+
+
+@given(GAPS, GAPS)
+def test_an_interval_of_means_leaves_0_out_exactly_where_p_is_below_5_percent(one, other):
+    found = contrast_means(group(**one), group(**other), "gap_m")
+    if found is not None and found.se:
+        assert (found.p < 0.05) == (found.low > 0 or found.high < 0)
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "low", "high"),
+    # As R's ratesci::scoreci and SAS PROC FREQ have it, who call it Miettinen and Nurminen's.
+    [(0, 0, -0.0720, 0.0720), (50, 50, -0.0720, 0.0720), (1, 0, -0.0528, 0.1056)],
+)
+def test_none_or_all_of_the_trials_have_an_interval_too(a, b, low, high):
+    found = contrast_rates(Cells(*(np.array([each]) for each in (a, 50, b, 50))))
+    assert (found.low, found.high) == pytest.approx((low, high), abs=1e-4)
+    assert found.detectable == pytest.approx(0.137, abs=1e-3)
+
+
+def test_the_likeliest_rates_of_a_difference_are_those_of_a_search():
+    a, n, b, m = 3, 10, 9, 15
+    for apart in (-0.6, -0.2, 0.0, 0.3):
+
+        def missing(q, apart=apart):
+            p = np.clip(q + apart, 1e-12, 1 - 1e-12)
+            return -stats.binom.logpmf(a, n, p) - stats.binom.logpmf(b, m, q)
+
+        found = optimize.minimize_scalar(
+            missing, bounds=(max(0, -apart) + 1e-9, min(1, 1 - apart) - 1e-9), method="bounded",
+            options={"xatol": 1e-10},
+        )  # fmt: skip
+        q, p = found.x, found.x + apart
+        expected = (p * (1 - p) / n + q * (1 - q) / m) * 25 / 24
+        cells = Cells(*(np.array([each]) for each in (a, n, b, m)))
+        assert cells.variance(apart) == pytest.approx(expected, abs=1e-6)
+
+
+def test_the_detectable_difference_of_shares_is_found_in_four_of_five_studies():
+    rng, size = np.random.default_rng(2), np.full(11, 10)
+    none = contrast_rates(Cells(0 * size + 3, size, 0 * size + 3, size))
+    found = [
+        contrast_rates(
+            Cells(rng.binomial(size, 0.3 + none.detectable), size, rng.binomial(size, 0.3), size)
+        )
+        for _ in range(300)
+    ]
+    assert np.mean([one.p < 0.05 for one in found]) == pytest.approx(0.8, abs=0.07)
+    assert contrast_rates(Cells(*(np.array([k]) for k in (0, 2, 0, 2)))).detectable is None
 
 
 def test_a_condition_that_one_group_lacks_changes_nothing_of_its_rates():
     first, second = trials(STRATA[0])
     more = pd.concat([first, pd.DataFrame({"condition": ["c"] * 50, "hit": [True] * 50})])
-    expected = contrast_cells(shared_cells(first, second, "hit"))
-    assert contrast_cells(shared_cells(more, second, "hit")) == expected
+    expected = contrast_rates(shared_cells(first, second, "hit"))
+    assert contrast_rates(shared_cells(more, second, "hit")) == expected
     apart = (one[one["condition"] == name] for one, name in ((first, "a"), (second, "b")))
     assert shared_cells(*apart, "hit") is None
 
 
-def test_an_interaction_of_rates_is_excluded_at_the_level_of_its_p():
+def test_an_interaction_of_shares_is_excluded_at_the_level_of_its_p():
     one, other = (shared_cells(*trials(strata), "hit") for strata in STRATA[:2])
-    rates = [*one.rates, *reversed(other.rates)]
-    found = difference_of_rates(rates)
-    p, q, r, s = (rate for rate, _ in rates)
-    assert found.value == pytest.approx(p - q + r - s)
-    ends = [np.array(intervals.wilson(*rate)) for rate in rates]
-    below = [ends[0][0] - p, ends[1][1] - q, ends[2][0] - r, ends[3][1] - s]
-    assert found.value - found.low == pytest.approx(sqrt(sum(d**2 for d in below)))
-    low, high = intervals.newcombe(rates, stats.norm.isf(found.p / 2))
-    assert min(abs(low), abs(high)) == pytest.approx(0, abs=1e-9)
-    assert difference_of_rates([*one.rates, *reversed(one.rates)]).p == 1
-    assert 0 < difference_of_rates([(1.0, 1_000_000), (0.0, 1_000_000)]).p < 1e-190
+    found = difference_of_contrasts(one, other)
+    assert found.value == pytest.approx(one.difference - other.difference)
+    z = stats.norm.isf(found.p / 2)
+    near = (one.end(-1, z) - one.difference, other.end(1, z) - other.difference)
+    assert abs(found.value) == pytest.approx(np.hypot(*near), abs=1e-6)
+    assert difference_of_contrasts(one, one).p == 1
+    all_of, none = np.array([1_000_000]), np.array([0])
+    sure = Cells(all_of, all_of, none, all_of)
+    assert difference_of_contrasts(sure, Cells(none, all_of, all_of, all_of)).p < 1e-190
 
 
 def test_which_outcomes_fishers_test_rejects_is_known_beforehand():

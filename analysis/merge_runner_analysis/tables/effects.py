@@ -1,0 +1,278 @@
+"""What a factor changes, in every measure; prompts and single factors are selections of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from math import isinf
+
+from merge_runner.study.crossing import PROMPT
+from merge_runner_analysis.metrics import INTERVALS, LEFT_FIRST, RULES_NOTE, shown_in
+from merge_runner_analysis.stats.effects import (
+    DRIVER,
+    Effect,
+    Level,
+    balance,
+    copied_of_shared,
+    effects,
+    levels_by_factor,
+    primary,
+)
+from merge_runner_analysis.stats.estimate import Estimate
+from merge_runner_analysis.stats.measures import undecided_note
+from merge_runner_analysis.study import Study
+from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Value, interval
+from merge_runner_analysis.wording import note_of
+
+TEST = "of the test of Mantel and Haenszel, or of Welch's"
+HOW = (
+    "compared within the cells that both have, a condition with one level of each other factor: "
+    "shares by the test of Mantel and Haenszel with the score interval that agrees with it, means "
+    "by Welch's test in a model with a level for each cell"
+)
+CROSSED = (
+    "an interaction (×) is the difference of a level minus that at the reference of the other "
+    "factor, in the cells that all four have"
+)
+FAMILIES = (
+    "p, corrected: by Holm in two families. The effects of factors on {primary}, the primary "
+    "measure, are one, without those of the model; all others are the other one"
+)
+DETECTABLE = "detectable: found at p < .05, before correction, with power .8"
+SAME_TRIALS = (
+    "programs play no trial at one of both levels that they do not play at the other: no test"
+)
+UNTESTED = (
+    "no test without cells that all have, spread within cells, or with undecided trials, trials of "
+    "several studies or the same ones at two levels"
+)
+
+
+def effects_table(study: Study) -> Table:
+    """A row per factor, level, and measure, and per interaction of two factors."""
+    by = study.selection.by or ""
+    return Table(
+        "effects",
+        (
+            *([Column("at", by)] if by else []),
+            Column("factor", "factor"),
+            Column("level", "level"),
+            Column("reference", "against"),
+            Column("measure", "measure"),
+            Optional("estimate", "estimate", "number", 2, "of the level"),
+            Optional("estimate_reference", "reference", "number", 2, "of the reference"),
+            Optional("difference", "difference", "number", 2, "level less reference"),
+            interval("ci", "of the same test"),
+            Optional("p", "p", "p", 3, TEST),
+            Optional("p_corrected", "p, corr.", "p", 3, "corrected by Holm"),
+            Optional("detectable", "detectable", "number", 2, "at p < .05 with power .8"),
+            Column("n", "n", "count", 0, "trials of the level in the shared cells"),
+            Column("n_reference", "n ref.", "count", 0, "trials of the reference in these"),
+            Optional("primary", "primary", "text", 0, "the study's own question"),
+        ),
+        [_row(study, one) for one in effects(study, by) if _is_shown(one)],
+        tuple(_notes(study, by)),
+    )
+
+
+def _is_shown(one: Effect) -> bool:
+    """Whether it has a test; of a level that has none a row says why."""
+    return one.metric.estimator != "median" and not (one.across and one.difference.p is None)
+
+
+def _row(study: Study, one: Effect) -> Row:
+    values: dict[str, Value] = {
+        "at": _place(one.level, one.across),
+        "factor": one.factor,
+        "level": f"{one.level.name}{one.level.mark}",
+        "reference": one.reference.name,
+        "measure": one.metric.heading,
+        "estimate": one.at_level.value,
+        "estimate_reference": one.at_reference.value,
+        **_difference(one),
+        "p_corrected": one.p_corrected,
+        "detectable": one.difference.detectable,
+        "n": one.n,
+        "n_reference": one.n_reference,
+        "primary": "primary" if one.primary else None,
+    }
+    return Row(one.id, one.groups, values, problem(study, one), one.metric.column, (), one.left_out)
+
+
+def _place(level: Level, across: tuple[Level, Level] | None) -> str:
+    """Where a level stands that is shown by another factor, and of an interaction what with."""
+    at = level.at.partition("=")[2]
+    return f"{at} - {across[0].at.partition('=')[2]}" if across else at
+
+
+def _difference(one: Effect) -> dict[str, Value]:
+    found = one.difference
+    return {"difference": found.value, "ci": found.bounds(), "p": found.p}
+
+
+def problem(study: Study, one: Effect) -> str:
+    """Why an effect has no test, or which cells its test leaves out."""
+    levels = (one.level, one.reference, *(one.across or ()))
+    copies, shared = copied_of_shared(study, *levels)
+    said = [note_of(undecided_note(level.pooled, one.metric)) for level in levels]
+    if not (one.at_level.n and one.at_reference.n) and not one.across:
+        said.append(f"{one.metric.heading}: a level has no trial with this measure")
+    elif copies and copies == shared:
+        said.append(SAME_TRIALS)
+    elif one.difference.value is None:
+        said.append(f"{one.metric.heading}: {UNTESTED}")
+    elif copies:
+        said.append(
+            f"the difference leaves out {copies} of {shared} shared cells, those of programs that "
+            "play the same trials at both levels"
+        )
+    elif one.metric.rate and one.difference.p is not None and one.difference.detectable is None:
+        said.append(f"{one.metric.heading}: so few trials can show no difference, however large")
+    return note_of(*dict.fromkeys(said))
+
+
+def _notes(study: Study, by: str) -> Iterator[str]:
+    found = [one for one in effects(study, by) if one.difference.p is not None]
+    every = levels_by_factor(study)
+    if not found and not every:
+        yield "the trials of judged drivers differ in no factor"
+        return
+    yield f"levels are {HOW}. {CROSSED}"
+    if found:
+        yield f"{FAMILIES.format(primary=primary(study).heading)}. {DETECTABLE}"
+    yield from _copies(every)
+    yield from (f"{levels[0].factor}{levels[0].mark}: {balance(levels)}" for levels in every)
+    yield RULES_NOTE
+
+
+def _copies(found: Sequence[Sequence[Level]]) -> Iterator[str]:
+    """Which levels have copies of trials from levels of other factors."""
+    counts = [
+        f"{level.id}: {level.pooled.repeated} of {len(level.pooled.stored.trials)}"
+        for levels in found
+        for level in levels
+        if level.pooled.repeated
+    ]
+    if counts:
+        yield (
+            f"{', '.join(counts)} trials of programs are equal to others of the level to the last "
+            "state, at another level of another factor: each counts once, in one cell"
+        )
+
+
+def factors(study: Study) -> Table:
+    """The effects with a row for every level, also the references."""
+    by = study.selection.by or ""
+    rows: dict[str, Row] = {}
+    for one in effects(study, by):
+        if not one.across:
+            name = f"{one.reference.id}/{one.metric.name}"
+            rows.setdefault(name, _level_row(name, one, one.reference, one.at_reference))
+        if by or not one.across:
+            row = _level_row(one.id, one, one.level, one.at_level)
+            different = _difference(one) | {"p_holm": one.p_corrected}
+            different["difference_ci"] = different.pop("ci")
+            note = problem(study, one)
+            rows[one.id] = replace(row, values={**row.values, **different}, note=note)
+    return Table(
+        "factors",
+        (
+            *([Column("at", by)] if by else []),
+            Column("factor", "factor"),
+            Optional("drivers", "drivers"),
+            Column("measure", "measure"),
+            Column("level", "level"),
+            Column("trials", "trials", "count", 0, "trials of the level that ended"),
+            Column("n", "n", "count", 0, "of these, trials that count for the measure"),
+            Optional("value", "value", "number", 2, "the measure"),
+            interval("ci", "of the measure"),
+            Optional("difference", "difference", "number", 2, "from the factor's reference"),
+            interval("difference_ci", "of the difference"),
+            Optional("p", "p", "p", 3, TEST),
+            Optional("p_holm", "p, corr.", "p", 3, "corrected by Holm"),
+        ),
+        [*rows.values()],
+        (
+            f"intervals: {INTERVALS}. The reference is the level that stands first",
+            *_notes(study, by),
+        ),
+    )
+
+
+def _level_row(name: str, one: Effect, level: Level, own: Estimate) -> Row:
+    """A level's own value in the measure of an effect."""
+    values: dict[str, Value] = {
+        "at": _place(level, one.across),
+        "factor": one.factor,
+        "drivers": "mock" if level.posing else None,
+        "measure": one.metric.heading,
+        "level": level.name,
+        "trials": len(level.pooled.ended),
+        "n": one.n if one.across else own.n,
+        "value": own.value,
+        "ci": own.bounds(),
+    }
+    note = note_of(undecided_note(level.pooled, one.metric))
+    return Row(name, level.groups, values, note, one.metric.column, copies=level.copies)
+
+
+def contrasts(study: Study) -> Table:
+    """The effects of prompts, driver by driver."""
+    known = {group.id: group for group in study.models}
+    shown = {LEFT_FIRST, *shown_in("tables")}
+    rows = []
+    for one in effects(study, DRIVER):
+        if one.across or one.level.factor != PROMPT or one.metric not in shown:
+            continue
+        group, other = (known[level.groups[0]] for level in (one.level, one.reference))
+        found = one.difference
+        if found.p is None:
+            continue
+        values: dict[str, Value] = {
+            "driver": group.label,
+            "setting": group.setting,
+            "reference": other.setting,
+            "measure": one.metric.heading,
+            **_difference(one),
+            "p_holm": one.p_corrected,
+            "detectable": found.detectable,
+            "n": one.n,
+            "n_reference": one.n_reference,
+            "freedom": None if isinf(found.freedom) else found.freedom,
+        }
+        name = f"{group.id}/{other.setting}/{one.metric.name}"
+        rows.append(
+            Row(name, one.groups, values, problem(study, one), one.metric.column, (), one.left_out)
+        )
+    return Table(
+        "contrasts",
+        (
+            Column("driver", "driver"),
+            Column("setting", "setting"),
+            Column("reference", "against"),
+            Column("measure", "measure"),
+            Column("difference", "difference", "number", 2, "first minus second"),
+            interval("ci", "of the same test"),
+            Column("p", "p", "p", 3, TEST),
+            Column("p_holm", "p, corr.", "p", 3, "corrected by Holm"),
+            Optional("detectable", "detectable", "number", 2, "at p < .05 with power .8"),
+            Column("n", "n", "count", 0, "trials of the setting in the shared conditions"),
+            Column("n_reference", "n ref.", "count", 0, "trials of the reference in these"),
+            Optional("freedom", "df", "number", 0, "of a t test"),
+        ),
+        rows,
+        (
+            *_same_as_reference(study),
+            *(_notes(study, DRIVER) if rows else ["there is no pair of judged groups to compare"]),
+        ),
+    )
+
+
+def _same_as_reference(study: Study) -> Iterator[str]:
+    """Which prompts have no row, since programs do not read them."""
+    every = [one for one in effects(study, DRIVER) if one.level.factor == PROMPT]
+    same = [
+        one.level.groups[0] for one in every if copied_of_shared(study, one.level, one.reference)[0]
+    ]
+    if same:
+        yield f"{', '.join(dict.fromkeys(same))}, beside {study.reference}: {SAME_TRIALS}"
