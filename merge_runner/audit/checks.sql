@@ -298,6 +298,7 @@ FROM (SELECT count(*) AS stored FROM linked SEMI JOIN trials USING (trial_id, sp
 -- it goes on from, or those of other sweeps.
 CREATE OR REPLACE TEMP VIEW played_before AS
 SELECT DISTINCT trial_id, spec_hash, own.sweep_id, earlier.sweep_id AS earlier,
+    earlier.started_at AS began_at,
     regexp_replace(own.sweep_id, '-[^-]*$', '') = regexp_replace(earlier.sweep_id, '-[^-]*$', '')
         AS resumed
 FROM linked JOIN sweep_trials USING (trial_id, spec_hash) JOIN sweeps AS earlier USING (sweep_id),
@@ -308,10 +309,9 @@ CREATE OR REPLACE TEMP VIEW notes AS
 SELECT format('unfinished: {} of {} trials are missing, {} failed; the same command again plays them',
     missing, (SELECT count(*) FROM planned), failed) AS text
 FROM counts, subject WHERE NOT finished AND missing + failed > 0
-UNION ALL SELECT format('{} goes on from {}: {} of its trials were stored before', sweep_id,
-    if(count(DISTINCT earlier) = 1, any_value(earlier),
-        format('{} earlier runs, the first {}', count(DISTINCT earlier), min(earlier))),
-    count(DISTINCT (trial_id, spec_hash)))
+UNION ALL SELECT format('goes on from {} of {}: {} of its trials were stored before',
+    if(count(DISTINCT earlier) = 1, 'the run', format('{} runs, the first', count(DISTINCT earlier))),
+    strftime(min(began_at), '%Y-%m-%d %H:%M'), count(DISTINCT (trial_id, spec_hash)))
 FROM played_before WHERE resumed GROUP BY sweep_id
 UNION ALL FROM (
     SELECT format('{} and {} share {} trials', sweep_id, earlier, count(*))

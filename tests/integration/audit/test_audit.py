@@ -6,6 +6,7 @@ import shutil
 import sqlite3
 import tomllib
 from dataclasses import replace
+from datetime import datetime
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
@@ -266,9 +267,10 @@ def test_what_another_sweep_has_played_since_is_not_missing(db):
     found = audit("--db", db)
     assert found.findings == []
     assert "7 of its trials were played by another sweep" in found.notes
-    own = found.audits[1]["subject"]
-    assert f"{own} goes on from {stopped}: 1 of its trials were stored before" in found.notes
-    assert f"{own} and {stopped}" not in found.notes
+    began = datetime.strptime(stopped.rsplit("-", 1)[1], "%Y%m%dT%H%M%S%f")  # noqa: DTZ007 # UTC
+    note = f"goes on from the run of {began:%Y-%m-%d %H:%M}: 1 of its trials were stored before"
+    assert note in found.notes
+    assert f"{found.audits[1]['subject']} and {stopped}" not in found.notes
 
 
 def caching(kept: dict[str, dict], **changes: object):
