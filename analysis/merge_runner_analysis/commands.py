@@ -387,4 +387,4 @@ def view(
     if single is not None:
         say(f"wrote {export_page(db, single, wanted)}")
     if export is None and single is None:
-        serve(db, port, announce, reader_of(reader))
+        serve(db, port, announce, reader_of(reader), study_file or "")

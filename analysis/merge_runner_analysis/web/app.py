@@ -67,12 +67,15 @@ FIRST_TIME = (
 MOST_NOTED, MOST_FIELDS = 65_536, 10  # bytes and fields of a form with a note
 
 
-def serve(db: Path, port: int, say: Callable[[str], None], reader: str) -> None:
-    """Serve a database to a reader; ``say`` gets the address to open. Raises UsageError."""
+def serve(db: Path, port: int, say: Callable[[str], None], reader: str, study: str) -> None:
+    """Serve a database to a reader; ``say`` gets the address to open. Raises UsageError.
+
+    ``study`` is the file of the study whose parts are in use, empty without one.
+    """
     typed = sys.argv[0]
     # What to type to run this: its path where the shell does not find it, as under ``make``.
     plain = Path(typed).name != "merge-runner" or shutil.which("merge-runner") == typed
-    site = Site(db, program="merge-runner" if plain else typed, reader=reader)
+    site = Site(db, program="merge-runner" if plain else typed, reader=reader, study=study)
     with reading(db):
         pass  # what is wrong with it is said at once
     listener = listen(port)

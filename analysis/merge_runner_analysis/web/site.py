@@ -83,6 +83,8 @@ class Site:
     """What to type to run this program."""
     reader: str = "reader"
     """Who writes notes."""
+    study: str = ""
+    """The file of the study whose names and parts are known, as it was typed."""
     is_still: bool = False
     """Whether no news is taken in."""
     policy: str = ""
@@ -160,7 +162,8 @@ class Site:
     def share(self, *options: str) -> str:
         """The command that writes what is shown here as files."""
         db = [] if self.db == DEFAULT_DB else ["--db", str(self.db)]
-        return shlex.join([self.program, "view", *db, *options])
+        study = ["--study", self.study] if self.study else []
+        return shlex.join([self.program, "view", *db, *study, *options])
 
     def render(self, template: str, **values: object) -> str:
         """Return a page, or a part of one."""
