@@ -11,6 +11,7 @@ from typing import Any
 
 from merge_runner.audit.checks import not_judged
 from merge_runner.config import both_sides, pair_name
+from merge_runner.paths import DEFAULT_DB, command_at
 from merge_runner.run.progress import Standing, read_standing
 from merge_runner_analysis.web.catalogue import Catalogue, Wanted
 from merge_runner_analysis.web.reading import Row
@@ -38,7 +39,8 @@ def list_runs(catalogue: Catalogue) -> list[Row]:
             # The newest run of the same trials went on with those before it.
             same = row["name"], config.get("model"), config.get("sample_set")
             later = newest.setdefault(same, sweep_id).replace(sweep_id, "")
-            runs.append(run_of(row | counted[sweep_id], config, standing, later))
+            row_of = {**row, **counted[sweep_id], "db": catalogue.db}
+            runs.append(run_of(row_of, config, standing, later))
         if all(run["state"] != "lost" for run in runs):
             break
     return runs
@@ -149,7 +151,9 @@ def assessment_of(run: Row) -> tuple[str, str]:
         return "stopped", f"Stopped: {REASONS[code]}. {counted} have an outcome{failures}."
     if ended == planned:
         text = f"Ended with faults: {counted} have an outcome, but what is stored does not hold "
-        return "stopped", f"{text}together. See: merge-runner audit --sweep {run['sweep_id']}"
+        audit = f"merge-runner audit --sweep {run['sweep_id']}"
+        at = command_at(audit, "--db", run["row"].get("db", DEFAULT_DB), DEFAULT_DB)
+        return "stopped", f"{text}together. See: {at}"
     if run["failed"]:
         return "stopped", f"Ended: {counted} have an outcome{failures}."
     return "stopped", f"Stopped by an error that it printed: {counted} have an outcome."

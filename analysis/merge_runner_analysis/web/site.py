@@ -159,10 +159,10 @@ class Site:
         """Whether the trials are being read for the first time."""
         return self._first_reading is not None and self._first_reading.is_alive()
 
-    def share(self, *options: str) -> str:
-        """The command that writes what is shown here as files."""
+    def share(self, *options: str, of_study: bool = True) -> str:
+        """The command that writes what is shown here as files; ``of_study``: it takes --study."""
         db = [] if self.db == DEFAULT_DB else ["--db", str(self.db)]
-        study = ["--study", self.study] if self.study else []
+        study = ["--study", self.study] if self.study and of_study else []
         return shlex.join([self.program, "view", *db, *study, *options])
 
     def render(self, template: str, **values: object) -> str:

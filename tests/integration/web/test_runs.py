@@ -294,3 +294,19 @@ def test_a_run_of_a_crossed_study_shows_each_driver_and_what_goes_on_with_it(gol
     assert len(arms) == 6
     for link, count in arms:
         assert f"<strong>{count}</strong> trials" in client.get(html.unescape(link)).text, link
+
+
+def test_a_shown_command_names_the_database_and_the_study_whose_names_it_needs(study):
+    site = Site(study, study="mine/study.toml")
+    place = f"merge-runner view --db {study}"
+    assert site.share("--export", "pages") == f"{place} --study mine/study.toml --export pages"
+    assert site.share("FOLDER", of_study=False) == f"{place} FOLDER"
+    assert Site(study).share("--export", "pages") == f"{place} --export pages"
+
+
+def test_a_run_with_a_name_is_called_by_it_in_the_list(study):
+    named = """json_merge_patch(config, '{"run_name": "the second"}')"""
+    change(study, f"UPDATE sweeps SET config = {named}")
+    (run,) = list_runs(Site(study).catalogue)
+    assert run["row"]["name"].startswith("the second (")
+    assert "<h1>Run of the second (" in page_of(Site(study))
