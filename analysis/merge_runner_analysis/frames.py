@@ -21,6 +21,7 @@ from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.served_model import other_models, sql_of
 from merge_runner.study.crossing import MODEL, PROMPT
 from merge_runner.text_safety import quoted
+from merge_runner_analysis.calls import COUNTED
 from merge_runner_analysis.trials import judged, with_metrics
 
 # One row a trial, as its ego sees it (see ``trial_drivers``): one whose ego sat
@@ -108,27 +109,11 @@ FROM states JOIN (
 ) USING (trial_id, spec_hash, side)
 WHERE time_s >= greatest(0, coalesce(first_s, 0)) GROUP BY ALL ORDER BY ALL
 """
-# Fates of the attempts that were answered, also without a plan.
-ANSWERED = ("driven", "fallback")
-# One row a trial: what became of its calls and decisions. ``failures`` has in lines what each
-# answer lacks, a valid plan or the decision asked for; a retried attempt has no share in it.
-CALLS = """
-SELECT trial_id, spec_hash, attempts, calls, retried, lost, unknown, other_model, failures,
-    decisions, fallback
-FROM trials LEFT JOIN (
-    SELECT trial_id, spec_hash, count(*) AS attempts,
-        count(*) FILTER (fate <> 'retried') AS calls,
-        count(*) FILTER (fate = 'retried') AS retried,
-        count(*) FILTER (fate = 'lost') AS lost,
-        count(*) FILTER (outcome = 'unknown') AS unknown,
-        count(*) FILTER (fate IN {answered} AND {others}) AS other_model,
-        string_agg(failure, chr(10)) FILTER (fate IN {answered}) AS failures
-    FROM attempts GROUP BY ALL
-) USING (trial_id, spec_hash) LEFT JOIN (
-    SELECT trial_id, spec_hash, count(*) AS decisions, count(*) FILTER (fallback) AS fallback
-    FROM decisions GROUP BY ALL
-) USING (trial_id, spec_hash) ORDER BY ALL
-"""
+CALLS = f"""
+SELECT trial_id, spec_hash, attempts, calls, retried, lost, unknown, failures, decisions,
+    others AS other_model, fallbacks AS fallback
+FROM ({COUNTED}) ORDER BY ALL
+"""  # noqa: S608 # constants
 SPECS = "SELECT DISTINCT spec_hash, spec FROM specs JOIN trials USING (spec_hash) ORDER BY ALL"
 KEYS = ["trial_id", "spec_hash"]
 # The newest run comes first: the order of its levels counts.
@@ -212,14 +197,12 @@ def read_frames(db: Path) -> Frames:
             return frames.frame(connection.execute(sql))
 
         specs = {row.spec_hash: json.loads(row.spec) for row in rows(SPECS).itertuples()}
-        calls = rows(CALLS.format(answered=ANSWERED, others=sql_of(other_models(connection))))
+        calls = rows(CALLS.format(others=sql_of(other_models(connection))))
         trials = with_metrics(connection, TRIALS).merge(rows(TRACES), on=KEYS, how="left")
         asked = trials["source"] == "seat"
         played = judged(connection, trials[~asked], specs)
         studies = _studies(rows(SWEEPS), rows(LINKS))
         decisions, levels = rows(ASKED_DECISIONS), rows("FROM trial_levels")
-    counts = calls.columns.drop([*KEYS, "failures"])
-    calls = calls.fillna(dict.fromkeys(counts, 0))
     return Frames(played, trials[asked], specs, studies, calls, decisions, levels)
 
 

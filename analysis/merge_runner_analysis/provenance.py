@@ -15,7 +15,7 @@ from merge_runner.records import NO_DECISION, SIDES
 from merge_runner.results import frames
 from merge_runner.results.database import read_database
 from merge_runner.served_model import other_models, sql_of
-from merge_runner_analysis.frames import ANSWERED, KEYS
+from merge_runner_analysis.frames import KEYS
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.study import Study
 
@@ -56,10 +56,10 @@ WHERE source NOT IN ('human', 'seat') ORDER BY ALL
 # Answers by each other model than was asked for.
 SERVED = """
 SELECT model_requested AS requested, model_served AS served,
-    count(DISTINCT (trial_id, spec_hash, side, decision)) AS answers,
+    count(DISTINCT (trial_id, spec_hash, side, decision, attempt)) AS answers,
     coalesce(string_agg(DISTINCT sweep_id, ', ' ORDER BY sweep_id), 'unknown') AS sweeps
-FROM attempts LEFT JOIN sweep_trials USING (trial_id, spec_hash)
-WHERE fate IN {answered} AND {others}
+FROM calls LEFT JOIN sweep_trials USING (trial_id, spec_hash)
+WHERE http_status = 200 AND {others}
 GROUP BY ALL ORDER BY ALL
 """
 MODEL_COSTS = """
@@ -92,7 +92,7 @@ class Provenance(NamedTuple):
 def provenance(db: Path) -> Provenance:
     """Read the origin of a database's results."""
     with read_database(db) as connection:
-        served = SERVED.format(answered=ANSWERED, others=sql_of(other_models(connection)))
+        served = SERVED.format(others=sql_of(other_models(connection)))
         sweeps, calls, model_costs, mismatches = (
             frames.frame(connection.execute(sql)) for sql in (SWEEPS, CALLS, MODEL_COSTS, served)
         )

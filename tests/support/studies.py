@@ -126,6 +126,7 @@ def answered(drive: Drive, side: Side, number: int, decision: Decision) -> Decis
         Attempt(
             index,
             outcome,
+            http_status=200 if outcome in ANSWERS else None,
             model_served=(said.served or drive.driver) if outcome in ANSWERS else None,
             cost_usd=None if outcome == "unknown" else 0.01,
         )

@@ -19,6 +19,7 @@ from merge_runner.records import NO_DECISION, SIDES
 from merge_runner.results.database import SETTINGS, in_memory
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.served_model import Pair, other_models, sql_of
+from merge_runner_analysis.calls import COUNTED
 from merge_runner_analysis.drivers import language_models, stand_in, unresponsive
 from merge_runner_analysis.web.database_copy import Copy
 from merge_runner_analysis.web.reading import Row, records
@@ -93,35 +94,20 @@ SELECT row_number() OVER (ORDER BY trials.trial_id, spec_hash)::INTEGER AS numbe
     condition, projected_headway_m, relative_velocity_mps, rep, pair, status, merged_first,
     end_time_s, error, scripted, stand_in, caution,
     if(status = 'finished', coalesce(merged_first || ' first', 'nobody first'), status) AS outcome,
-    CASE WHEN source = 'human' THEN 'human' WHEN decisions IS NULL THEN 'no decision'
+    CASE WHEN source = 'human' THEN 'human' WHEN decisions = 0 THEN 'no decision'
         WHEN fallbacks > 0 OR invalid > 0 THEN 'fallbacks'
         ELSE 'all valid' END AS validity,
     time_to_merge_s, gap_m, rmse_mps, joint, min_ttc_s,
     coalesce(collision, {OTHER_ACCOUNTS}) AS account,
-    coalesce(decisions, 0) AS decisions, coalesce(asked, 0) AS asked,
-    coalesce(invalid, 0) AS invalid, coalesce(fallbacks, 0) AS fallbacks,
-    coalesce(no_decision, 0) AS no_decision, coalesce(attempts, 0) AS attempts, cost_usd,
-    faults, answers, others, unpriced, of_several, left_mps, right_mps, left_range_mps,
+    decisions, asked, invalid, fallbacks, no_decision, attempts, cost_usd, faults, answers, others,
+    unpriced, of_several, left_mps, right_mps, left_range_mps,
     right_range_mps, levels
 FROM (FROM trials WHERE source <> 'seat') AS trials
 JOIN trial_metrics USING (trial_id, spec_hash)
 JOIN trial_drivers USING (trial_id, spec_hash)
 JOIN posed USING (trial_id, spec_hash) JOIN said USING (place)
 LEFT JOIN collisions USING (trial_id, spec_hash)
-LEFT JOIN (
-    SELECT trial_id, spec_hash, count(*) AS decisions, count(call_key) AS asked,
-        count(*) FILTER (NOT valid) AS invalid, count(*) FILTER (fallback) AS fallbacks,
-        count(*) FILTER (failure = '{NO_DECISION}') AS no_decision
-    FROM decisions GROUP BY ALL
-) USING (trial_id, spec_hash)
-LEFT JOIN (
-    SELECT trial_id, spec_hash, count(*) AS attempts, sum(cost_usd) AS cost_usd,
-        count(*) FILTER (outcome <> 'ok') AS faults,
-        count(*) FILTER (http_status = 200) AS answers,
-        count(*) FILTER (http_status = 200 AND {{others}}) AS others,
-        count(*) FILTER (cost_usd IS NULL) AS unpriced
-    FROM calls GROUP BY ALL
-) USING (trial_id, spec_hash)
+JOIN ({COUNTED}) USING (trial_id, spec_hash)
 LEFT JOIN (
     SELECT trial_id, spec_hash,
         list(struct_pack(reply := hash(call_key, attempt), usd := cost_usd)) AS of_several
