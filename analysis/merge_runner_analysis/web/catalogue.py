@@ -5,10 +5,10 @@ from __future__ import annotations
 import io
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import duckdb
 
@@ -26,6 +26,7 @@ PAGE = 100
 # While a run goes on the database changes all the time: so many trials are listed anew, which takes
 # half a second, at most every so many seconds.
 MANY, STANDS_S = 3_000, 20.0
+MOST_COUNTED = 50  # filters whose counts are remembered
 Wanted = Mapping[str, Any]
 """Which trials are wanted, by facet or column; an empty value wants all, and of a list one must be.
 
@@ -33,6 +34,7 @@ Wanted = Mapping[str, Any]
 (trial, spec), where those behind a cell of a table are wanted.
 """
 Facets = dict[str, list[tuple[str, int]]]
+Counted = TypeVar("Counted")
 FACETS = ("sweep", "who", "model", "variant", "condition", "outcome", "account", "validity",
           "cause", "tag")  # fmt: skip
 # Facets of which a trial may have several values.
@@ -108,6 +110,7 @@ class Catalogue:
     _listing: Listing = field(init=False)
     _lock: threading.RLock = field(default_factory=threading.RLock)
     _tags: tuple[tuple[str, str, str], ...] = ()
+    _counted: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.copies = Copies(self.db)
@@ -126,7 +129,7 @@ class Catalogue:
             if copy is self._copy:
                 return False
             try:
-                self._listing, self._tags = list_trials(copy), ()
+                self._listing, self._tags, self._counted = list_trials(copy), (), {}
             except duckdb.Error as exc:
                 raise UsageError(f"{self.db} cannot be read: {first_line(exc)}") from exc
             self._copy, self._read_at = copy, time.monotonic()
@@ -160,6 +163,7 @@ class Catalogue:
     def keep(self, numbers: Sequence[int]) -> None:
         """List no trials but those with these numbers."""
         self.ask("DELETE FROM listed WHERE number NOT IN (SELECT unnest(?))", numbers)
+        self._counted = {}
 
     def tag(self, tags: tuple[tuple[str, str, str], ...]) -> None:
         """Know the tags that readers gave: (trial, spec, tag), each once."""
@@ -167,7 +171,7 @@ class Catalogue:
             if tags != self._tags:
                 self.ask("DELETE FROM several WHERE facet = 'tag'")
                 self.ask(TAGGED, *columns_of(tags, 3))
-                self._tags = tags
+                self._tags, self._counted = tags, {}
 
     def factors(self) -> list[str]:
         """The factors of the listed studies, with ``model`` where there is any, but no prompt."""
@@ -179,9 +183,12 @@ class Catalogue:
 
     def facets(self, wanted: Wanted) -> Facets:
         """Each facet's values with how many trials they would leave, the other facets as wanted."""
-        names = (*FACETS, *(f"{FACTOR}{name}" for name in self.factors()))
-        with self._lock:
+
+        def count() -> Facets:
+            names = (*FACETS, *(f"{FACTOR}{name}" for name in self.factors()))
             return facets_of(self._listing.connection, "listed", names, wanted)
+
+        return self._once(("facets", wanted), count)
 
     def counts(self, wanted: Wanted, *columns: str) -> list[Row]:
         """What a filter's trials come to by columns: counts of all, means of those with a value.
@@ -191,11 +198,22 @@ class Catalogue:
         where, values = where_of(wanted)
         table = f"listed{MEMBERS}" if "sweep" in columns else "listed"
         named = "".join(f"{name}, " for name in columns)
-        return self.ask(
+        sql = (
             f"SELECT * EXCLUDE (every, once) FROM (SELECT {named}{COUNTS} FROM {table} "  # noqa: S608 # constants
-            f"WHERE {where} GROUP BY ALL) ORDER BY ALL",
-            *values,
+            f"WHERE {where} GROUP BY ALL) ORDER BY ALL"
         )
+        return self._once((columns, wanted), lambda: self.ask(sql, *values))
+
+    def _once(self, of: object, count: Callable[[], Counted]) -> Counted:
+        """Count something of the present list, or give what was counted of it before."""
+        with self._lock:
+            if len(self._counted) > MOST_COUNTED:
+                self._counted.clear()
+            name = repr(of)
+            if name not in self._counted:
+                self._counted[name] = count()
+            found: Counted = self._counted[name]
+            return found
 
     def every(self, wanted: Wanted, sort: str = "trial", page: int = 0) -> list[Row]:
         """All trials of a filter, or those of a page from 1; ``-gap`` sorts the largest gap first.

@@ -13,6 +13,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
 from fnmatch import fnmatchcase
 from functools import cache, lru_cache
+from heapq import heappop, heappush
 from html import escape
 from itertools import chain, count
 from pathlib import Path, PurePosixPath
@@ -23,6 +24,10 @@ from markupsafe import Markup
 
 from merge_runner.errors import UsageError
 from merge_runner.paths import refuse_another_kind
+from merge_runner_analysis.cache import stamp_of
+from merge_runner_analysis.figures import FIGURES
+from merge_runner_analysis.tables import TABLES
+from merge_runner_analysis.web.answers import Request
 from merge_runner_analysis.web.app import explorer
 from merge_runner_analysis.web.catalogue import FACETS
 from merge_runner_analysis.web.computing import processes
@@ -48,6 +53,7 @@ FOLLOWED: dict[str, Collection[str]] = {
 }
 OF_TRIALS = ("trials", "glossary")
 MOST_HELPERS = 4
+LAST = ("/tables", "/figures")  # figures take long to draw: meanwhile all other pages are saved
 MOMENT = ("side", "decision")  # the script of a trial's page reads these
 POLICY = (
     "default-src 'none'; script-src 'self' file:; style-src 'self' file:; "
@@ -85,6 +91,8 @@ def export_folder(
     with _opened(site, wanted) as rows, _staged(folder) as stage:
         if wanted:
             site.catalogue.keep([row["number"] for row in rows])
+        else:
+            _begin_to_compute(site)
         try:
             asyncio.run(_crawl(site, rows, begin, heads, stage, told))
         except BrokenProcessPool:
@@ -103,6 +111,14 @@ def export_page(db: Path, file: Path, wanted: Sequence[str]) -> Path:
     return file
 
 
+def _begin_to_compute(site: Site) -> None:
+    """Ask for all that pages wait for; what takes long comes last."""
+    requests: list[Request] = [("table", name, "", "") for name in TABLES]
+    requests += [("audit",), *(("figure", name, "svg") for name in FIGURES)]
+    for request in requests:
+        site.computing.ask(request, stamp_of(site.db))
+
+
 async def _crawl(
     site: Site,
     rows: Sequence[Row],
@@ -112,7 +128,7 @@ async def _crawl(
     told: Callable[[int], object],
 ) -> None:
     """Save the pages to which links lead, and those of all trials."""
-    files, waiting = {begin: INDEX}, deque([begin])
+    files, waiting = {begin: INDEX}, [(False, 0, begin)]
     names, done = {INDEX}, count(1)
     transport = httpx.ASGITransport(explorer(site), raise_app_exceptions=False)
     plain = {"accept-encoding": "identity"}
@@ -130,7 +146,7 @@ async def _crawl(
             return files[page]
         name = named(page)
         if name.endswith(".html"):
-            waiting.append(page)
+            heappush(waiting, (page.startswith(LAST), len(files), page))
             return name
         # A style, a script, a table; a figure that cannot be drawn has no file.
         file = await client.get(page)
@@ -168,7 +184,7 @@ async def _crawl(
                 for page, text in (await asyncio.wrap_future(rendering.popleft())).items():
                     await save(page, text)
             else:
-                page = waiting.popleft()
+                *_, page = heappop(waiting)
                 await save(page, await _served(client, page))
 
 

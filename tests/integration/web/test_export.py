@@ -22,6 +22,8 @@ TRIAL, OTHER = "o3/baseline/N_0_0/rep01", "o3/baseline/L_4_0/rep01"
 FEW = {  # which stand for all
     "pages.tables.TABLES": {"attempts": TABLES["attempts"]},
     "pages.tables.FIGURES": {"first-action": FIGURES["first-action"]},
+    "export.TABLES": {"attempts": TABLES["attempts"]},
+    "export.FIGURES": {"first-action": FIGURES["first-action"]},
     "catalogue.PAGE": 3,
     "pages.trials.PAGE": 3,
 }
