@@ -48,8 +48,10 @@ GROUP BY driver, model, provider HAVING bool_or(tried.scripted) ORDER BY ALL;
 CREATE OR REPLACE TEMP VIEW same_prompts AS
 WITH driven AS (
     SELECT trial_id, spec_hash, sum(hash(step, side, position_m)) AS trace
-    FROM states SEMI JOIN (FROM played WHERE scripted AND status <> 'failed')
-        USING (trial_id, spec_hash)
+    FROM states SEMI JOIN (
+        FROM played WHERE scripted AND status <> 'failed'
+            AND (SELECT count(DISTINCT variant) FROM played) > 1
+    ) USING (trial_id, spec_hash)
     GROUP BY ALL
 ), prompts AS (
     SELECT variant,

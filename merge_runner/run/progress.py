@@ -525,10 +525,11 @@ def _faults(summary: dict[str, Any]) -> Iterator[str]:
             yield f"The model `{model}` is a scripted stand-in, no language model."
         else:
             yield f"{driver}: a scripted stand-in answered, not {model}"
-    for prompts in summary["same_prompts"]:
+    if same := summary["same_prompts"]:
+        prompts = "; ".join(map(", ".join, same))
         yield (
-            f"{', '.join(prompts)} gave the same trials: the emulator reads no words; plant an "
-            "effect to rehearse (docs/how-to/run-a-study.md)"
+            f"the same trials with these prompts: {prompts}. The emulator reads no words: plant an "
+            "effect to rehearse (docs/how-to/run-a-study.md#words-that-cross)"
         )
     audit = summary["audit"]
     audit_it = command_at("merge-runner audit", "--db", summary["db"], DEFAULT_DB)

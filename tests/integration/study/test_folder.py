@@ -25,7 +25,7 @@ def study(tmp_path):
     return folder
 
 
-PART = ("--only", "temperature=0.2", "--conditions", "L_4_0")
+PART = ("--only", "hurry=yes", "--conditions", "L_4_0", "--reps", "1")
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ async def test_a_new_study_is_replayed_and_shown(merge_runner, played):
     digest = results_digest(played / "results/merge.duckdb")
     assert results_digest(played / "again.duckdb") == digest
     tables = await merge_runner("tables", "attempts", cwd=played)
-    assert "emulator+hesitant [temperature=0.2]/hurry" in tables.out
+    assert "emulator+hesitant/persona=taxi hurry=yes" in tables.out
 
 
 async def test_an_export_names_the_plug_ins_that_it_carries_and_has_no_command_line(
@@ -168,8 +168,8 @@ def test_a_plug_in_is_short_and_every_commented_line_of_the_registry_can_be_used
 
 async def test_the_commented_lines_of_the_study_can_be_used(merge_runner, study):
     text = (study / "study.toml").read_text()
-    used = re.sub(r"^# (?=\[|total_usd|prompt = |temperature = )", "", text, flags=re.MULTILINE)
+    used = re.sub(r"^# (?=\[|total_usd|persona = |opponent = )", "", text, flags=re.MULTILINE)
     (study / "study.toml").write_text(used)
     run = await merge_runner("sweep", "study.toml", "--dry-run", cwd=study)
     assert run.code == 0, run.err
-    assert re.search(r"trials +18 ", run.out)
+    assert re.search(r"trials +110 ", run.out)

@@ -113,10 +113,12 @@ async def test_a_run_says_where_several_prompts_gave_the_same_trials(merge_runne
     told = await merge_runner("sweep", "words.toml", "--only", "opponent=self", *FAST)
     assert told.code == 0, told.err
     assert (
-        "baseline, hurry=yes, persona=taxi, persona=taxi hurry=yes gave the same trials: the "
-        "emulator reads no words; plant an effect to rehearse (docs/how-to/run-a-study.md)"
+        "the same trials with these prompts: baseline, hurry=yes, persona=taxi, persona=taxi "
+        "hurry=yes. The emulator reads no words: plant an effect to rehearse "
+        "(docs/how-to/run-a-study.md#words-that-cross)"
     ) in told.err + told.out
     text = text + "emulator = { own_first = 6 }\n"
     (tmp_path / "words.toml").write_text(text)
     told = await merge_runner("sweep", "words.toml", "--only", "opponent=self", *FAST)
-    assert "baseline, persona=taxi gave the same trials" in told.err + told.out
+    said = "with these prompts: baseline, persona=taxi; hurry=yes, persona=taxi hurry=yes."
+    assert said in told.err + told.out

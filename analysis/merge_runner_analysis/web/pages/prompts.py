@@ -124,7 +124,13 @@ def left_out(site: Site, variant: str) -> str:
     ((names,),) = map(dict.values, site.catalogue.ask(STORED, variant))
     if names is None:
         return f"of which {UNKNOWN}"
-    own, baseline = frozenset(names), frozenset(blocks_of(BASELINE))
+    baseline = frozenset(blocks_of(BASELINE))
+    # A block that one driver alone is told has its side behind its name; of the baseline's ones
+    # that is what the other one is not told.
+    own = frozenset(
+        name.partition("@")[0] for name in names if name.partition("@")[0] not in baseline
+    )
+    own |= baseline & frozenset(names)
     changes = Variant(removes=baseline - own, adds=own - baseline)
     return changes_text(changes, _named) or "the whole prompt"
 
