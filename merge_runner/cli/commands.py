@@ -223,7 +223,7 @@ def _play(
             say(note)
     if dry_run:
         expected = asyncio.run(running.unsent(plan, options, say=say))
-        lines = "\n".join(progress.estimate_lines(expected))
+        lines = "\n".join([*progress.estimate_lines(expected), *progress.prompt_lines(plan)])
         sent = "\nNothing was sent." if expected.trials else ""
         print_out(json.dumps(asdict(expected)) if as_json else f"{lines}{sent}")
         return 0

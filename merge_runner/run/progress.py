@@ -29,6 +29,7 @@ from merge_runner.errors import ReplayMiss
 from merge_runner.llm.client import Meter
 from merge_runner.llm.ledger import Ledger
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, command_at
+from merge_runner.prompts.blocks import decomposed
 from merge_runner.records import Status
 from merge_runner.results.export import write_table
 from merge_runner.run.estimate import Estimate
@@ -561,6 +562,13 @@ def _by_model(expected: Estimate) -> Iterator[str]:
     """What each of several models costs."""
     if len(expected.usd_by_model) > 1:
         yield from (f"        {name}: {_about(usd)}" for name, usd in expected.usd_by_model.items())
+
+
+def prompt_lines(plan: Plan) -> Iterator[str]:
+    """The blocks, in order, of each prompt that has words of the study's factors."""
+    for name, prompt in plan.parts.prompts.items():
+        if decomposed(name)[1]:
+            yield f"prompt  {name}: {', '.join(prompt.blocks)}"
 
 
 def estimate_lines(expected: Estimate) -> Iterator[str]:

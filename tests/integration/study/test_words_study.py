@@ -122,3 +122,10 @@ async def test_a_run_says_where_several_prompts_gave_the_same_trials(merge_runne
     told = await merge_runner("sweep", "words.toml", "--only", "opponent=self", *FAST)
     said = "with these prompts: baseline, persona=taxi; hurry=yes, persona=taxi hurry=yes."
     assert said in told.err + told.out
+
+
+async def test_a_dry_run_shows_of_what_each_prompt_is_composed(merge_runner, tmp_path):
+    (tmp_path / "words.toml").write_text(PLANTED)
+    told = await merge_runner("sweep", "words.toml", "--dry-run")
+    blocks = "C3.human, persona=taxi.1, hurry=yes.1, C3.distance"
+    assert f"prompt  persona=taxi hurry=yes: C0, C1, C2, C3.safety, {blocks}" in told.out
