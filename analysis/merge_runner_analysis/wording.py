@@ -28,6 +28,7 @@ PLAYED_RULES = {
     "shared_lane": "the rule of its scenario",
 }
 MISSING, MINUS = "–", "−"
+TIMES = " × "  # between the factors of an interaction
 
 Values = Mapping[str, Any]
 

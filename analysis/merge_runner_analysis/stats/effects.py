@@ -7,7 +7,7 @@ in the cells that all four have.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain, combinations, product
@@ -31,11 +31,11 @@ from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.intervals import difference
 from merge_runner_analysis.stats.measures import estimate, linear, undecided
 from merge_runner_analysis.study import Study, in_one_study
+from merge_runner_analysis.wording import TIMES
 
 # Shown by this one, prompts are compared driver by driver; a driver has all other levels in it.
 DRIVER = "driver"
 PRIMARY = "goes_first"  # in a study's file, and where none is named
-TIMES = " × "
 Cell = tuple[str, ...]
 
 
@@ -406,6 +406,25 @@ def _with_cells(groups: Sequence[Group], apart_from: set[str]) -> Group:
         cells_of = pd.Series(cells, group.trials.index, dtype=object)
         parts.append(group.trials.assign(cell=cells_of, group=group.id))
     return replace(groups[0], trials=pd.concat(parts, ignore_index=True))
+
+
+def crossing(study: Study, factors: Sequence[str], wanted: Mapping[str, str]) -> list[Level]:
+    """The trials at these levels of several factors, as a level of their crossing.
+
+    Those of scripted stand-ins are another one.
+    """
+    chosen = [g for g in study.models if all(_level_of(g, f) == at for f, at in wanted.items())]
+    found = []
+    for scripted in (False, True):
+        groups = [group for group in chosen if group.scripted == scripted]
+        if not groups:
+            continue
+        mark = " [scripted]" if scripted and len(groups) < len(chosen) else ""
+        name = ", ".join(wanted[factor] for factor in factors)
+        pooled = _with_cells(groups, {*wanted})
+        ids = tuple(group.id for group in groups)
+        found += _distinct([Level(TIMES.join(factors), name, ids, pooled, mark=mark)])
+    return found
 
 
 def _distinct(levels: list[Level]) -> list[Level]:

@@ -51,6 +51,7 @@ TABLES = {
     "effects": Listed(
         "What each factor changes: its levels against the reference, in every measure"
     ),
+    "levels": Listed("What drivers do at each level of each factor, and in their crossings"),
     "contrasts": Listed("Differences between prompts"),
     "factors": Listed("Each factor's levels: every metric, and the difference from the reference"),
     "criticality": Listed("When conflicts are resolved, and how close the vehicles come"),

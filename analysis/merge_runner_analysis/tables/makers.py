@@ -13,6 +13,7 @@ from merge_runner_analysis.tables.effects import contrasts, effects_table, facto
 from merge_runner_analysis.tables.first_action import first_action
 from merge_runner_analysis.tables.gap import gap
 from merge_runner_analysis.tables.indicators import indicators
+from merge_runner_analysis.tables.levels import levels
 from merge_runner_analysis.tables.model import Table
 from merge_runner_analysis.tables.verdicts import verdicts
 from merge_runner_analysis.tables.who_first import who_first
@@ -25,6 +26,7 @@ MAKERS: dict[str, Callable[[Study], Table]] = {
     "ablation-qualitative": ablation_qualitative,
     "ablation-quantitative": ablation_quantitative,
     "effects": effects_table,
+    "levels": levels,
     "contrasts": contrasts,
     "factors": factors,
     "criticality": criticality,

@@ -1,0 +1,118 @@
+"""What drivers do at each level of each factor, and in the crossings of those that a study varies.
+
+The first page draws its chart and counts its trials from this table.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+
+from merge_runner.study.crossing import MODEL, OPPONENT
+from merge_runner_analysis.metrics import COLLISIONS, GAP, RMSE, Metric
+from merge_runner_analysis.stats.effects import (
+    Level,
+    crossing,
+    levels_by_factor,
+    primary,
+)
+from merge_runner_analysis.stats.measures import counts, estimate
+from merge_runner_analysis.study import Study
+from merge_runner_analysis.tables.model import ENDED, Column, Optional, Row, Table, Value, interval
+
+# More crossings than these are no chart.
+MOST_CROSSINGS = 8
+
+
+def levels(study: Study) -> Table:
+    """A row per level of a factor, and per crossing of the factors, of all drivers and of each."""
+    metric = primary(study)
+    hits = metric.column if metric.rate else ""
+    return Table(
+        "levels",
+        (
+            Column("factor", "factor"),
+            Column("level", "level"),
+            Optional("driver", "driver"),
+            Optional("k", metric.label, "count", 0, "trials in which it is so", hits),
+            Column("n", "n", "count", 0, f"trials that count: {metric.meaning}"),
+            Optional("value", metric.heading, "number", 2, metric.meaning),
+            interval("ci", f"of {metric.heading}"),
+            Column("crashed", "crashed", "count", 0, COLLISIONS.meaning, COLLISIONS.column,
+                   rests_on=COLLISIONS.column),
+            Column("ended", "of", "count", 0, "trials that ended", rests_on=ENDED),
+            Optional("gap_m", GAP.heading, "number", 2, GAP.meaning, rests_on=GAP.column),
+            Optional("rmse_mps", RMSE.heading, "number", 2, RMSE.meaning, rests_on=RMSE.column),
+        ),
+        [_row(level, driver, metric) for driver, level in _every(study)],
+        (
+            "all trials of a level, whether or not another level has the same cells: differences "
+            "are in the table effects. A crossing leaves out the driver and the opponent",
+        ),
+    )  # fmt: skip
+
+
+def varied(study: Study) -> tuple[str, ...]:
+    """The factors that a study varies, but the driver and its opponent; so many can be crossed."""
+    named = {
+        levels[0].factor: len(levels)
+        for levels in levels_by_factor(study)
+        if levels[0].factor not in (MODEL, OPPONENT)
+    }
+    kept: list[str] = []
+    crossings = 1
+    for name, number in named.items():
+        crossings *= number
+        if crossings <= MOST_CROSSINGS:
+            kept.append(name)
+    return tuple(kept)
+
+
+def _every(study: Study) -> Iterator[tuple[str, Level]]:
+    """Each level of all drivers, then of each driver, then each crossing of each driver."""
+    drivers = {group.levels[MODEL] for group in study.models if MODEL in group.levels}
+    ordered = [name for name in dict.fromkeys(_drivers(study)) if name in drivers]
+    for of_factor in levels_by_factor(study):
+        yield from (("", level) for level in of_factor)
+    for driver in ordered:
+        for of_factor in levels_by_factor(study, MODEL, driver):
+            yield from ((driver, level) for level in of_factor)
+    factors = varied(study)
+    if len(factors) < 2:
+        return
+    for driver, names in product(ordered, product(*_names(study, factors))):
+        wanted = {MODEL: driver, **dict(zip(factors, names, strict=True))}
+        yield from ((driver, level) for level in crossing(study, factors, wanted))
+
+
+def _drivers(study: Study) -> Iterator[str]:
+    return (group.levels.get(MODEL, "") for group in study.models)
+
+
+def _names(study: Study, factors: tuple[str, ...]) -> list[list[str]]:
+    """The names of the levels of each of these factors."""
+    names: dict[str, dict[str, None]] = {factor: {} for factor in factors}
+    for of_factor in levels_by_factor(study):
+        if of_factor[0].factor in names:
+            names[of_factor[0].factor] |= dict.fromkeys(level.name for level in of_factor)
+    return [[*known] for known in names.values()]
+
+
+def _row(level: Level, driver: str, metric: Metric) -> Row:
+    group, found = level.pooled, estimate(level.pooled, metric)
+    crashed, ended = counts(group, COLLISIONS)
+    values: dict[str, Value] = {
+        "factor": level.factor,
+        "level": f"{level.name}{level.mark}",
+        "driver": driver or None,
+        "k": counts(group, metric)[0] if metric.rate else None,
+        "n": found.n,
+        "value": found.value,
+        "ci": found.bounds(),
+        "crashed": crashed,
+        "ended": ended,
+        "gap_m": estimate(group, GAP).value,
+        "rmse_mps": estimate(group, RMSE).value,
+    }
+    name = f"{driver}/" * bool(driver) + f"{level.factor}={level.name}{level.mark}"
+    return Row(name, level.groups, values, "", metric.column, copies=level.copies)
