@@ -16,7 +16,7 @@ from merge_runner.paths import DEFAULT_DB
 from merge_runner.prompts.blocks import BASELINE
 from merge_runner.registry import require
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
-from merge_runner.study.crossing import PROMPT, listed_levels
+from merge_runner.study.crossing import MODEL, PROMPT, listed_levels
 from merge_runner.study.file import StudySource, read_study
 from merge_runner_analysis.cache import present_state, remembered
 from merge_runner_analysis.frames import KEYS, Order, Studies, read, read_frames, study_name
@@ -64,6 +64,11 @@ class Study:
         self.played = [group for group in played if group in wanted]
         self.models = [group for group in self.played if not group.unjudged]
         self.unjudged = [group for group in self.played if group.unjudged]
+        if selection.models:  # the one that is named first is what others are compared with
+            place = [without_endpoint(name) for name in selection.models].index
+            named = sorted(self.models, key=lambda group: place(without_endpoint(group.driver)))
+            levels = [group.levels[MODEL] for group in named if MODEL in group.levels]
+            self.order = {**self.order, MODEL: list(dict.fromkeys(levels))}
         only_asked = [group for group in only_asked if group in wanted]
         self.asked = [group for group in only_asked if not group.unjudged]
         self.unjudged_asked = [group for group in only_asked if group.unjudged]

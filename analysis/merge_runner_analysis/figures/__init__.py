@@ -27,6 +27,13 @@ OF_FIGURE_2 = (
     "imported); few very wide intervals of D and E are cut at the frame."
 )
 FIGURES = {
+    "effects": About(
+        "each level of each factor in every measure, a mark for each driver",
+        "Each level of each factor by driver, over all of its trials: shares with Wilson "
+        "intervals, means with those of Student's t. Dotted: neither driver is favoured. How far "
+        "levels are apart, within equal conditions, is in the table effects.",
+        "effects",
+    ),
     "figure2": About(
         "the paper's Figure 2 for the baselines: speeds, who is first, gap and RMSE by condition",
         f"Baseline behaviour. {OF_FIGURE_2}",

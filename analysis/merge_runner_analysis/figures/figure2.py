@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -117,8 +118,9 @@ def gap(trials: pd.DataFrame) -> Estimate:
 
 
 def deviation(trials: pd.DataFrame) -> Estimate:
-    """Panel E: mean RMSE of the speed in m/s, of a trial that of both vehicles."""
-    return mean(trials["rmse_mps"].to_numpy(float))
+    """Panel E: mean RMSE of the speed in m/s, of a trial that of both vehicles; never below 0."""
+    found = mean(trials["rmse_mps"].to_numpy(float))
+    return found if found.low is None else replace(found, low=max(0.0, found.low))
 
 
 Summary = Callable[[pd.DataFrame], Estimate]
@@ -215,7 +217,7 @@ def _draw_humans(axis: Axes, human: Group, summary: Summary, styles: Styles, das
 
 
 def _scale(axes: NDArray[np.object_], groups: list[Group], study: Study) -> None:
-    """One scale per quantity, which shows all values and lines, and most intervals."""
+    """One scale per quantity: all values and lines, and intervals as far as single trials reach."""
     speeds = [limit for axis in axes[0, :2] for limit in axis.get_ylim()]
     for axis in axes[0, :2]:
         axis.set_ylim(min(speeds), max(speeds))
@@ -226,12 +228,16 @@ def _scale(axes: NDArray[np.object_], groups: list[Group], study: Study) -> None
         if not found:
             continue
         frame = pd.DataFrame([(one.value, one.low, one.high) for one in found], dtype=float)
-        values = [*frame[0], frame[1].quantile(1 - SHOWN), frame[2].quantile(SHOWN)]
+        column = "gap_m" if summary is gap else "rmse_mps"
+        single = pd.concat([group.finished[column] for group in groups if group.measured])
+        ends = frame[1].quantile(1 - SHOWN), frame[2].quantile(SHOWN)
+        values = [*frame[0], max(ends[0], single.min()), min(ends[1], single.max())]
         if summary is gap and not all(group.measured for group in groups):
             values += [y for v in HUMAN_VELOCITIES_MPS for y in published_gap_line(v)[1]]
         low, high = np.nanmin(values), np.nanmax(values)
         margin = 0.08 * (high - low) or 1.0
-        axis.set_ylim(low - margin, high + margin)
+        bottom = low - margin
+        axis.set_ylim(bottom if summary is gap else max(0.0, bottom), high + margin)
     farthest_m = max(abs(headway_m) for headway_m, _ in study.conditions.values())
     for axis in axes[0, 2:]:
         axis.set(xlim=(-farthest_m - 1, farthest_m + 1), xticks=[-farthest_m, 0, farthest_m])

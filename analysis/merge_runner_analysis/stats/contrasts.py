@@ -34,12 +34,15 @@ class Cells:
     """Two rates by cell: successes and trials of the first, and of the second.
 
     Their difference is that of Mantel and Haenszel: cells weigh n m / (n + m), as in least squares.
+    ``varying`` is by cell what share of the trials of either vary by themselves: not those that
+    stand in two cells with opposite outcomes, so that their sum is sure.
     """
 
     a: NDArray[np.int_]
     n: NDArray[np.int_]
     b: NDArray[np.int_]
     m: NDArray[np.int_]
+    varying: tuple[NDArray[np.float64] | float, NDArray[np.float64] | float] = (1.0, 1.0)
 
     @property
     def shares(self) -> NDArray[np.float64]:
@@ -61,7 +64,8 @@ class Cells:
         n, m = self.n, self.m
         p, q = _likeliest(self.a, n, self.b, m, apart)
         every = n + m
-        of_cells = (p * (1 - p) / n + q * (1 - q) / m) * every / (every - 1)
+        one, other = self.varying
+        of_cells = (one * p * (1 - p) / n + other * q * (1 - q) / m) * every / (every - 1)
         return float(self.shares**2 @ of_cells)
 
     def end(self, sign: int, z: float = Z) -> float:
@@ -123,15 +127,25 @@ def weighted(
 
 
 def shared_cells(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Cells | None:
-    """Return the rates of two groups in the conditions that both have; None where there is none."""
-    counts = []
+    """Return the rates of two groups in the conditions that both have; None where there is none.
+
+    A column ``varies`` says which trials vary by themselves (see ``Cells``); else all do.
+    """
+    counts, varying = [], []
     for frame in (first, second):
-        known = frame.loc[frame[measure].notna(), ["condition", measure]]
+        known = frame.loc[frame[measure].notna()]
         hits = known.loc[known[measure].astype(bool), "condition"]
         counts += [Counter(hits), Counter(known["condition"])]
+        if "varies" in known:
+            varying.append(Counter(known.loc[known["varies"], "condition"]))
+        else:
+            varying.append(counts[-1])
     shared = sorted(counts[1].keys() & counts[3].keys())
-    both = (np.array([count[cell] for cell in shared], dtype=int) for count in counts)
-    return Cells(*both) if shared else None
+    if not shared:
+        return None
+    a, n, b, m = (np.array([count[cell] for cell in shared], dtype=int) for count in counts)
+    one, other = (np.array([count[cell] for cell in shared], dtype=int) for count in varying)
+    return Cells(a, n, b, m, (one / n, other / m))
 
 
 def contrast_rates(cells: Cells) -> Estimate:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain, combinations, product
 
+import numpy as np
 import pandas as pd
 
 from merge_runner.registry import require
@@ -28,7 +29,7 @@ from merge_runner_analysis.stats.contrasts import (
     shared_cells,
 )
 from merge_runner_analysis.stats.estimate import Estimate
-from merge_runner_analysis.stats.intervals import difference
+from merge_runner_analysis.stats.intervals import difference, wilson
 from merge_runner_analysis.stats.measures import estimate, linear, undecided
 from merge_runner_analysis.study import Study, in_one_study
 from merge_runner_analysis.wording import TIMES
@@ -81,9 +82,10 @@ class Level:
 class Effect:
     """A level against the reference of its factor, in one measure, in the unit of that.
 
-    ``at_level`` and ``at_reference`` are the estimates of all their trials, ``difference`` that
+    ``at_level`` and ``at_reference`` are the estimates of all their trials, ``means`` those of both
+    in the shared cells, with the weights of the ``difference``, which is the first less the second
     within the shared cells with its interval, p and detectable; its value is None where nothing is
-    compared, and ``problem`` says why. ``n`` and ``n_reference`` are the trials that it rests on.
+    compared. ``n`` and ``n_reference`` are the trials that it rests on, without ``left_out``.
     Of an interaction ``across`` are the same two levels at the reference of the other factor.
     ``p_corrected`` is by Holm's method, in the family that ``primary`` tells.
     """
@@ -94,6 +96,7 @@ class Effect:
     at_level: Estimate
     at_reference: Estimate
     difference: Estimate
+    means: tuple[float, float] | None
     n: int
     n_reference: int
     left_out: tuple[tuple[str, str], ...] = ()
@@ -139,9 +142,10 @@ def effects(study: Study, by: str = "") -> list[Effect]:
     if not by:
         main = [one for levels in levels_by_factor(study) for one in _of_levels(study, levels)]
         return _with_corrected(study, [*main, *_interactions(study)])
-    shown = [""] if by == DRIVER else require(levels_of(study.models, study.order), "factor", by)
     if by == DRIVER:
         shown = list(dict.fromkeys(group.driver for group in study.models))
+    else:
+        shown = require(levels_of(study.models, study.order), "factor", by)
     simple = [
         one
         for at in shown
@@ -152,7 +156,7 @@ def effects(study: Study, by: str = "") -> list[Effect]:
     p_corrected = {one.key: one.p_corrected for one in effects(study)} if crossed else {}
     return [
         *_with_corrected(study, simple),
-        *(replace(one, p_corrected=p_corrected[one.key]) for one in crossed),
+        *(replace(one, p_corrected=p_corrected.get(one.key)) for one in crossed),
     ]
 
 
@@ -201,9 +205,9 @@ def _of_levels(study: Study, levels: Sequence[Level]) -> Iterator[Effect]:
     """Each level but the first against that one, measure by measure."""
     reference, *others = levels
     for metric in measured(study):
-        first = estimate(reference.pooled, metric)
+        first = level_estimate(study, reference, metric)
         for level in others:
-            both = estimate(level.pooled, metric), first
+            both = level_estimate(study, level, metric), first
             yield _effect(study, metric, (level, reference), both)
 
 
@@ -252,18 +256,33 @@ def _effect(
     for level, frame in zip(levels, frames, strict=False):
         unused = level.pooled.trials[KEYS].drop(index=frame.index)
         left_out |= {*unused.itertuples(index=False, name=None)}
-    compared = [frames[place] for place in (0, 2, 1, 3)] if turned and frames else frames
-    found = _difference(compared, metric) or Estimate()
+    ordered = [frames[place] for place in (0, 2, 1, 3)] if turned and frames else frames
+    found = _difference(ordered, metric) or Estimate()
     # Where nothing varies it is not known what could have been seen.
     found = replace(found, detectable=found.detectable or None)
+    unit = 100 if metric.rate else 1
     return Effect(
         *(levels[0], levels[1], metric, *both),
-        difference=found.times(100 if metric.rate else 1),
-        n=len(frames[0]) if frames else 0,
-        n_reference=len(frames[1]) if frames else 0,
+        difference=found.times(unit),
+        means=_means(frames, unit) if len(frames) == 2 and found.p is not None else None,
+        n=frames[0].index.nunique() if frames else 0,
+        n_reference=frames[1].index.nunique() if frames else 0,
         left_out=tuple(sorted(left_out)),
         across=(levels[2], levels[3]) if len(levels) > 2 else None,
     )
+
+
+def _means(frames: Sequence[pd.DataFrame], unit: float) -> tuple[float, float]:
+    """Both means over the cells, which weigh n m / (n + m) as in their difference."""
+    codes, cells = pd.factorize(pd.concat([frame["condition"] for frame in frames]))
+    parts = np.split(codes, [len(frames[0])])
+    n, m = (np.bincount(part, minlength=len(cells)) for part in parts)
+    weights = n * m / (n + m)
+    one, other = (
+        float(np.bincount(part, frame["value"].astype(float)) / size @ weights / weights.sum())
+        for part, frame, size in zip(parts, frames, (n, m), strict=True)
+    )
+    return unit * one, unit * other
 
 
 def _difference(frames: Sequence[pd.DataFrame], metric: Metric) -> Estimate | None:
@@ -287,23 +306,30 @@ def _with_corrected(study: Study, found: list[Effect]) -> list[Effect]:
 
     Where nothing varies and nothing differs, as without a single collision, no test is made.
     """
-    chosen, families = primary(study), dict[bool, list[int]]()
-    for place, one in enumerate(found):
-        own = one.metric is chosen and not one.across and one.level.factor not in (MODEL, DRIVER)
-        found[place] = replace(one, primary=own)
-        if one.difference.p is not None and (one.difference.se or one.difference.value):
-            families.setdefault(own, []).append(place)
-    p_corrected = {
-        place: p
-        for places in families.values()
-        for place, p in zip(
-            places, corrected([found[place].difference.p or 0.0 for place in places]), strict=True
+    chosen = primary(study)
+    found = [
+        replace(
+            one,
+            primary=one.metric is chosen
+            and not one.across
+            and one.level.factor not in (MODEL, DRIVER),
+            p_corrected=one.difference.p,
         )
-    }
-    return [
-        replace(one, p_corrected=p_corrected.get(place, one.difference.p))
-        for place, one in enumerate(found)
+        for one in found
     ]
+    for own in (True, False):
+        family = {
+            place: one.difference.p
+            for place, one in enumerate(found)
+            if one.primary is own and one.difference.p is not None and _can_differ(one)
+        }
+        for place, p in zip(family, corrected([*family.values()]), strict=True):
+            found[place] = replace(found[place], p_corrected=p)
+    return found
+
+
+def _can_differ(one: Effect) -> bool:
+    return bool(one.difference.se or one.difference.value)
 
 
 def trials_by_cell(study: Study, groups: Sequence[Group], metric: Metric) -> list[pd.DataFrame]:
@@ -314,17 +340,88 @@ def trials_by_cell(study: Study, groups: Sequence[Group], metric: Metric) -> lis
     """
     if not in_one_study(study, *groups) or any(undecided(group, metric) for group in groups):
         return []
-    frames = []
+    copied, frames = copied_cells(study, tuple(groups)), []
     for group in groups:
+        trials = group.trials[~group.trials["cell"].isin(copied)] if copied else group.trials
         columns = {"condition": "cell", "value": metric.column, "weight": metric.weight_column}
-        named = {name: group.trials[own] for name, own in columns.items() if own in group.trials}
+        named = {name: trials[own] for name, own in columns.items() if own in trials}
         frame = pd.DataFrame(named).dropna(subset="value")
         if metric.weight:
             frame["value"] = linear(frame["value"], frame["weight"], frame["condition"])
+        elif metric is LEFT_FIRST and one_sided(study):
+            frame = _from_both_sides(study, frame, trials)
         frames.append(frame)
     kept = set.intersection(*(set(one["condition"]) for one in frames))
-    kept -= copied_cells(study, tuple(groups))
     return [frame[frame["condition"].isin(kept)] for frame in frames]
+
+
+@remembered
+def one_sided(study: Study) -> bool:
+    """Whether in some trials one driver is given what the other, who is equal to it, is not."""
+    return any(
+        (group.trials["focal"].notna() & _of_equals(group.trials)).any() for group in study.models
+    )
+
+
+def _of_equals(trials: pd.DataFrame) -> pd.Series:
+    return trials["model_left"] == trials["model_right"]
+
+
+def _from_both_sides(study: Study, frame: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
+    """Who goes first, by cell and side; trials of two that are given the same read from both.
+
+    So whoever is given something on the left is compared with the left ones who are not, and on the
+    right with the right ones: no side is favoured. The readings of a trial are opposite, and the
+    sum of both does not vary.
+    """
+    trials = trials.loc[frame.index]
+    same = trials["focal"].isna() & _of_equals(trials)
+    sides = _with_side(frame["condition"], trials["ego"])
+    left = frame.assign(condition=sides, varies=~same)
+    images = {name: _image(study, name) for name in trials["condition"].unique()}
+    named = [(images[cell[0]], *cell[1:]) for cell in frame.loc[same, "condition"]]
+    cells = pd.Series(named, frame.index[same], dtype=object)
+    right = pd.DataFrame(
+        {
+            "condition": _with_side(cells, pd.Series("right", cells.index)),
+            "value": ~frame.loc[same, "value"].astype(bool),
+            "varies": False,
+        }
+    )
+    return pd.concat([left, right])
+
+
+def _with_side(cells: pd.Series, sides: pd.Series) -> pd.Series:
+    named = [(*cell, side) for cell, side in zip(cells, sides, strict=True)]
+    return pd.Series(named, cells.index, dtype=object)
+
+
+def _image(study: Study, condition: str) -> str:
+    """A condition as the driver on the right sees it."""
+    headway_m, velocity_mps = study.conditions[condition]
+    mirrored = (0 - headway_m, 0 - velocity_mps)
+    if mirrored == (headway_m, velocity_mps):
+        return condition
+    found = sorted(name for name, numbers in study.conditions.items() if numbers == mirrored)
+    return found[0] if found else f"{condition} mirrored"
+
+
+def level_estimate(study: Study, level: Level, metric: Metric) -> Estimate:
+    """What a level comes to, over all of its trials.
+
+    Where one driver is given something, who goes first of two that are not is each of them in half
+    of the trials: the share of readings from both sides.
+    """
+    if metric is not LEFT_FIRST or not one_sided(study):
+        return estimate(level.pooled, metric)
+    trials = level.pooled.trials
+    known = trials[trials[metric.column].notna()]
+    if not (n := len(known)):
+        return Estimate()
+    same = known["focal"].isna() & _of_equals(known)
+    k = float(known.loc[~same, metric.column].sum()) + same.sum() / 2
+    low, high = wilson(k / n, n)
+    return Estimate(100 * k / n, 100 * low, 100 * high, n, k=round(k))
 
 
 @remembered
@@ -365,8 +462,8 @@ def copied_of_shared(study: Study, *levels: Level) -> tuple[int, int]:
 
 
 @remembered
-def levels_by_factor(study: Study, by: str = "", at: str = "") -> list[list[Level]]:
-    """The levels of each factor in which the trials of drivers differ, the reference first.
+def levels_by_factor(study: Study, by: str = "", at: str = "", least: int = 2) -> list[list[Level]]:
+    """The levels of each factor that has so many of them at ``least``, the reference first.
 
     Trials of scripted stand-ins are never pooled with others. With ``by``, the trials are those
     ``at`` one of its levels.
@@ -378,7 +475,7 @@ def levels_by_factor(study: Study, by: str = "", at: str = "") -> list[list[Leve
         _distinct([_level(groups, factor, name, by, apart=apart) for name in levels])
         for groups in kinds
         for factor, levels in levels_of(groups, study.order).items()
-        if len(levels) > 1
+        if len(levels) >= least
     ]
 
 

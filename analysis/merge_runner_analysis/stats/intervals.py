@@ -6,7 +6,6 @@ Every test against Student's t is made here; one with infinite degrees of freedo
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import cycle
 from math import hypot, inf, sqrt
 
 import numpy as np
@@ -45,19 +44,6 @@ def wilson(p: float, n: float, z: float = Z) -> tuple[float, float]:
     half = z / (1 + z**2 / n) * sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
     # The exact bounds at 0 and n are 0 and 1; rounding must not leave the estimate outside.
     return min(p, max(0.0, middle - half)), max(p, min(1.0, middle + half))
-
-
-def newcombe(rates: Sequence[tuple[float, float]], z: float = Z) -> tuple[float, float]:
-    """Return the interval of a difference of rates, (rate, trials) each (Newcombe 1998).
-
-    The first is added, the second subtracted, and so on in turn.
-    """
-    value, below, above = 0.0, 0.0, 0.0
-    for sign, (rate, n) in zip(cycle((1, -1)), rates, strict=False):
-        apart = [sign * (end - rate) for end in wilson(rate, n, z)]
-        value += sign * rate
-        below, above = hypot(below, min(apart)), hypot(above, max(apart))
-    return value - below, value + above
 
 
 def melded(

@@ -8,9 +8,11 @@ from statsmodels.stats.contingency_tables import StratifiedTable
 from statsmodels.stats.multitest import multipletests
 
 from merge_runner.errors import UsageError
+from merge_runner_analysis.frames import load
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.stats.effects import compared, effects, primary
 from merge_runner_analysis.study import Study
+from tests.support.harness import FAST
 from tests.support.studies import changed, write_study, yielding
 from tests.support.tables import made, values_of
 
@@ -49,14 +51,19 @@ def test_two_models_differ_by_an_independent_test_with_one_p_on_every_page(two):
     assert between["collided_percent"].difference.p == pytest.approx(p)
     for name, effect in between.items():
         row = rows.get(f"model=two/{name}")
-        if row is None:  # a median
+        if row is None or row["p"] is None:  # a median; or some trials are undecided
             continue
         found = effect.difference
         assert (row["difference"], row["ci"], row["p"]) == (found.value, found.bounds(), found.p)
         assert row["p_corrected"] == effect.p_corrected
-        assert (row["estimate"], row["estimate_reference"]) == (
-            effect.at_level.value, effect.at_reference.value,
-        )  # fmt: skip
+        assert row["estimate"] - row["estimate_reference"] == pytest.approx(found.value)
+        assert (row["estimate"], row["estimate_reference"]) == effect.means
+
+
+def test_the_driver_that_is_named_first_is_the_reference(two):
+    turned = values_of(Study(two.db, Selection(["two", "one"])), "effects")
+    row, same = turned["model=one/gap_m"], values_of(two, "effects")["model=two/gap_m"]
+    assert (row["reference"], row["difference"]) == ("two", pytest.approx(-same["difference"]))
 
 
 def test_every_interval_leaves_0_out_exactly_where_its_p_is_below_5_percent(two, played):
@@ -116,6 +123,47 @@ def test_replies_of_a_trial_count_as_one_observation(tmp_path):
     assert found.difference.value == pytest.approx(shares["two"] - shares["one"], abs=3)
     assert found.n == 55
     assert found.difference.freedom < 110
+
+
+HURRY = """
+models = ["emulator"]
+repetitions = 30
+conditions = ["N_0_0", "L_4_0", "R_-4_0"]
+mirror = true
+[factors]
+hurry = ["no", "yes"]
+[texts.hurry.yes]
+add = [{ after = "C3.human", text = "You are in a hurry." }]
+given_to = "ego"
+emulator = { own_first = 1.5 }
+"""
+SHARES = """
+SELECT focal, condition, count(*) FILTER (merged_first = 'left') AS k, count(*) AS n
+FROM trials WHERE status = 'finished' GROUP BY ALL
+"""
+
+
+def test_the_one_in_a_hurry_is_compared_with_the_one_on_the_same_side(prepare, tmp_path):
+    (tmp_path / "hurry.toml").write_text(HURRY)
+    assert prepare(tmp_path, "sweep", "hurry.toml", "--db", "t.duckdb", *FAST).code == 0
+    study = Study(tmp_path / "t.duckdb")
+    (found,) = [one for one in effects(study) if one.primary]
+    counts = load(SHARES, study.db).fillna({"focal": ""}).set_index(["focal", "condition"])
+    apart, weights = [], []
+    for condition in ("N_0_0", "L_4_0", "R_-4_0"):
+        k_none, m = counts.loc[("", condition)]
+        for side in ("left", "right"):
+            k, n = counts.loc[(side, condition)]
+            own, other = (k, k_none) if side == "left" else (n - k, m - k_none)
+            apart.append(own / n - other / m)
+            weights.append(n * m / (n + m))
+    assert found.difference.value == pytest.approx(100 * np.average(apart, weights=weights))
+    assert found.difference.low > 0
+    assert found.p_corrected == found.difference.p < 0.001
+    assert found.at_reference.value == 50
+    assert (found.n, found.n_reference) == tuple(
+        counts.groupby(counts.index.get_level_values(0) == "")["n"].sum()
+    )
 
 
 def test_a_study_without_factors_says_so(tmp_path):

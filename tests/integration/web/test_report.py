@@ -153,7 +153,7 @@ def test_the_report_writes_all_its_parts_as_files(tmp_path):
     study = Study(write_study(tmp_path / "t.duckdb", yielding("o3", reps=1)[:4]))
     out, files = tmp_path / "r/report.html", tmp_path / "r/files"
     written = {*write_report(study, out, files)}
-    parts = {f"{name}.{form}" for name in FIGURES for form in ("pdf", "png")}
+    parts = {f"{name}.{form}" for name in FIGURES for form in ("pdf", "svg", "png")}
     parts |= {f"{name}.{form}" for name in TABLES for form in ("txt", "csv", "json", "md", "tex")}
     assert written == {out, *(files / part for part in parts)}
     assert all(path.stat().st_size > 50 for path in written)
@@ -163,7 +163,7 @@ def test_the_report_writes_all_its_parts_as_files(tmp_path):
     assert b"/Type /Font" in pdf, "text stays text"
     width, _ = struct.unpack(">II", (files / "figure2.png").read_bytes()[16:24])
     assert width == round(300 * PAGE_IN)
-    for form in ("pdf", "png"):  # equal results give equal files
+    for form in ("pdf", "svg", "png"):  # equal results give equal files
         again = rendered(Study(study.db), "first-action", form)
         assert again == (files / f"first-action.{form}").read_bytes()
     with pytest.raises(UsageError, match="cannot be made"):

@@ -74,3 +74,22 @@ def test_means_hold_their_level_also_where_groups_differ_in_size_and_spread():
         estimate = contrast_means(*frames, "gap_m")
         covered += estimate.low <= 0 <= estimate.high
     assert covered / STUDIES == pytest.approx(0.95, abs=ERROR)
+
+
+@pytest.mark.parametrize("biased", [0.0, 1.0])
+def test_trials_that_are_read_from_both_sides_leave_the_level_of_the_test_as_it_is(biased):
+    """Nobody goes first for a hurry; the left one does more often, in every condition."""
+    rng, found = np.random.default_rng(10), 0
+    left = expit(FIRST + biased)
+    for _ in range(STUDIES):
+        untreated = rng.binomial(10, left)
+        on_left, on_right = rng.binomial(5, left), 5 - rng.binomial(5, left)
+        cells = Cells(
+            np.concatenate([on_left, on_right]),
+            np.full(22, 5),
+            np.concatenate([untreated, 10 - untreated]),
+            np.full(22, 10),
+            (1.0, 0.0),
+        )
+        found += contrast_rates(cells).p < 0.05
+    assert 0.03 <= found / STUDIES <= 0.05 + ERROR

@@ -1,6 +1,7 @@
 """The figures: their data, their sizes, and that equal results give equal files."""
 
 import re
+from dataclasses import replace
 from itertools import combinations
 
 import matplotlib as mpl
@@ -24,6 +25,7 @@ from merge_runner_analysis.frames import load
 from merge_runner_analysis.stats.intervals import mean, proportion
 from merge_runner_analysis.study import Study
 from tests.support.studies import Drive, changed, write_study, yielding
+from tests.support.tables import values_of
 
 
 def test_panels_show_each_condition_of_a_relative_velocity_once_with_its_trials(study):
@@ -44,7 +46,8 @@ def test_panels_show_each_condition_of_a_relative_velocity_once_with_its_trials(
         assert shown[left_first][at] == proportion(first, len(trials))
         assert shown[gap][at] == mean(trials["gap_m"])
         # Both vehicles of a conflict are correlated: a trial is one value.
-        assert shown[deviation][at] == mean(trials["rmse_mps"])
+        rmse = mean(trials["rmse_mps"])
+        assert shown[deviation][at] == replace(rmse, low=max(0.0, rmse.low))
 
 
 def test_traces_are_those_of_the_left_vehicle_that_merges_first_or_second(study):
@@ -151,9 +154,11 @@ def test_no_name_is_cut_or_hidden_and_stand_ins_are_named(name, long_names):
     assert any(LONG in text for text in marked)
     assert not any("o3" in text and "not o3" in text for text in shown)
     if name not in {"figure2", "first-action"}:  # these show baselines alone
-        assert any("A2" in text for text in marked)
-        assert any("A1" in text for text in marked)
-        assert any("A7" in text and "o3" in text for text in shown)
+        # A prompt is a line of its own beside the marks of drivers.
+        prompts = shown if name == "effects" else marked
+        assert any("A2" in text for text in prompts)
+        assert any("A1" in text for text in prompts)
+        assert any("A7" in text and ("o3" in text or name == "effects") for text in shown)
 
 
 def test_each_group_has_a_row_of_its_own_by_the_same_scales(study):
@@ -187,3 +192,30 @@ def test_figures_of_next_to_nothing_are_drawn_all_the_same(drives, tmp_path, rec
     for draw in MAKERS.values():
         draw(study).draw_without_rendering()
     assert [str(w.message) for w in recwarn.list] == []
+
+
+def test_the_axis_of_speed_deviation_begins_at_0_where_two_trials_make_wide_intervals(tmp_path):
+    drives = [d for d in yielding("o3", reps=2) if d.condition in {"N_0_0", "L_4_0"}]
+    drives = [
+        replace(d, right=tuple(0.2 * x for x in d.right)) if d.rep == 2 else d for d in drives
+    ]
+    study = Study(write_study(tmp_path / "t.duckdb", drives))
+    wide = mean(study.models[0].finished.query("condition == 'N_0_0'")["rmse_mps"])
+    assert wide.low < 0
+    rows, _ = drawn(study)
+    low, high = rows[1][4].get_ylim()
+    assert low >= 0
+    assert high < 2 * study.models[0].finished["rmse_mps"].max()
+
+
+def test_levels_are_drawn_as_the_table_of_effects_has_them(tmp_path):
+    drives = [*yielding("o3", reps=2), *yielding("o3", "A1", 2), *yielding("o1", reps=2)]
+    study = Study(write_study(tmp_path / "t.duckdb", drives))
+    panels = {axis.get_xlabel(): axis for axis in MAKERS["effects"](study).axes}
+    first, *_ = panels.values()
+    lines = [text.get_text() for text in first.get_yticklabels()]
+    assert lines == ["prompt: baseline", "prompt: A1"]
+    rows = values_of(study, "factors")
+    drawn_m = {round(float(line.get_xdata()[0]), 6) for line in panels["gap (m)"].lines}
+    assert round(rows["prompt=A1/gap_m"]["value"], 6) in drawn_m
+    assert panels["joint (%)"].get_xlim()[1] < 103

@@ -10,7 +10,8 @@ from merge_runner.errors import UsageError
 from merge_runner.planted_effect import PlantedEffect
 from merge_runner.run.plan import make_plan
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
-from merge_runner_analysis.power import HUMANS, Case, chances, human, simulate
+from merge_runner.study.file import Effect
+from merge_runner_analysis.power import HUMANS, Case, Contrast, chances, human, simulate
 from merge_runner_analysis.stats.regressions import gap_ols, who_first_logit
 
 PLANTED = """
@@ -27,6 +28,17 @@ resistance = ["none", "human"]
 [effect]
 prompt = { gap_m = 2.0, relative_velocity = 3.0 }
 resistance = { collided = 0.4 }
+"""
+HURRY = """
+models = ["idm"]
+repetitions = 10
+mirror = true
+conditions = ["L_4_0", "N_0_0", "R_-4_0"]
+[factors]
+prompt = ["baseline", "A1"]
+opponent = ["projected-order", "constant"]
+[effect]
+prompt = { goes_first = 0.15 }
 """
 PERSONA = """
 repetitions = 4
@@ -52,10 +64,37 @@ def test_simulated_trials_scatter_about_their_truth():
 
 
 def test_what_is_the_same_has_no_chance_to_be_told_apart():
-    assert Case(human(), 10, "first", human(), 10).effects == {}
-    assert Case(human(), 10, HUMANS, human()).effects == {}
+    conditions = list(HUMAN_CONDITIONS)
+    same = Contrast(((human(), 10, human(), 10),), "first")
+    assert same.effects(conditions) == {}
+    assert Case(human(), 10, HUMANS).effects(conditions) == {}
     braver = replace(human(), gap_m=9.0, collided=0.5)
-    assert list(Case(braver, 10, HUMANS, human()).effects) == ["collisions"]
+    assert list(Case(braver, 10, HUMANS).effects(conditions)) == ["collisions"]
+    apart = Contrast(((braver, 10, human(), 10),), "first").effects(conditions)
+    assert {name: size for name, (_, size, _) in apart.items()} == pytest.approx(
+        {"collisions": 100 * (0.5 - 28 / 990), "gap": 9.0 - human().gap_m}
+    )
+
+
+def test_an_effect_on_who_goes_first_is_that_many_points_over_the_conditions():
+    conditions = ["L_4_0", "N_0_0", "R_-4_0"]
+    before = human().first(conditions)
+    more = human().plus(Effect(goes_first=0.15), conditions).first(conditions)
+    assert more.mean() - before.mean() == pytest.approx(0.15)
+    assert all(more > before)
+    trials = simulate(human(), conditions, 4000, np.random.default_rng(3))
+    shares = trials.groupby("condition", sort=False)["left_first"].mean()
+    assert list(shares) == pytest.approx(list(before), abs=0.03)
+
+
+def test_a_study_of_an_effect_has_a_row_for_each_of_its_tests_and_none_for_mirrored_halves(file):
+    found = powered(file(HURRY), simulations=20)
+    assert [(r["question"], r["arms"], r["against"], r["trials"]) for r in found] == [
+        ("goes first", "prompt=A1", "prompt=baseline", 4 * 10 * 3)
+    ]
+    (row,) = found
+    assert (row["table"], row["effect"], row["unit"]) == ("effects", pytest.approx(15), "points")
+    assert row["times_0.5"] <= row["times_4"] == 100
 
 
 def powered(study, model=(), simulations=1):
@@ -83,22 +122,20 @@ def test_what_is_planted_is_told_and_strong_effects_need_fewer_trials(file):
 
 def test_an_effect_that_the_study_names_beside_a_factor_is_supposed(file):
     found = powered(file(NAMED))
-    differ = {
+    effects = {
         (each["arms"], each["question"]): each["effect"]
         for each in found
-        if each["against"] == "resistance=none baseline"
+        if each["table"] == "effects" and each["question"] != "goes first"
     }
-    assert differ == {
-        ("resistance=human baseline", "collisions"): pytest.approx(0.4),
-        ("resistance=none A1", "gap"): pytest.approx(2),
-        ("resistance=none A1", "relative velocity"): pytest.approx(3),
-        ("resistance=human A1", "gap"): pytest.approx(2),
-        ("resistance=human A1", "relative velocity"): pytest.approx(3),
-        ("resistance=human A1", "collisions"): pytest.approx(0.4),
+    assert effects == {
+        ("resistance=human", "collisions"): pytest.approx(40),
+        ("prompt=A1", "gap"): pytest.approx(2),
     }
-    # What is compared with the humans is found in another table than what is with a reference.
+    # How a prompt's driver heeds its situation is a question about that driver.
+    slopes = [e for e in found if e["question"] == "relative velocity"]
+    assert [e["effect"] for e in slopes] == pytest.approx([3, 3])
+    assert all(e["arms"].endswith("A1") for e in slopes)
     assert {each["table"] for each in found if each["against"] == HUMANS} == {"verdicts"}
-    assert {each["table"] for each in found if each["question"] == "gap"} >= {"contrasts"}
     with pytest.raises(UsageError, match="resistence"):
         make_plan(str(file(NAMED.replace("resistance = {", "resistence = {"))), ())
 
@@ -110,7 +147,8 @@ def test_a_planted_persona_is_supposed_where_the_prompt_contains_it(file):
 
 def test_equal_arms_share_a_row_and_half_of_the_trials_find_less():
     found = powered("ablations", ("o3",), simulations=2)
-    assert {each["arms"].count(",") for each in found} == {0, 6}
+    assert {each["arms"].count(",") for each in found} == {6}
+    assert {each["question"] for each in found} == {"goes first", "collisions", "gap"}
     assert {each["truth"] for each in found} == {"human"}
     (gap,) = (each for each in found if each["question"] == "gap")
     assert gap["times_0.5"] < gap["times_4"] == 100

@@ -1,0 +1,109 @@
+"""Every level of every factor in each measure: dots and intervals, a mark for each driver."""
+
+from __future__ import annotations
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from merge_runner.study.crossing import MODEL
+from merge_runner_analysis.figures.style import GREY, LINE_IN, PAGE_IN, Style, style, wrapped
+from merge_runner_analysis.grouping import levels_of
+from merge_runner_analysis.metrics import LEFT_FIRST
+from merge_runner_analysis.stats.effects import Level, level_estimate, levels_by_factor, measured
+from merge_runner_analysis.stats.estimate import Estimate
+from merge_runner_analysis.study import Study
+
+ACROSS = 3  # panels
+LABEL, LEGEND = 24, 48  # characters of a line
+LINES_IN = 2.2 * LINE_IN  # from one level to the next
+MARK = 0.03  # of an axis: the width of a mark
+EVEN = 50.0  # percent: neither driver is favoured
+
+
+def effects_figure(study: Study) -> Figure:
+    """Return the figure: a panel per measure, a line per level, a mark per driver."""
+    lines = _lines(study)
+    every = [level for levels in lines.values() for _, level in levels]
+    metrics = [
+        metric
+        for metric in measured(study)
+        if metric.estimator != "median"
+        and any(level_estimate(study, level, metric).value is not None for level in every)
+    ]
+    drivers = list(dict.fromkeys(driver for levels in lines.values() for driver, _ in levels))
+    looks = {driver: style(number) for number, driver in enumerate(drivers)}
+    across, down = min(ACROSS, len(metrics)) or 1, -(-len(metrics) // ACROSS) or 1
+    height_in = down * (LINES_IN * len(lines) + 0.6) + LINE_IN * 2 * len(drivers)
+    figure = Figure(figsize=(PAGE_IN, max(height_in, 1.5)), layout="constrained")
+    axes = figure.subplots(down, across, sharey=True, squeeze=False).flatten()
+    for axis, metric in zip(axes, metrics, strict=False):
+        axis.set_xlabel(metric.heading)
+        for place, levels in enumerate(lines.values()):
+            for driver, level in levels:
+                beside = 0.5 * (drivers.index(driver) + 0.5) / len(drivers) - 0.25
+                _draw(axis, place + beside, level_estimate(study, level, metric), looks[driver])
+        if metric is LEFT_FIRST:
+            axis.axvline(EVEN, color=GREY, ls=":", lw=0.8)
+        _limit(axis, 0.0 if metric.rate else metric.least, 100.0 if metric.unit == "%" else None)
+    for axis in axes[len(metrics) :]:
+        axis.set_visible(False)
+    axes[0].set_yticks(range(len(lines)), [wrapped(name, LABEL) for name in lines])
+    axes[0].set_ylim(max(len(lines), 1) - 0.5, -0.5)
+    if not lines:
+        axes[0].set_xlabel("the drivers differ in no factor")
+    handles = [
+        Line2D([], [], label=wrapped(driver, LEGEND), **look | {"ls": ""})
+        for driver, look in looks.items()
+    ]
+    if handles:
+        figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False)
+    return figure
+
+
+def _lines(study: Study) -> dict[str, list[tuple[str, Level]]]:
+    """By line the levels that stand on it, each with its driver; without a factor one of drivers.
+
+    Levels stand as the study lists them, the reference first.
+    """
+    factors = levels_of(study.models, study.order)
+    found: dict[str, list[tuple[str, Level]]] = {
+        f"{factor}: {name}": []
+        for factor, names in factors.items()
+        for name in names
+        if factor != MODEL and len(names) > 1
+    }
+    for model in factors.get(MODEL, ()):
+        for levels in levels_by_factor(study, MODEL, model, 1):
+            for level in levels:
+                line = f"{level.factor}: {level.name}"
+                if line in found:
+                    found[line].append((_named(model, level), level))
+    if not found:
+        drivers = [level for levels in levels_by_factor(study) for level in levels]
+        found = {"all trials": [(_named(level.name, level), level) for level in drivers]}
+    return {line: levels for line, levels in found.items() if levels}
+
+
+def _named(driver: str, level: Level) -> str:
+    """The driver, with what is said of a stand-in."""
+    return f"{driver} ({level.posing})" if level.posing else driver
+
+
+def _limit(axis: Axes, least: float | None, most: float | None) -> None:
+    """Let the axis end where values do, but for the width of a mark."""
+    low, high = axis.get_xlim()
+    mark = MARK * (high - low)
+    axis.set_xlim(
+        low if least is None else max(low, least - mark),
+        high if most is None else min(high, most + mark),
+    )
+
+
+def _draw(axis: Axes, place: float, own: Estimate, look: Style) -> None:
+    """A dot with its interval."""
+    if own.value is None:
+        return
+    low, high = own.bounds() or (own.value, own.value)
+    errors = [[own.value - low], [high - own.value]]
+    axis.errorbar([own.value], [place], xerr=errors, elinewidth=0.7, capsize=1.5, mew=0.8, **look)
