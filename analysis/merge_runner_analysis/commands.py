@@ -243,6 +243,7 @@ def figures(
     study = _study(db, _selection(models, where, study_file), trust=trust)
     from merge_runner_analysis.figures.gallery import write_figures
 
+    _say_what_is_computed(study, "figures")
     deque(write_figures(study, out), maxlen=0)
     print_out(f"wrote the figures into {out}")
 
@@ -286,9 +287,17 @@ def report(
     study = _study(db, _selection(models, where, study_file), trust=trust)
     from merge_runner_analysis.web.report import write_report
 
+    _say_what_is_computed(study, "tables and figures")
     deque(write_report(study, out, files), maxlen=0)
     also = "" if files is None else f", and its tables and figures into {files}"
     print_out(f"wrote {out}{also}")
+
+
+def _say_what_is_computed(study: Study, what: str) -> None:
+    """Say why nothing is seen for a while."""
+    say(
+        f"computing the {what} of {len(study.frames.trials)} trials; a thousand take about a minute"
+    )
 
 
 def open_browser(address: str) -> bool:

@@ -562,7 +562,7 @@ async def _served_name(name: str, entry: ModelEntry, *, say: Callable[[str], Non
         variable = PROVIDERS.require(entry.provider).model_env
         raise UsageError(
             f"{driver} serves {models}: name one with "
-            f"{variable}, or with `id` of [{name}] in {REGISTRY}, which goes first"
+            f"{variable}, or with `id` of [{name}] in {REGISTRY}, which takes precedence"
         )
     say(f"{driver} serves {listed[0]}, which is asked")
     return listed[0]
