@@ -48,7 +48,7 @@ TOLD_EVERY = 100  # pages
 
 NAMES = (
     "Tables, all if none is named: verdicts, who-first, gap, indicators, ablation-qualitative, "
-    "ablation-quantitative, contrasts, factors, criticality, attempts, first-action."
+    "ablation-quantitative, effects, contrasts, factors, criticality, attempts, first-action."
 )
 
 app.add_typer(human_app, name="human", rich_help_panel=KEEP)
@@ -94,7 +94,10 @@ def tables(
     study_file: StudyOption = None,
     trust: TrustOption = False,
     output: Annotated[
-        TableFormat, typer.Option("--format", help="Form of the tables.")
+        TableFormat,
+        option(
+            "FORM", "text (the default), csv, json, md or latex.", "--format", show_default=False
+        ),
     ] = TableFormat.TEXT,
     against: Annotated[
         str | None,

@@ -250,7 +250,9 @@ def _play(
 def sql(
     query: Annotated[str, typer.Argument(metavar="QUERY", help="One SQL query.")],
     db: cli.DbOption = DEFAULT_DB,
-    output: Annotated[Form, typer.Option("--format", help="Form of the result.")] = "text",
+    output: Annotated[
+        Form, cli.option("FORM", "text (the default), csv or json.", "--format", show_default=False)
+    ] = "text",
     as_json: cli.JsonOption = False,
 ) -> None:
     """Query the results; also while a sweep runs. Nothing can be changed.
