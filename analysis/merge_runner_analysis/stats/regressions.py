@@ -199,7 +199,7 @@ class Fit:
         Followed from value to value, a profile may miss a higher maximum elsewhere, which is
         therefore looked for at the bound. Raises ValueError where none is found.
         """
-        followed = np.stack([self.b, self.b])
+        followed = self.b[None].copy()
 
         @cache
         def excess(value: float) -> float:
