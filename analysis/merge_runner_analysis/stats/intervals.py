@@ -6,6 +6,7 @@ Every test against Student's t is made here; one with infinite degrees of freedo
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from math import hypot, inf, sqrt
 
 import numpy as np
@@ -114,6 +115,17 @@ def interval(
     """The interval of an estimate with this standard error, by Student's t."""
     half = float(stats.t.ppf((1 + level) / 2, freedom)) * se
     return value - half, value + half
+
+
+def at(found: Estimate, level: float) -> Estimate:
+    """The same with its interval at a level; without its ends where there are none."""
+    ends = None
+    if found.ends_at:
+        ends = found.ends_at(level)
+    elif found.value is not None and found.se is not None:
+        ends = interval(found.value, found.se, found.freedom, level)
+    low, high = ends or (None, None)
+    return replace(found, low=low, high=high, level=level)
 
 
 def two_sided_p(statistic: float, freedom: float = inf) -> float:

@@ -18,7 +18,7 @@ tested it, so that both agree.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -90,24 +90,6 @@ WITHIN_LEVEL = 1 - 2 * ALPHA
 Ends = tuple[float, float] | None
 
 
-@dataclass(frozen=True, slots=True)
-class Tested:
-    """How a driver's ``own`` value is tested: against the ``human`` one, or against a margin.
-
-    ``interval`` gives by its level the ends that agree with ``p``: of the difference, or of a value
-    with a margin, beyond which it then lies. ``within``: a value with a margin is shown to be
-    inside; ``trait``: the one that is tested is shown, and None for what is no trait.
-    """
-
-    own: float
-    human: float
-    p: float
-    interval: Callable[[float], Ends]
-    detectable: float | None = None
-    within: bool = False
-    trait: bool | None = None
-
-
 class Both(NamedTuple):
     """A driver's trials in conditions of humans, and the humans.
 
@@ -132,41 +114,38 @@ class Counted(NamedTuple):
 class Statistic:
     """How a measure is estimated of a driver and of humans, and tested: if not said, by Welch.
 
-    ``indicator`` is the one whose own test shows the trait.
+    The test is of the difference, or of a value with a margin against that. ``indicator`` is the
+    one whose own test shows the trait.
     """
 
     own: Callable[[Both], Estimate]
     human: Callable[[Both], Estimate]
-    test: Callable[[Both], Tested | None] | None = None
+    test: Callable[[Both], Estimate | None] | None = None
     indicator: str = ""
 
-    def tested(self, both: Both) -> Tested | None:
+    def tested(self, both: Both) -> Estimate | None:
         """The test, if it can be made."""
-        return self.test(both) if self.test else _means(self.own(both), self.human(both))
+        if self.test:
+            return self.test(both)
+        return intervals.difference(self.own(both), self.human(both))
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
     """A driver beside the humans in one measure.
 
-    ``difference`` is driver minus humans with its ``interval``, and is None for a measure with a
-    margin. ``p`` is corrected over the driver's measures as ``p_holm``. ``level`` is that of the
-    interval that the state rests on: of the difference, or of the estimate beside a margin.
-    ``counted`` is what a person sees of it at once.
+    ``tested`` is what the state rests on, at the level of its test: driver minus humans, or the
+    driver's value where the measure has a margin. It is empty where there is no test. ``counted``
+    is what a person sees of it at once.
     """
 
     measure: Measure
     own: Estimate
     human: Estimate
+    tested: Estimate
     state: str
     remarks: tuple[Fact | None, ...]
-    difference: float | None = None
-    interval: Ends = None
-    level: float | None = None
-    p: float | None = None
-    p_holm: float | None = None
-    detectable: float | None = None
-    counted: Counted | None = None
+    counted: Counted | None
 
 
 @remembered
@@ -175,27 +154,21 @@ def compared(study: Study, group: Group) -> tuple[Comparison, ...]:
     alike = in_human_conditions(group)
     both = Both(alike, study.human, _likeness(study, alike))
     tests = tests_of(both)
-    states, p_holm = decided(tests)
-    levels = holm_levels({name: test.p for name, test in tests.items()}, p_holm)
+    states = decided(both, tests)
     judgements = judge(fits(alike).firth, fits(alike).hc3, robust=True)
     seen = counted(both)
     found = []
     for name, measure in MEASURES.items():
         statistic = STATISTICS[name]
         own, human = statistic.own(both), statistic.human(both)
-        test, state = tests.get(name), states.get(name, OPEN if own.undecided else "")
         why = judgements[statistic.indicator].why if statistic.indicator else None
         remarks = own.problem, human.problem, None if own.problem else why
-        level = WITHIN_LEVEL if test and test.within else levels.get(name)
-        one = Comparison(measure, own, human, state, remarks, level=level, counted=seen.get(name))
-        if test and level is not None:
-            ends = test.interval(level)
-            one = replace(one, p=test.p, p_holm=p_holm[name], detectable=test.detectable)
-            if measure.margin is None:
-                one = replace(one, difference=test.own - test.human, interval=ends)
-            elif ends:
-                one = replace(one, own=replace(own, low=ends[0], high=ends[1]))
-        found.append(one)
+        state, tested = states.get(name, OPEN if own.undecided else ""), Estimate()
+        if name in tests:
+            tested = intervals.at(tests[name], tests[name].level)
+            if measure.margin is not None and tested.low is not None:
+                own = replace(own, low=tested.low, high=tested.high)
+        found.append(Comparison(measure, own, human, tested, state, remarks, seen.get(name)))
     return tuple(found)
 
 
@@ -241,23 +214,55 @@ def in_human_conditions(group: Group) -> Group:
     return group.part(lambda trials: trials["condition"].isin(HUMAN_CONDITIONS))
 
 
-def tests_of(both: Both) -> dict[str, Tested]:
-    """The tests of a driver's measures; those that cannot be tested are missing."""
-    judgements = judge(fits(both.group).firth, fits(both.group).hc3, robust=True)
-    tests = {}
-    for name, statistic in STATISTICS.items():
-        if test := statistic.tested(both):
-            trait = judgements[statistic.indicator].passed if statistic.indicator else None
-            tests[name] = replace(test, trait=trait)
+def tests_of(both: Both) -> dict[str, Estimate]:
+    """The tests of a driver's measures, corrected over all of them, each with its level.
+
+    Those that cannot be made are missing.
+    """
+    tests = {
+        name: test
+        for name, statistic in STATISTICS.items()
+        if (test := statistic.tested(both)) is not None
+    }
+    p = {name: test.p for name, test in tests.items() if test.p is not None}
+    p_holm = dict(zip(p, corrected([*p.values()]), strict=True))
+    levels = holm_levels(p, p_holm)
+    for name in p:
+        level = WITHIN_LEVEL if _within(MEASURES[name], tests[name]) else levels[name]
+        tests[name] = replace(tests[name], p_holm=p_holm[name], level=level)
     return tests
 
 
-def decided(tests: Mapping[str, Tested]) -> tuple[dict[str, str], dict[str, float]]:
-    """The state of each measure that is tested, and its p as it is corrected over all of them."""
-    p_holm = dict(zip(tests, corrected([test.p for test in tests.values()]), strict=True))
-    return {
-        name: _state(MEASURES[name], test, p_holm[name]) for name, test in tests.items()
-    }, p_holm
+def decided(both: Both, tests: Mapping[str, Estimate]) -> dict[str, str]:
+    """The state of each measure that is tested; see ``Measure.rule``."""
+    judgements = judge(fits(both.group).firth, fits(both.group).hc3, robust=True)
+    traits = {name for name, judgement in judgements.items() if judgement.passed}
+    states = {}
+    for name, test in tests.items():
+        measure, statistic = MEASURES[name], STATISTICS[name]
+        differs = test.p_holm is not None and test.p_holm < ALPHA
+        states[name] = UNLIKE if differs else OPEN
+        if _within(measure, test):
+            states[name] = SHOWN
+        elif measure.margin is None and statistic.indicator in traits:
+            states[name] = _strength(statistic, both) if differs else SHOWN
+    return states
+
+
+def _strength(statistic: Statistic, both: Both) -> str:
+    """Whether a trait that differs is weaker or stronger than in humans."""
+    own, human = statistic.own(both).value, statistic.human(both).value
+    assert own is not None
+    assert human is not None
+    return WEAKER if abs(own) < abs(human) else STRONGER
+
+
+def _within(measure: Measure, test: Estimate) -> bool:
+    """Whether a value with a margin is inside by two one-sided tests (Schuirmann 1987)."""
+    if measure.margin is None:
+        return False
+    ends = intervals.at(test, WITHIN_LEVEL).bounds()
+    return ends is not None and max(-ends[0], ends[1]) < measure.margin
 
 
 def holm_levels(p: Mapping[str, float], p_holm: Mapping[str, float]) -> dict[str, float]:
@@ -271,27 +276,15 @@ def holm_levels(p: Mapping[str, float], p_holm: Mapping[str, float]) -> dict[str
     return {name: 1 - ALPHA / (len(order) - min(place, sure)) for place, name in enumerate(order)}
 
 
-def _state(measure: Measure, test: Tested, p_holm: float) -> str:
-    """The state of a measure; see ``Measure.rule``."""
-    differs = p_holm < ALPHA
-    if measure.margin is not None:
-        return SHOWN if test.within else UNLIKE if differs else OPEN
-    if not test.trait:
-        return UNLIKE if differs else OPEN
-    weaker = abs(test.own) < abs(test.human)
-    return (WEAKER if weaker else STRONGER) if differs else SHOWN
-
-
-def _who_first(both: Both, term: str) -> Tested | None:
+def _who_first(both: Both, term: str) -> Estimate | None:
     """A slope of who goes first: a term of one model of both, in which every term may differ."""
-    group, human = both.group, both.human
-    own, other = fits(group).firth.terms.get(term), fits(human).firth.terms.get(term)
-    less = _less_humans(group, human)
-    if own is None or other is None or term not in less.terms:
+    less = _less_humans(both.group, both.human)
+    alone = fits(both.group).firth, fits(both.human).firth
+    if any(term not in fit.terms for fit in (*alone, less)):
         return None
-    apart = less.terms[term]
-    least = intervals.detectable(apart.se)
-    return Tested(own.b, other.b, apart.p, partial(less.interval, term), least)
+    b, se, _, p = astuple(less.terms[term])
+    least = intervals.detectable(se)
+    return Estimate(b, se=se, p=p, detectable=least, ends_at=partial(less.interval, term))
 
 
 @remembered
@@ -299,7 +292,7 @@ def _less_humans(group: Group, human: Group) -> Regression:
     return who_first_firth(group.outcomes, less=human.outcomes)
 
 
-def _rates(both: Both) -> Tested | None:
+def _rates(both: Both) -> Estimate | None:
     """Collisions in percent; None with undecided trials, whose rate has no value."""
     group, human = both.group, both.human
     cells = shared_cells(group.ended_outcomes, human.outcomes, BOXES.column)
@@ -316,46 +309,27 @@ def _rates(both: Both) -> Tested | None:
 
     least = detectable_rate(n, humans.n, humans.value / 100)
     least = None if least is None else 100 * least
-    return Tested(100 * k / n, humans.value, p, interval, least)
+    return Estimate(100 * k / n - humans.value, p=p, detectable=least, ends_at=interval)
 
 
-def _means(own: Estimate, other: Estimate) -> Tested | None:
-    """Two estimates, by Welch's test."""
-    value, human, apart = own.value, other.value, intervals.difference(own, other)
-    if value is None or human is None or apart is None:
-        return None
-    assert apart.value is not None
-    assert apart.se is not None
-    assert apart.p is not None
-    interval = partial(intervals.interval, apart.value, apart.se, apart.freedom)
-    return Tested(value, human, apart.p, interval, apart.detectable)
-
-
-def _velocity(both: Both) -> Tested | None:
+def _velocity(both: Both) -> Estimate | None:
     """I4, against its margin."""
     moved = fits(both.group).hc3.moved(both.group.trials)
     if moved is None:
         return None
-    within = moved.within_p < ALPHA
-    return Tested(moved.most, 0.0, moved.beyond_p, moved.interval, within=within)
+    return Estimate(moved.most, p=moved.beyond_p, ends_at=moved.interval)
 
 
-def _held(both: Both) -> Tested | None:
+def _held(both: Both) -> Estimate | None:
     """I5, against its margin."""
     likeness = both.likeness
     value, se, margin = likeness.value, likeness.se, MEASURES["held"].margin
     if value is None or se is None or margin is None:
         return None
-
-    def interval(level: float) -> tuple[float, float]:
-        return intervals.interval(value, se, likeness.freedom, level)
-
-    low, high = interval(WITHIN_LEVEL)
-    beyond = abs(value) - margin
-    p = 1.0
+    beyond, p = abs(value) - margin, 1.0
     if beyond > 0:
         p = intervals.two_sided_p(beyond / se, likeness.freedom) if se else 0.0
-    return Tested(value, 0.0, p, interval, within=max(-low, high) < margin)
+    return replace(likeness, p=p)
 
 
 def _likeness(study: Study, group: Group) -> Estimate:
@@ -445,10 +419,12 @@ def human_fit(human: Group) -> Regression:
 def _slope(group: Group, term: str) -> Estimate:
     """A slope of who goes first by Firth's fit."""
     fit = fits(group).firth
-    ends = fit.interval(term, LEVEL)
+    if fit.problem:
+        return Estimate(n=fit.n, problem=fit.problem)
+    found, ends = fit.terms[term], fit.interval(term, LEVEL)
     if ends is None:
-        return Estimate(n=fit.n, problem=fit.problem or Fact(Why.NO_PROFILE))
-    return Estimate(fit.terms[term].b, *ends, fit.n, fit.terms[term].se)
+        return Estimate(found.b, n=fit.n, se=found.se, problem=Fact(Why.NO_PROFILE))
+    return Estimate(found.b, *ends, fit.n, found.se)
 
 
 def _headway(fit: Regression) -> Estimate:

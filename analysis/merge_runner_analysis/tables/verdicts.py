@@ -114,18 +114,19 @@ def _played_rule(study: Study, group: Group) -> str:
 
 
 def _compared(group: Group, kind: str, found: Comparison, played_rule: str) -> Row:
-    measure = found.measure
+    measure, tested = found.measure, found.tested
+    apart = tested if measure.margin is None else Estimate()
     values: dict[str, Value] = _driver(group, kind) | {
         "measure": measure.name,
         **_known(found.own),
         "human": found.human.value,
         "human_ci": found.human.bounds(),
-        "difference": found.difference,
-        "difference_ci": found.interval,
-        "level": None if found.level is None else 100 * found.level,
-        "p": found.p,
-        "p_holm": found.p_holm,
-        "detectable": found.detectable,
+        "difference": apart.value,
+        "difference_ci": apart.bounds(),
+        "level": None if tested.p is None else 100 * tested.level,
+        "p": tested.p,
+        "p_holm": tested.p_holm,
+        "detectable": tested.detectable,
         "state": found.state or None,
         "rule": measure.rule,
     }

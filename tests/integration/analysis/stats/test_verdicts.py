@@ -93,11 +93,11 @@ def test_i4_is_judged_by_the_largest_predicted_difference(study, gap_of, scatter
     (found,) = (c for c in compared(study, moved) if c.measure.name == "gap-velocity")
     low, high = found.own.bounds()
     assert found.state == state
-    assert level is None or found.level == pytest.approx(level)
+    assert level is None or found.tested.level == pytest.approx(level)
     assert found.human.value == pytest.approx(6.4 * 0.06)
     if state == "unlike":
         assert found.own.value == pytest.approx(0.34 * 6.4, abs=0.05)
-        assert found.level >= 0.95
+        assert found.tested.level >= 0.95
     assert {"unlike": low > 1, "shown": high < 1, "inconclusive": low <= 1 <= high}[state]
 
 

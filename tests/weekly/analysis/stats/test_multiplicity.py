@@ -72,8 +72,8 @@ def humans(tmp_path_factory):
 
 @np.errstate(divide="ignore")
 def states(groups: Iterator[Group], humans: Group) -> list[dict[str, str]]:
-    tests = (verdicts.tests_of(verdicts.Both(group, humans)) for group in groups)
-    return [verdicts.decided(test)[0] for test in tests]
+    every = (verdicts.Both(group, humans) for group in groups)
+    return [verdicts.decided(both, verdicts.tests_of(both)) for both in every]
 
 
 @pytest.mark.parametrize("pairs", [True, False])
