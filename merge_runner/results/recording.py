@@ -291,8 +291,8 @@ def summary_lines(file: Path, summary: dict[str, Any]) -> Iterator[str]:
             planned = sum(arm["repetitions"] for arm in arms) * len(config["conditions"])
             trials = f"{planned} of {models}"
         asked = (str(row.get(when) or "?")[:16] for when in ("started_at", "ended_at"))
-        yield f"study    {study}"
-        yield f"trials   {trials}"
+        yield one_line(f"study    {study}")
+        yield one_line(f"trials   {trials}")
         yield f"played   {' to '.join(asked)} UTC"
     for model, calls in summary["models_requested"].items():
         yield f"model    {model}: {calls} calls"
@@ -439,7 +439,7 @@ def described_sweeps(provenance: dict[str, str]) -> list[RecordedSweep]:
 def sweep_rows(provenance: dict[str, str]) -> list[Any]:
     """Return the rows of sweeps that a recording has, as it says itself."""
     with suppress(*DAMAGED):
-        return [*json.loads(provenance[SWEEPS])]
+        return [row for row in json.loads(provenance[SWEEPS]) if isinstance(row, dict)]
     return [provenance]
 
 

@@ -27,7 +27,7 @@ def recorded_plans(file: Path, *, db: Path, trust: bool) -> Iterator[Plan]:
     seen = set[str]()
     for row in sweep_rows(read_provenance(file)):
         try:
-            name, config = str(row["name"]), json.loads(row["config"])
+            name, config = str(row["name"]), dict(json.loads(row["config"]))
             has_study = "study" in config
             plan = Plan.model_validate(config) if has_study else None
         except DAMAGED as exc:
@@ -42,6 +42,8 @@ def recorded_plans(file: Path, *, db: Path, trust: bool) -> Iterator[Plan]:
         if (text := plan.model_dump_json()) not in seen:
             seen.add(text)
             yield plan
+    if not seen:
+        raise RecordingError(f"{file} does not say what was played")
 
 
 def _with_parts(plan: Plan, db: Path, *, trust: bool) -> Plan:

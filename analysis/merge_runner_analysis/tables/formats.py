@@ -23,6 +23,7 @@ BETWEEN = "   "
 ASIDE = {
     *(("kind", "text"), ("k", "count"), ("undecided", "count"), ("level", "number")),
     *(("detectable", "number"), ("freedom", "number"), ("human_ci", "interval")),
+    ("primary", "text"),
 }
 FINDINGS = {"estimate", "value", "b", "difference"}
 LATEX = str.maketrans(

@@ -12,7 +12,7 @@ from pathlib import Path
 import duckdb
 import pytest
 
-from merge_runner.errors import MergeRunnerError, RecordingError
+from merge_runner.errors import MergeRunnerError, RecordingError, UsageError
 from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.records import Attempt, Slot, call_key
 from merge_runner.results.parquet import group_bytes
@@ -22,7 +22,9 @@ from merge_runner.results.recording import (
     import_recording,
     read_recording,
     summarise,
+    summary_lines,
 )
+from merge_runner.run.recorded_plans import recorded_plans
 from tests.support.raw_server import a_request
 
 CALLS = 3
@@ -359,6 +361,27 @@ async def test_the_program_refuses_in_one_line_and_leaves_the_cache_as_it_was(
             f"error: {bad}: row 3 is damaged: its content does not belong to its key\n"
         )
     assert everything_in(tmp_path / "cache/responses") == kept
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        {},
+        {"sweeps": "[]"},
+        {"sweeps": '["a", 7]'},
+        {"name": "a", "config": "[]"},
+        {"name": "a", "config": "7"},
+        {"name": "/etc/passwd.toml", "config": "{}"},
+        {"name": "a", "config": '{"study": {}}'},
+    ],
+)
+def test_a_recording_that_does_not_say_what_was_played_is_no_study(told, tmp_path):
+    source, file = ResponseCache(tmp_path / "source"), tmp_path / "told.parquet"
+    source.put_now([entry(1)])
+    export_recording(file, source, [entry(1).request.key], told)
+    with pytest.raises((RecordingError, UsageError)):
+        list(recorded_plans(file, db=tmp_path / "none.duckdb", trust=False))
+    assert any(line.startswith("calls    1 ") for line in summary_lines(file, summarise(file)))
 
 
 def everything_in(cache):

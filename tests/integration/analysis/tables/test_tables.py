@@ -65,11 +65,11 @@ def test_a_table_fits_the_terminal_and_names_the_columns_that_do_not(tables, wid
 
 
 def test_a_terminal_of_100_columns_shows_estimates_differences_p_and_verdicts(tables):
-    for name in ("verdicts", "contrasts", "factors", "indicators", "who-first"):
+    for name in ("verdicts", "effects", "contrasts", "factors", "indicators", "who-first"):
         _, hidden = hidden_in(tables[name], 100)
         kinds = {column.name: column.kind for column in tables[name].columns}
         assert hidden, name
-        findings = {"estimate", "value", "b", "difference", "p", "p_holm", "state"}
+        findings = {"estimate", "value", "b", "difference", "p", "p_holm", "p_corrected", "state"}
         assert not findings & {*hidden}, name
         assert not {"p", "verdict"} & {kinds[column] for column in hidden}, name
 
