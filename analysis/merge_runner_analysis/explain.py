@@ -122,20 +122,24 @@ def _source(
     copies: tuple[tuple[str, str], ...],
     counts: str,
 ) -> Source:
-    rows = {STORED: group.trials, ENDED: group.ended, FINISHED: group.finished}.get(rests_on)
-    if rows is None:
-        rows = group.trials[group.trials[rests_on].notna()]
+    known = {STORED: group.trials, ENDED: group.ended, FINISHED: group.finished}
+    whole = known.get(rests_on, group.trials)
+    rows = whole[[*KEYS, "condition"]]  # a part of all columns takes far longer
+    if rests_on not in known:
+        rows = rows[whole[rests_on].notna()]
     if conditions:
         rows = rows[rows["condition"].isin(conditions)]
     if copies:
-        rows = rows[~pd.MultiIndex.from_frame(rows[KEYS]).isin(copies)]
+        copied = {*copies}
+        rows = rows[[key not in copied for key in rows[KEYS].itertuples(index=False, name=None)]]
     trials = tuple(rows["trial_id"])
     numerator: tuple[str, ...] = ()
     if counts:
-        values = rows.get(counts)
+        values = whole.get(counts)
         if values is None:  # a failure that never occurred has no column
             values = call_counts(study, group).get(counts, pd.Series(False, rows.index))
-        numerator = tuple(rows.loc[values.fillna(False).astype(bool), "trial_id"])
+        counted = values.reindex(rows.index).fillna(False).astype(bool)
+        numerator = tuple(rows.loc[counted, "trial_id"])
     outcomes = group.published_outcomes
     parts = (
         f"{len(trials)} of {len(group.trials)} trials; not finished: {group.left_out}",

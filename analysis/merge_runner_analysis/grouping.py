@@ -151,7 +151,7 @@ class Group:
         """How many outcomes there are in each condition of humans, in their order."""
         return in_human_conditions(self.ended_outcomes)
 
-    @property
+    @cached_property
     def left_out(self) -> str:
         """Which trials are not among the finished ones, in words."""
         counts = self.trials["status"].value_counts()
