@@ -45,7 +45,7 @@ INSERT INTO several SELECT number, 'tag', tag, 1 FROM listed JOIN (
         unnest(?::VARCHAR[]) AS tag
 ) USING (trial_id, spec_hash)
 """
-SORTS = {"trial": "trial_id", "outcome": "outcome", "end": "end_time_s", "gap": "gap_m",
+SORTS = {"trial": "condition", "outcome": "outcome", "end": "end_time_s", "gap": "gap_m",
          "rmse": "rmse_mps", "invalid": "invalid", "cost": "cost_usd"}  # fmt: skip
 SUMMED = ("decisions", "asked", "invalid", "fallbacks", "no_decision", "attempts", "faults",
           "answers", "others", "unpriced")  # fmt: skip
@@ -149,6 +149,11 @@ class Catalogue:
     def others(self) -> list[Pair]:
         """Which model was asked for where another one answered, and which."""
         return self._listing.others
+
+    @property
+    def has_humans(self) -> bool:
+        """Whether any human trial is listed."""
+        return bool(self.ask("SELECT 1 FROM listed WHERE who = 'humans' LIMIT 1"))
 
     def ask(self, sql: str, *values: object) -> list[Row]:
         """Rows of a query of ours."""

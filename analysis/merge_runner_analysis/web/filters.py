@@ -13,7 +13,16 @@ from merge_runner_analysis.web.site import TooMuch
 # is a fault within DuckDB, or the end of the process.
 MOST_CHOSEN, LONGEST_VALUE = 30, 1_000
 # What facets are called that have another name in an address.
-HEADINGS = {"sweep": "run", "model": "driver", "variant": "prompt"}
+HEADINGS = {
+    "sweep": "run",
+    "who": "kind of driver",
+    "model": "driver",
+    "variant": "prompt",
+    "condition": "start",
+    "account": "why",
+    "validity": "replies",
+    "cause": "error",
+}
 
 
 def filter_of(asked: Mapping[str, str]) -> dict[str, str]:

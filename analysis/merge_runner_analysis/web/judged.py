@@ -68,6 +68,7 @@ def judged(site: Site, bar: Bar, asked: Mapping[str, str]) -> tuple[list[Driver]
         "table": table,
         "headings": KINDS,
         "human": humans_of(table),
+        "imported": site.catalogue.has_humans,
     }
 
 

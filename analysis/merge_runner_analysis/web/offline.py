@@ -11,7 +11,7 @@ from markupsafe import Markup
 from merge_runner_analysis.web.leaks import refuse_leaks
 from merge_runner_analysis.web.pages.trial import trial_pages
 from merge_runner_analysis.web.reading import Row
-from merge_runner_analysis.web.rendering import STYLES, inlined_texts, policy_of
+from merge_runner_analysis.web.rendering import STYLE, inlined_texts, policy_of
 from merge_runner_analysis.web.site import REPLAY, Site
 from merge_runner_analysis.web.urls import Links, query_of
 
@@ -32,7 +32,7 @@ def site_of_a_page(db: Path, held: Collection[tuple[str, str]]) -> Site:
         is_there = (trial, asked.get("spec", "")) in held
         return query_of({"trial": trial, **asked}) if is_there else ""
 
-    inlined = inlined_texts([*STYLES, *SCRIPTS])
+    inlined = inlined_texts([STYLE, *SCRIPTS])
     return Site(db, Links(leads), policy=policy_of(inlined), inlined=inlined)
 
 

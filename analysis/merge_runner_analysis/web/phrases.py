@@ -8,6 +8,32 @@ from merge_runner.prompts.blocks import BLOCKS, Variant
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 UNKNOWN = "no meaning is known here"
+# What is stored, in the words of a page; what is not here is shown as it is.
+PLAIN = {
+    "collided": "crashed",
+    "timeout": "timed out",
+    "no action": "neither acted",
+    "one too little": "one braked too little, too late",
+    "invalid plan": "no plan in a reply",
+    "fallbacks": "some without a plan",
+    "no decision": "nobody decided",
+    "stand-ins": "scripted stand-ins",
+    "human": "people",
+    "humans": "people",
+    "decision: missing": "no decision in the reply",
+    "no_array": "no plan in the reply",
+    "several_arrays": "several plans in the reply",
+    "out_of_range": "plan out of range",
+    "wrong_length": "plan of a wrong length",
+    "not_finite": "infinite numbers in the plan",
+    "not_a_number": "no numbers in the plan",
+    "truncated": "reply cut off (token limit)",
+    "refusal": "refused to answer",
+    "empty": "empty reply",
+    "no_decision": "no decision in the reply",
+    "M": "merge first",
+    "Y": "yield",
+}
 
 
 def condition_text(headway: float, velocity: float) -> str:
@@ -42,6 +68,16 @@ def block_meaning(name: str) -> str:
     """What a block of a prompt is for."""
     block = BLOCKS.get(name)
     return UNKNOWN if block is None else block.meaning
+
+
+def plain(value: str) -> str:
+    """A stored name in the words of a page; of a cause what it is of, and why."""
+    kind, _, name = value.partition(": ")
+    if kind == "plan":
+        return PLAIN.get(name, name)
+    if kind == "attempt":
+        return f"request: {name.replace('_', ' ')}"
+    return f"wrong {value}" if kind == "model" and name else PLAIN.get(value, value)
 
 
 def clock(time_s: float) -> str:

@@ -13,11 +13,12 @@ from jinja2.bccache import Bucket
 from markupsafe import Markup
 
 from merge_runner_analysis.web.display_text import visible, with_minus
+from merge_runner_analysis.web.phrases import plain
 from merge_runner_analysis.web.urls import Links
 from merge_runner_analysis.wording import MINUS, number, p_value
 
 TEMPLATES, STATIC = (Path(__file__).with_name(name) for name in ("templates", "static"))
-STYLES = [f"styles/{name}.css" for name in ("base", "answers", "trial", "pages")]
+STYLE = "style.css"
 # What all templates call, without a word of where it is.
 MACROS = ("scope", "words", "computed", "mark", "conditions", "trust", "notes", "table")
 
@@ -64,8 +65,9 @@ def environment(
         p=p_value,
         whole="{:,}".format,
         minus=lambda text: with_minus(str(text)),
+        plain=plain,
     )
-    made.globals.update(at=at, policy=policy, inlined=inlined or {}, styles=STYLES, **shared)
+    made.globals.update(at=at, policy=policy, inlined=inlined or {}, style=STYLE, **shared)
     for name in MACROS:
         macros = vars(made.get_template(f"_{name}.html").module)
         made.globals |= {k: v for k, v in macros.items() if k[0] != "_"}

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from datetime import datetime
 from difflib import unified_diff
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 from pandas.api.types import is_string_dtype
@@ -32,7 +33,7 @@ from merge_runner_analysis.tables.against import FILES, against
 from merge_runner_analysis.tables.formats import render, table_view
 from merge_runner_analysis.tables.model import Column, Row, Table
 from merge_runner_analysis.tables.verdicts import verdicts
-from merge_runner_analysis.web.rendering import STYLES, environment, inlined_texts, policy_of
+from merge_runner_analysis.web.rendering import STYLE, environment, inlined_texts, policy_of
 from merge_runner_analysis.web.scope import DESCRIPTIONS
 from merge_runner_analysis.web.urls import Links
 from merge_runner_analysis.wording import TABLE, number, sentences
@@ -120,7 +121,8 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
     descriptions, levels, prompts = design(study)
     headline, *others = sentences((finished or verdicts(study)).rows)
     beside = (against(table, study) if table.name in FILES else table for table in tables)
-    inlined = inlined_texts(STYLES)
+    views = [table_view(table, number) for table in beside]
+    inlined = inlined_texts([STYLE])
     templates = environment(Links(lambda _: ""), policy_of(inlined), inlined)
     return templates.get_template("report.html").render(
         study=study,
@@ -131,7 +133,8 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
         headline=headline,
         sentences=others,
         figures=[(name, FIGURES[name].caption, data) for name, data in figures.items()],
-        tables=[table_view(table, number) for table in beside],
+        tables=views,
+        notes=_once(views),
         numbers=numbers,
         most=LISTED,
         command=sql_command(study),
@@ -142,6 +145,16 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
         cited=published("sources"),
         program=program(),
     )
+
+
+def _once(tables: Iterable[Mapping[str, Any]]) -> dict[str, list[str]]:
+    """The notes of each table by its name, without those of a table before it."""
+    said: dict[str, None] = {}
+    notes = {}
+    for table in tables:
+        notes[table["name"]] = [note for note in table["notes"] if note not in said]
+        said |= dict.fromkeys(table["notes"])
+    return notes
 
 
 def design(study: Study) -> tuple[list[str], dict[str, list[str]], dict[str, str]]:

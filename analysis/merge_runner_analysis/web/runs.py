@@ -25,6 +25,15 @@ REASONS = {
 }
 
 
+# The same in a list.
+ENDED_AS = {
+    2: "refused: key, model or setting",
+    3: "cap or quota reached",
+    4: "replies not recorded",
+    130: "interrupted (Ctrl-C)",
+}
+
+
 def list_runs(catalogue: Catalogue) -> list[Row]:
     """All runs, the newest first; see ``run_of``. Raises what ``Catalogue.refresh`` does."""
     runs: list[Row] = []
@@ -110,7 +119,17 @@ def run_of(row: Row, config: Row, standing: Standing | None, later: str = "") ->
     goes_on = state in {"lost", "stopped"} and code != 4 and run["ended"] != run["planned"]
     typed = config.get("typed") if goes_on and not later else None  # a notebook types none
     command = shlex.join(["merge-runner", *typed]) if typed else ""
-    return {**run, "kind": kind, "text": text, "command": command}
+    return {**run, "kind": kind, "text": text, "command": command, "ended_as": ended_as(run)}
+
+
+def ended_as(run: Row) -> str:
+    """How a run ended, in a word or two."""
+    if run["state"] == "lost":
+        return "killed or crashed"
+    if run["state"] != "stopped":
+        return "checking what is stored" if run["state"] == "checking" else str(run["state"])
+    failed = f"{run['failed']} trials failed" if run["failed"] else "ended by an error"
+    return ENDED_AS.get(run["row"]["exit_code"], failed)
 
 
 def assessment_of(run: Row) -> tuple[str, str]:
@@ -136,7 +155,7 @@ def assessment_of(run: Row) -> tuple[str, str]:
         row, text = run["row"], f"Finished: all {ended} trials ended"
         if why := not_judged(run["driver"], row["invalid"], row["asked"]):
             return "doubtful", f"{text}; {why}."
-        troubles = {"failed attempts": row["faults"], "invalid replies": row["invalid"]}
+        troubles = {"failed requests (retried)": row["faults"], "invalid replies": row["invalid"]}
         if met := ", ".join(f"{name} {times:,}" for name, times in troubles.items() if times):
             text += f"; on the way: {met}"
         else:
@@ -145,7 +164,7 @@ def assessment_of(run: Row) -> tuple[str, str]:
             return "doubtful", f"{text}; but another model gave {others} answers."
         return "finished", f"{text}."
     if state == "lost":
-        gone = "Stopped without a word: its process is gone, or frozen."
+        gone = "Killed or crashed: the process is gone, or frozen."
         return "stopped", f"{gone} {counted} are stored{failures}."
     if code in REASONS:
         return "stopped", f"Stopped: {REASONS[code]}. {counted} have an outcome{failures}."

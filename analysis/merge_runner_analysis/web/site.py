@@ -43,7 +43,7 @@ PAGES = {
 # The parts of a scope in an address; the list of trials filters by the same names.
 SCOPE = ("sweep", "model", "variant", "condition")
 # What hangs under these, each with one list of all.
-LISTS = {"Tables and figures": "tables", "Notes": "notes"}
+LISTS = {"Tables and figures": "tables", "Notes": "notes", "What words mean": "glossary"}
 
 
 class NotThere(Exception):

@@ -71,10 +71,12 @@ def test_from_the_study_to_a_verdict_and_to_why_the_worst_condition_collides_and
     page.goto("/")
     words = "Too few trials finished to say: "
     expect(page.locator(".answer")).to_contain_text(words, timeout=2000 * HANGS_S)
-    page.locator("#answers").get_by_role("rowheader", name="smollm2").get_by_role("link").click()
+    page.locator("#answers").get_by_role("rowheader", name="smollm2").get_by_role(
+        "link"
+    ).first.click()
     trials = page.locator("#headway").get_by_role("link").last.inner_text()
     page.get_by_label("Compare with").select_option("emulator")
-    page.get_by_role("button", name="Apply").click()
+    page.get_by_role("button", name="Show").click()
     expect(page.get_by_role("columnheader", name="emulator", exact=True)).to_be_visible()
     page.locator("#headway").get_by_role("link").last.click()
     expect(page.locator(".totals")).to_contain_text(f"{trials} trials")
@@ -83,8 +85,8 @@ def test_from_the_study_to_a_verdict_and_to_why_the_worst_condition_collides_and
     assert page.evaluate(OVER) <= 0
     row = page.locator("#collisions").get_by_role("row", name="smollm2")
     row.get_by_role("link").nth(3).click()
-    page.get_by_role("link", name="smollm2/baseline/", exact=False).first.click()
-    account = page.locator("details", has_text="Why it collided")
+    page.locator(".of-trials tbody a").first.click()
+    account = page.locator("details", has_text="Why it crashed")
     expect(account).to_contain_text("could still have avoided it")
     page.locator("#moments").get_by_role("button", name="last moment to").first.click()
     expect(page.locator("#panel blockquote, #panel pre").first).to_be_visible()
@@ -118,12 +120,13 @@ def test_from_a_filtered_list_to_a_collision_its_words_and_back(page):
     expect(page.locator("#search")).to_be_focused()
     page.get_by_label("outcome").focus()
     page.get_by_label("outcome").select_option("collided")
-    expect(page.locator(".totals")).to_contain_text("2 of 2 ended ones collided")
+    expect(page.locator(".totals")).to_contain_text("smollm2: 2, 2 crashed")
     expect(page.get_by_label("outcome")).to_be_focused()
     expect(page).to_have_url(re.compile("q=n_0_0.*outcome=collided"))
     page.reload()
     expect(page.locator("tbody tr")).to_have_count(2)
     page.locator("tbody a").first.click()
+    page.locator("#scrub").fill("2")
     page.locator("#decision article").last.get_by_role("link").click()
     told = ["What it said", "What it planned", "What it was told", "Attempts"]
     expect(page.locator(".decision-panel h3")).to_have_text(told)
@@ -135,10 +138,23 @@ def test_from_a_filtered_list_to_a_collision_its_words_and_back(page):
     page.wait_for_url("**/trials?q=n_0_0&outcome=collided")
 
 
+def test_a_screen_holds_25_trials_between_which_keys_go(page):
+    page.set_viewport_size({"width": 1440, "height": 900})
+    page.goto("/trials")
+    bottoms = (
+        "rows => rows.filter((row) => row.getBoundingClientRect().bottom <= innerHeight).length"
+    )
+    assert page.locator(".of-trials tbody tr").evaluate_all(bottoms) >= 25
+    links = page.locator(".of-trials tbody a")
+    for key, at in (("j", 0), ("j", 1), ("k", 0)):
+        page.keyboard.press(key)
+        expect(links.nth(at)).to_be_focused()
+
+
 def test_through_a_list_by_keys_and_links_and_from_its_words(page):
     name = page.locator("h1")
     page.goto("/trials?q=emulator&sort=-end")
-    names = page.locator("tbody th a").all_inner_texts()
+    names = page.locator("tbody th a").evaluate_all("all => all.map(({ title }) => title)")
     page.locator("tbody th a").nth(1).click()
     for move, there in (
         (lambda: None, names[1]),
@@ -206,10 +222,11 @@ def test_time_moves_by_play_scrub_keys_and_charts_and_ends_at_a_collision(page):
 def test_the_panel_follows_the_replay_until_a_decision_is_chosen_or_somebody_reads(page):
     page.set_viewport_size({"width": 1500, "height": 420})
     page.goto(TRIAL)
-    expect(page.locator("#decision")).to_contain_text("What they last said")
 
     def shown(n):
         return [f"{side} decision {n} at {n}.0 s" for side in ("left", "right")]
+
+    expect(headings(page)).to_have_text(shown(0))
 
     page.locator("#scrub").fill("1.5")
     expect(headings(page)).to_have_text(shown(1))
@@ -228,7 +245,7 @@ def test_the_panel_follows_the_replay_until_a_decision_is_chosen_or_somebody_rea
     expect(headings(page)).to_have_text(shown(2)[:1])
     page.keyboard.press("Escape")
     expect(headings(page)).to_have_text(shown(3))
-    page.locator("#panel").evaluate("panel => { panel.scrollTop = 60; }")
+    page.evaluate("scrollTo(0, document.body.scrollHeight)")
     expect(page.locator("#follow")).to_be_visible()
     page.locator("#scrub").fill("1.5")
     expect(headings(page)).to_have_text(shown(3))
@@ -289,7 +306,7 @@ def test_another_trial_is_found_by_the_keyboard_and_goes_on_where_this_one_ended
     page.keyboard.press(" ")
     expect(page.locator("#play")).to_have_text("Pause")
     page.get_by_role("button", name="next repetition").click()
-    expect(key).to_contain_text("rep 2. The vehicles collided")
+    expect(key).to_contain_text("rep 2. The vehicles crashed")
     page.go_back()
     expect(key).to_contain_text("L_4_8, rep 2")
     page.locator("#alone").click()
@@ -303,7 +320,7 @@ def test_what_a_model_wrote_is_text_and_its_failures_are_named(page):
         "<script>document.title='owned'</script>",
         "{{ 7*7 }}",
         "[U+202E]",
-        "no valid plan: no_array: it drove on with an older plan",
+        "no valid plan: no plan in the reply. The car kept to its plan of",
     ):
         expect(panel).to_contain_text(said)
     assert ("owned" in page.title(), panel.locator("script, img").count()) == (False, 0)
@@ -323,13 +340,16 @@ def test_a_phone_shows_a_decision_that_is_tapped_and_leads_back_by_day_and_by_ni
     page.emulate_media(color_scheme="dark")
     page.set_viewport_size({"width": 420, "height": 800})
     page.goto("/trials")
-    page.get_by_role("button", name="?").click()
+    page.get_by_role("button", name="More", exact=True).click()
+    page.get_by_role("button", name="Keys").click()
     expect(page.locator("#help")).to_contain_text("play and pause")
     assert serious(page) == []
+    page.get_by_role("button", name="Close").click()
     page.get_by_role("link", name="What words mean").click()
     expect(page.locator("#main dt", has_text="tunnel")).to_be_visible()
     paper = "getComputedStyle(document.body).backgroundColor"
     night = page.evaluate(paper)
+    page.get_by_role("button", name="More", exact=True).click()
     page.locator("#theme").select_option("light")
     day = page.evaluate(paper)
     page.goto(TRIAL)
@@ -406,7 +426,7 @@ def test_a_sweep_is_followed_to_its_end_without_a_reload(page, tmp_path, held_se
         expect(listing.locator(".state")).to_have_text("finished")
         expect(listing.locator("tbody tr")).to_contain_text("2 of 2")
         expect(study.locator("#strip")).to_contain_text(ended)
-        expect(study.locator("#answers .n a").first).to_have_text("2")
+        expect(study.locator("#answers .facts a").first).to_have_text("2")
         trials.get_by_role("link", name="Show them").click()
         expect(trials.locator("tbody tr")).to_have_count(1)
         assert "condition=N_0_0" in trials.url
@@ -422,8 +442,8 @@ def test_an_exported_folder_and_a_page_of_few_trials_open_from_the_disk(page, db
     page.context.set_offline(True)
     page.goto((tmp_path / "made").rename(tmp_path / "moved").joinpath("index.html").as_uri())
     expect(page.locator("footer")).to_contain_text("Search, filters, SQL and new notes need")
-    page.get_by_role("link", name=COLLIDED).click()
-    expect(page.get_by_text("The vehicles collided")).to_be_visible()
+    page.locator(f'a[title="{COLLIDED}"]').click()
+    expect(page.get_by_text("The vehicles crashed")).to_be_visible()
     start = place(page, "left")
     for _ in range(3):
         page.keyboard.press("]")

@@ -65,7 +65,7 @@ def test_a_report_begins_with_the_description_the_design_the_prompts_and_the_fac
     text = report_html(study, make_tables(study, ["factors", "gap"]), {})
     assert "Read this first" not in text
     conditions = ", ".join(sorted(study.conditions))
-    parts = ["<h1>Who is &lt;first&gt;?</h1>", 'id="design"', conditions, "There is time.",
+    parts = ["Who is &lt;first&gt;?</h1>", 'id="design"', conditions, "There is time.",
              "-There is time.\n+You",
              'id="conclusions"', 'id="factors"', 'id="gap"']  # fmt: skip
     places = [text.index(part) for part in parts]

@@ -115,12 +115,12 @@ def test_the_page_has_the_numbers_of_the_database_and_every_rate_leads_to_its_tr
     client = client_of(written)
     text = text_of(client)
     for name, count, of, things in (
-        ("collisions", dict(facts["outcomes"]).get("collided", 0), 29, "ended trials"),
+        ("crashes", dict(facts["outcomes"]).get("collided", 0), 29, "ended trials"),
         ("failed trials", 1, 30, "stored trials"),
         ("invalid replies", 2, facts["decisions"], "decisions asked"),
         ("fallbacks", 2, facts["decisions"], "decisions asked"),
-        ("faults", failures, attempts, "attempts"),
-        ("another model answered", 1, answers, "answers"),
+        ("failed requests (retried)", failures, attempts, "requests"),
+        ("wrong model", 1, answers, "answers"),
     ):
         part = f" ({100 * count / of:.2f} %)" if count else ""
         assert f"{name} {count:,} of {of:,}{part} {things}" in text
@@ -215,7 +215,7 @@ def test_runs_show_how_they_ended_and_what_the_audit_finds_and_a_scope_changes_n
     Store(tmp_path / "none.duckdb")
     client = client_of(tmp_path / "none.duckdb")
     assert "No trial of a driver is stored. merge-runner sweep baseline" in text_of(client, "/")
-    assert "holds no sweep" in text_of(client, "/sweeps")
+    assert "holds no run" in text_of(client, "/sweeps")
     assert client.get("/sweeps/none").status_code == 404
 
 
@@ -223,7 +223,7 @@ def test_a_page_follows_a_sweep_to_its_end_and_has_each_state_read_out_once(stud
     running(study, updated_at=datetime(2026, 1, 1, tzinfo=UTC))
     client = client_of(study)
     shown = client.get(URL).text
-    assert "Stopped without a word" in shown
+    assert "Killed or crashed" in shown
     hostile = "<script>alert(1)</script>\u202e<img src=x>"
     rows = (("WARNING", f"another model answers: {hostile}"), ("cost", "1.50 USD"))
     running(study, ended={"finished": 1, "failed": 1}, rows=rows)  # it had slept
@@ -248,7 +248,7 @@ def test_a_page_follows_a_sweep_to_its_end_and_has_each_state_read_out_once(stud
     with held(study):  # its end cannot be read: it is not said to be lost
         remove_standing(study, "sweep-1")
         assert client.get(look).status_code == 204
-    assert "Stopped without a word" in client.get(look).text
+    assert "Killed or crashed" in client.get(look).text
     Store(study).end_sweep("sweep-1", END, 130)
     assert "<span>Stopped: it was interrupted" in client.get(look).text
 
@@ -284,7 +284,7 @@ def test_a_run_of_a_crossed_study_shows_each_driver_and_what_goes_on_with_it(gol
     text = client.get(f"/sweeps/{sweep}").text
     said = Page(text).text
     for words in (
-        "mine: cheap, dear drives",
+        "Run of mine: cheap, dear",
         "18 of 36 trials have an outcome",
         "merge-runner sweep mine.toml --yes --trust --db ",
         "dear [temperature=0.2]",

@@ -118,7 +118,7 @@ def test_a_result_is_a_table_with_types_and_links_to_trials(client, spec):
     row = [(name, 0), ("1", 0), ("o3-baseline", 0) if spec else None]
     client.site.queries.found = QueryResult(columns, [row], False, 0.0123)
     page = client.get("/sql?q=select").text
-    assert '<th scope="col" class="n">rep <small>INTEGER</small>' in page
+    assert '<th scope="col" class="n" title="INTEGER">rep</th>' in page
     assert '<td class="n">1</td>' in page
     assert spec or '<td><span class="quiet">NULL</span></td>' in page
     assert "<strong>1</strong> row, in 0.01 s" in page

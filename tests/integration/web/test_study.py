@@ -25,9 +25,9 @@ from tests.support.studies import Said, changed, write_study, yielding
 WORST = "L_0_-8"
 COLUMNS = {
     "o3": ("estimate", "ci"),
-    "humans": ("human", "human_ci"),
+    "people": ("human", "human_ci"),
     "difference": ("difference", "difference_ci"),
-    "detectable": ("detectable", ""),
+    "could have seen": ("detectable", ""),
 }
 NUMBER = re.compile(r"[−-]?\d+(?:\.\d+)?(?:e-\d+)?")
 
@@ -170,7 +170,7 @@ def test_links_take_the_scope_to_every_page(client):
 
 def test_a_driver_stands_beside_another(client, db):
     text = client.get("/drivers/o3?variant=baseline&with=o4").text
-    verdicts, _, by_condition = text.partition("In the conditions")
+    verdicts, _, by_condition = text.partition("Situation by situation")
     drawn = re.findall(r'class="o" href="#(\w+)" x="([\d.]+)%"', verdicts)
     assert {shape for shape, _ in drawn} == {"other", "beyond"}
     # Outside its axis it is an arrow, and no value at the end.
@@ -216,7 +216,7 @@ def test_the_study_begins_with_its_description_and_says_what_to_type_and_counts_
     client = client_of(copy, in_process(copy, never), program="/opt/bin/merge-runner")
     text = client.get("/").text
     page = Page(text)
-    assert "<h1>Who is &lt;first&gt;?</h1>" in text
+    assert '<h1 class="question">Who is &lt;first&gt;?</h1>' in text
     for said in (
         "This could not be computed",
         "Stopped: the account",

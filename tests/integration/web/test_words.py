@@ -99,7 +99,7 @@ def test_what_is_said_is_chosen_beside_what_is_planned_and_driven_and_facets_cou
     for link, count in shares:
         assert f"<strong>{count}</strong> decisions" in client.get(link).text
     facets = re.findall(r'value="(?:M|Y|none)"[^>]*>([^<]+)<', client.get("/words?q=brak").text)
-    assert facets == ["Y (2)", "none (1)"]
+    assert facets == ["yield (2)", "none (1)"]
 
 
 def test_what_is_found_comes_in_pages(client, db):

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 from merge_runner_analysis.published import HUMAN
 from merge_runner_analysis.tables.formats import printed
+from merge_runner_analysis.tables.model import Row as TableRow
 from merge_runner_analysis.web.computed import computed_table
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.display_text import with_minus
@@ -106,8 +108,17 @@ def _first(site: Site, driver: str, scope: Scope) -> tuple[Job, str]:
         if table and is_told and row.values.get("slope_ci"):
             of = printed(table, row)
             told.append(
-                f"{of['driver']}: brakes in {of['brake_percent']} %, holds in {of['hold_percent']}"
-                f" %, goes in {of['go_percent']} % of {of['n']}; m/s² per m/s of own relative "
-                f"velocity: {of['slope']} {of['slope_ci']}."
+                f"{of['driver']}: {of['brake_percent']} % brake, {of['hold_percent']} % hold, "
+                f"{of['go_percent']} % speed up, of {of['n']}. Per m/s that they are faster, they "
+                f"{_harder(row)}."
             )
     return found, with_minus(" ".join(told)) if len(told) > 1 else ""
+
+
+def _harder(row: TableRow) -> str:
+    """By how many m/s² one who is faster brakes, or speeds up, harder; with its interval."""
+    values: Mapping[str, Any] = row.values
+    brakes = values["slope"] < 0
+    low, high = sorted(-end if brakes else end for end in values["slope_ci"])
+    word, slope = ("brake", -values["slope"]) if brakes else ("speed up", values["slope"])
+    return f"{word} {slope:.2f} m/s² harder [{low:.2f}, {high:.2f}]"

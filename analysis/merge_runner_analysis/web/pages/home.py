@@ -44,5 +44,4 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         other_prompts=[name for name, _ in bar.prompts if name != scope.prompt],
         notes=noted(shown),
         conditions=by_condition(site, scope, shown),
-        imported=bool(site.catalogue.counts({"who": "humans"}, "who")),
     )

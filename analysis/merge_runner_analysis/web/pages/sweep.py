@@ -24,7 +24,7 @@ WHERE facet = 'cause' GROUP BY ALL ORDER BY trials DESC, cause
 TRUST = [
     dict(zip(("name", "count", "of", "things", "meaning", "state"), rate, strict=True))
     for rate in (
-        ("collisions", "collided", "ended", "ended trials",
+        ("crashes", "collided", "ended", "ended trials",
          "the vehicles came closer than the collision rule allows", {"outcome": "collided"}),
         ("failed trials", "failed", "trials", "stored trials",
          "a call got no answer; the trial has no outcome and can be played anew",
@@ -35,14 +35,17 @@ TRUST = [
          "an older plan was driven on, or none", {"validity": "fallbacks"}),
         ("missing decisions", "no_decision", "asked", "decisions asked",
          "a valid plan without the tactical decision that was asked for", {"cause": MISSING}),
-        ("faults", "faults", "attempts", "attempts",
+        ("failed requests (retried)", "faults", "attempts", "requests",
          "no answer, a refusal, or one that was cut off", {}),
-        ("another model answered", "others", "answers", "answers",
+        ("wrong model", "others", "answers", "answers",
          "it is neither the one asked for nor a declared alias of it", {}),
-        ("replies shared", "shared", "replies", "replies",
+        ("reused replies", "shared", "replies", "replies",
          "one reply decided in several trials, which are no separate samples there", {}),
     )
 ]  # fmt: skip
+
+# What the list of runs always shows; the other rates where there is any such case.
+ALWAYS = ("collided", "failed", "invalid", "faults")
 
 
 def sweeps_page(site: Site, asked: Mapping[str, str]) -> str:
@@ -50,6 +53,7 @@ def sweeps_page(site: Site, asked: Mapping[str, str]) -> str:
     bar, part = scope_of(site, asked, any_prompt=True), carried(asked)
     runs = list_runs(site.catalogue)
     counted = numbers_of(site.catalogue, bar.scope.wanted)
+    rare = counted[""] | {"fallbacks": 0}  # each follows an invalid reply
     return site.render(
         "sweeps.html",
         here="sweeps",
@@ -58,7 +62,7 @@ def sweeps_page(site: Site, asked: Mapping[str, str]) -> str:
         runs=[run for run in runs if not part or counted[run["sweep_id"]]["trials"]],
         counted=counted,
         audit=audit_of(site, runs),
-        trust=TRUST,
+        shown=[rate for rate in TRUST if str(rate["count"]) in ALWAYS or rare[str(rate["count"])]],
         duration=duration,
         seen=news_of((runs, site.catalogue.state), asked.get("seen", "")),
     )
@@ -69,7 +73,7 @@ def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
     seen = asked.get("seen", "")
     found = [run for run in list_runs(site.catalogue) if run["sweep_id"] == sweep_id]
     if not found:
-        raise NotThere(f"the database holds no sweep {sweep_id}")
+        raise NotThere(f"the database holds no run {sweep_id}")
     (run,) = found
     state = run["state"]
     if seen and state == "lost" and site.catalogue.held:

@@ -20,12 +20,29 @@ from merge_runner_analysis.web.site import NotThere, Site, download
 TABLE_FILES = {"csv": TableFormat.CSV, "tex": TableFormat.LATEX}
 FIGURE_FILES = {"svg": "image/svg+xml", "png": "image/png"}
 # Matplotlib writes styles into its SVG, and traces as pictures.
+# The list of tables, by what they answer.
+GROUPS = {
+    "Do they drive like people?": ("verdicts", "first-action", "criticality"),
+    "What makes a difference?": ("effects", "contrasts", "factors"),
+    "The tables of the paper": (
+        "who-first",
+        "gap",
+        "indicators",
+        "ablation-qualitative",
+        "ablation-quantitative",
+    ),
+    "More": ("attempts",),
+}
 DRAWN = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox"
 
 
 def tables_page(site: Site, _: Mapping[str, str]) -> str:
     """The list of all tables and figures."""
-    return site.render("tables.html", here="tables", tables=TABLES, figures=FIGURES)
+    grouped = {name for names in GROUPS.values() for name in names}
+    others = [name for name in TABLES if name not in grouped]
+    groups = {of: [name for name in names if name in TABLES] for of, names in GROUPS.items()}
+    groups["More"] += others
+    return site.render("tables.html", here="tables", tables=TABLES, figures=FIGURES, groups=groups)
 
 
 def table_file(site: Site, name: str, suffix: str, _: Mapping[str, str]) -> Response:

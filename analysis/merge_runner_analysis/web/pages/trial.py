@@ -18,6 +18,7 @@ from merge_runner_analysis.web.phrases import block_meaning
 from merge_runner_analysis.web.pictures import accelerations, step_points
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.site import REPLAY, NotThere, Site
+from merge_runner_analysis.web.trial.account import TICK_S
 from merge_runner_analysis.web.trial.prompt_parts import parts_of
 from merge_runner_analysis.web.trial.reader import Trial, read_trials
 from merge_runner_analysis.web.trial.replay import VIEW_BOX, account_of, plan_chart, replay_data
@@ -90,17 +91,12 @@ def _page(site: Site, row: Row, trial: Trial, template: str) -> str:
         view_box=VIEW_BOX,
         data=replay_data(row, trial, account) if trial.states else None,
         account=account,
-        reply_of=REPLY,
         samples=SAMPLES.format(quoted(row["trial_id"]), quoted(row["spec_hash"])),
         lines=summary(trial),
         trial_decisions=trial.by_side,
         offers=OFFERS,
-        clamped=clamped,
-        last_words=[
-            said[-1]
-            for mine in trial.by_side.values()
-            if (said := [d for d in mine if d["tactical"]])
-        ],
+        human_offer=HUMAN,
+        has_humans=site.at.served and site.catalogue.has_humans,
     )
 
 
@@ -130,7 +126,7 @@ def decision_panel(
         thoughts = reasoning_of(reply_object(decision["reply"]))
     panel = site.render(
         "_decision.html",
-        d=decision,
+        d=decision | {"older_s": _older_s(decision, trial)},
         driver=row[f"model_{decision['side']}"],
         page=site.at.trial(row, **named),
         clamped=clamped,
@@ -146,6 +142,18 @@ def decision_panel(
         accelerations=accelerations,
     )
     return Markup(panel)  # noqa: S704 # rendered by a template of ours, which escapes
+
+
+def _older_s(decision: Row, trial: Trial) -> float | None:
+    """When the plan was made that a decision without one fell back on; None where none was left."""
+    pace, before = trial.paces[decision["side"]], decision["before"]
+    while before and not before["plan"]:
+        before = before["before"]
+    if not before:
+        return None
+    lasts_s = len(before["plan"]) * pace.action_steps * trial.scenario.step_s
+    is_left = decision["time_s"] < before["time_s"] + lasts_s - TICK_S
+    return before["time_s"] if is_left or trial.scenario.fallback == "restart" else None
 
 
 def others(site: Site, trial_id: str, asked: Mapping[str, str]) -> dict[str, Any] | str | None:

@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from merge_runner_analysis.tables import TABLES
 from merge_runner_analysis.web.catalogue import PAGE, SORTS, Wanted
 from merge_runner_analysis.web.computed import awaited, computed
 from merge_runner_analysis.web.filters import HEADINGS, filter_of, sort_of
 from merge_runner_analysis.web.listing import FACTOR
+from merge_runner_analysis.web.phrases import plain
 from merge_runner_analysis.web.pictures import sparkline, speed_range
+from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.scope import carried
 from merge_runner_analysis.web.site import NotThere, Site, news_of
 from merge_runner_analysis.web.urls import whole
+
+MOST = 4  # drivers whose sums stand above a list
+# Requests that failed and were repeated are no fault of a trial.
+CAUSES = """
+SELECT number, value, times FROM several
+WHERE facet = 'cause' AND value NOT LIKE 'attempt: %' AND list_contains(?, number) ORDER BY ALL
+"""
 
 
 def trials_page(site: Site, asked: Mapping[str, str]) -> str:
@@ -30,8 +39,8 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
         if named.content is None:
             return site.render("behind.html", here="trials", cell=cell, computed=named)
         wanted = {**chosen, "trials": named.content["trials"]}
-    totals = {row["who"]: row for row in site.catalogue.counts(wanted, "who")}
-    trials = sum(part["trials"] for part in totals.values())
+    totals = site.catalogue.counts(wanted, "model")
+    trials = sum(part["trials"] for part in totals)
     last = max(1, -(-trials // PAGE))
     page = min(whole(asked.get("page", "")) or 1, last)
     rows = site.catalogue.every(wanted, sort, page)
@@ -47,9 +56,13 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
         computed=named,
         sort=sort,
         sorts=SORTS,
-        totals=totals,
+        totals=[row | {"driver": plain(row["model"])} for row in totals if len(totals) <= MOST],
         trials=trials,
+        asked=sum(part["asked"] for part in totals),
+        invalid=sum(part["invalid"] for part in totals),
         rows=rows,
+        errors=_errors(site, rows),
+        prompted=len({row["variant"] for row in rows} - {None}) > 1,
         leveled=any(row["levels"] for row in rows),
         scale=speed_range(rows),
         news=news,
@@ -58,6 +71,14 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
         sparkline=sparkline,
         unknown=[] if rows else _unknown(site, chosen),
     )
+
+
+def _errors(site: Site, rows: Sequence[Row]) -> dict[int, list[tuple[str, int]]]:
+    """Why trials failed, and why replies held no plan: causes of each trial, and how many times."""
+    errors: dict[int, list[tuple[str, int]]] = {}
+    for one in site.catalogue.ask(CAUSES, [row["number"] for row in rows]):
+        errors.setdefault(one["number"], []).append((one["value"], one["times"]))
+    return errors
 
 
 def _unknown(site: Site, chosen: Wanted) -> list[tuple[str, str, list[str]]]:

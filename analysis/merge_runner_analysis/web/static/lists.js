@@ -1,6 +1,17 @@
 "use strict";
 // A trial leads to its neighbours in the list that led to it, and back to the list.
 (() => {
+  // On a phone a row is a card, in which each value has the head of its column.
+  window.label = (part) => {
+    for (const table of part.querySelectorAll("table")) {
+      const heads = [...table.querySelectorAll("thead th")].map((head) => head.textContent.trim());
+      for (const row of table.rows) {
+        [...row.cells].forEach((cell, i) => cell.tagName === "TD" && (cell.dataset.l ??= heads[i] ?? ""));
+      }
+    }
+  };
+  label(document);
+
   // A page without a server may hold several trials; a name may have several specs.
   const key = (href) => {
     const { pathname, searchParams } = new URL(href);
@@ -31,6 +42,12 @@
       if (led && from.pathname !== location.pathname) return from.href;
       return here() >= 0 ? list.address : document.getElementById("trial").dataset.back;
     },
-    step: (id) => document.querySelector(`#${id}-trial[href]`)?.click(),
+    // In a list of trials the keys go from row to row.
+    step: (id) => {
+      const rows = [...document.querySelectorAll(".of-trials tbody a, .hits tbody th a")];
+      const to = rows[rows.indexOf(document.activeElement) + (id === "next" ? 1 : -1)];
+      (to ?? document.body).focus();
+      document.querySelector(`#${id}-trial[href]`)?.click();
+    },
   };
 })();

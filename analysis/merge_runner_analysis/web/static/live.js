@@ -22,6 +22,7 @@ window.live = (() => {
       if (!here || !there) continue;
       here.replaceChildren(...there.childNodes);
       follow(here);
+      label(here);
     }
     if (id && document.activeElement.id !== id) document.getElementById(id)?.focus({ preventScroll: true });
     return reply;

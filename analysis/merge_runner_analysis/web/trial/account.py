@@ -178,7 +178,7 @@ HEADINGS = {NEAR_MISS: "Why it came close", LONG_WAIT: "Why it took so long"}
 MEANINGS = {
     BOTH_INSISTED: "Both insisted: both had sped up",
     BOTH_GAVE_WAY: "Both gave way: both had slowed down",
-    ONE_TOO_LITTLE: "One did too little: the two did different things, which was not enough",
+    ONE_TOO_LITTLE: "One braked and the other did not: too little, too late",
     NO_ACTION: "Neither acted",
     INVALID_PLAN: "A driver drove without a valid plan when its braking could last have helped",
 }
@@ -224,19 +224,22 @@ def account(course: Course, decisions: Decided, trial: Mapping[str, Any]) -> Acc
         avoidable = (_avoidable(course, side, chance) for side, chance in chances.items())
         sentences = [_collision(course, name), *avoidable]
     marks = sorted(_marks(course, decisions, chances), key=lambda mark: mark.time_s)
-    return Account(HEADINGS.get(name, "Why it collided"), sentences, marks)
+    return Account(HEADINGS.get(name, "Why it crashed"), sentences, marks)
 
 
 def _collision(course: Course, name: str) -> str:
     at = judged_at(course)
-    changes = (course.change_mps(side, at) for side in SIDES)
+    changes = [course.change_mps(side, at) for side in SIDES]
+    meaning = MEANINGS[name]
+    if name == ONE_TOO_LITTLE and min(changes) > -ACTED_MPS:
+        meaning = "One sped up, and nobody braked"
     left, right = (f"{abs(mps):.1f} m/s {'faster' if mps >= 0 else 'slower'}" for mps in changes)
     when = f"{course.times_s[at]:.1f} s, when one driver alone could last have avoided it"
     when += ", by braking or speeding up"
     if at == course.last:
         when = "the end; nobody alone could have avoided it"
     return (
-        f"{MEANINGS[name]}. At {when}, the left vehicle was {left} and the right one {right} than "
+        f"{meaning}. At {when}, the left vehicle was {left} and the right one {right} than "
         f"at the start; {ACTED_MPS:g} m/s or more count as acting."
     )
 

@@ -86,8 +86,10 @@ replay.charts = (scene, ribbons, seek) => {
         return line;
       }),
     );
+    // What drivers choose stands in the ribbons.
+    const told = all.filter(({ kind }) => !kind.includes(" choice"));
     at("moments").replaceChildren(
-      ...all.map(({ t, kind, symbol, words }) => {
+      ...told.map(({ t, kind, symbol, words }) => {
         const button = element("button", { type: "button", class: kind }, `${symbol} ${words}`);
         button.addEventListener("click", () => seek(t));
         return element("li", {}, button);

@@ -37,7 +37,7 @@ replay.comparison = (scene, changed) => {
     if (button === at("alone")) return lay("", true);
     const key = await ask({ offer: button.dataset.offer });
     if (key) lay(key, true);
-    else if (key === null) say(`${button.textContent}: there is none here. It would be ${button.title}.`);
+    else if (key === null) say(`There is no ${button.textContent}: it would be ${button.title}.`);
   });
   const known = () => [...list.options].some(({ value }) => value === field.value);
   const suggest = async () => {

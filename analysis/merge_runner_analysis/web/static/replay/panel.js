@@ -10,7 +10,7 @@ replay.panel = (scene, ribbons) => {
 
   // Who has scrolled down to read, or holds something in the panel, is left alone.
   const reading = () =>
-    box.scrollTop > 8 || box.getBoundingClientRect().top < -8 || shown.contains(document.activeElement);
+    box.getBoundingClientRect().top < -8 || shown.contains(document.activeElement);
   const said = () => {
     at("follow").hidden = !chosen && !reading();
     box.ariaLive = scene.playing ? "off" : "polite";
@@ -25,8 +25,7 @@ replay.panel = (scene, ribbons) => {
   };
   const follow = () => {
     if (chosen || reading()) return said();
-    const begun = scene.now > scene.begin + 1e-9 || scene.ghost;
-    const now = begun ? ribbons.current().filter(Boolean) : [];
+    const now = ribbons.current().filter(Boolean);
     const names = [...now.map(({ link }) => link.href), scene.ghost?.named].join();
     if (names !== followed) fill(now);
     followed = names;
@@ -40,11 +39,10 @@ replay.panel = (scene, ribbons) => {
     chosen.link.ariaCurrent = "true";
     fill([chosen]);
     said();
-    box.scrollTop = 0;
     if (scroll && matchMedia("(max-width: 62rem)").matches) box.scrollIntoView();
   };
-  const toReplay = () => at("track").scrollIntoView();
-  box.addEventListener("scroll", said);
+  const toReplay = () => at("trial").querySelector(".watch").scrollIntoView();
+  addEventListener("scroll", said);
   at("to-replay").addEventListener("click", toReplay);
   return {
     follow,
@@ -52,7 +50,6 @@ replay.panel = (scene, ribbons) => {
     free: () => {
       if (at("follow").hidden) return false;
       if (box.contains(document.activeElement)) document.activeElement.blur();
-      box.scrollTop = 0;
       if (box.getBoundingClientRect().top < 0) toReplay();
       choose(null);
       return true;

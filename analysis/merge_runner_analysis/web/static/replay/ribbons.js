@@ -6,6 +6,7 @@ replay.ribbons = (scene) => {
   const read = (place, run, text, other) => {
     const holder = element("template", {});
     holder.innerHTML = text;
+    label(holder.content);
     const panels = [...holder.content.children];
     return [...at(place).querySelectorAll("a.decision")].map((link, i) => {
       const { side, n } = link.dataset,

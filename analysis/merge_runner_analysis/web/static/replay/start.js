@@ -11,6 +11,7 @@ window.startReplay = () => {
     begin,
     now: begin,
     ghost: null,
+    recalled: false,
     playing: false,
     get end() {
       return Math.max(trial.end, scene.ghost?.end ?? 0);
@@ -37,6 +38,7 @@ window.startReplay = () => {
   const recall = async () => {
     const asked = Object.fromEntries(new URLSearchParams(location.search));
     if ((asked.compare ?? "") !== (scene.ghost?.named ?? "")) await comparison.lay(asked.compare ?? "", null);
+    scene.recalled = true;
     const decision = ribbons.find({ side: asked.side, n: asked.decision, other: asked.of === "other" }) ?? null;
     const t = parseFloat(asked.t || decision?.t);
     clock.seek(Number.isNaN(t) ? begin : t);
@@ -59,7 +61,7 @@ window.startReplay = () => {
   const clock = replay.clock(scene, {
     show: () => {
       for (const part of [track, charts, ribbons]) part.show();
-      panel.follow();
+      if (scene.recalled) panel.follow(); // until then the address may name a decision
     },
     settled: () => remember(false),
   });
