@@ -33,6 +33,7 @@ from merge_runner_analysis.tables.against import FILES, against
 from merge_runner_analysis.tables.formats import render, table_view
 from merge_runner_analysis.tables.model import Column, Row, Table
 from merge_runner_analysis.tables.verdicts import verdicts
+from merge_runner_analysis.web.question import MIDDLE, answer_of
 from merge_runner_analysis.web.rendering import STYLE, environment, inlined_texts, policy_of
 from merge_runner_analysis.web.scope import DESCRIPTIONS
 from merge_runner_analysis.web.urls import Links
@@ -120,6 +121,8 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
     finished = next((table for table in tables if table.name == TABLE), None)
     descriptions, levels, prompts = design(study)
     headline, *others = sentences((finished or verdicts(study)).rows)
+    made = {table.name: table for table in tables}
+    question = answer_of(made.get("effects"), made.get("levels"))
     beside = (against(table, study) if table.name in FILES else table for table in tables)
     views = [table_view(table, number) for table in beside]
     inlined = inlined_texts([STYLE])
@@ -132,6 +135,9 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
         alarms=alarms(study, origin),
         headline=headline,
         sentences=others,
+        question=question,
+        linked=False,
+        middle=MIDDLE,
         figures=[(name, FIGURES[name].caption, data) for name, data in figures.items()],
         tables=views,
         notes=_once(views),

@@ -4,14 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from merge_runner_analysis.web.computed import computed_table
+from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.judged import by_condition, by_kind, judged, noted
+from merge_runner_analysis.web.question import MIDDLE, Answer, answer_of
 from merge_runner_analysis.web.runs import standing_of
-from merge_runner_analysis.web.scope import DESCRIPTIONS, scope_of, unmarked
+from merge_runner_analysis.web.scope import DESCRIPTIONS, Bar, scope_of, unmarked
 from merge_runner_analysis.web.site import Site, news_of
 from merge_runner_analysis.wording import (
     LANGUAGE_MODEL,
     headline,
 )
+
+TABLES = ("effects", "levels")  # of what a study's factors change
+
+
+def _question(site: Site, bar: Bar) -> tuple[list[Job], Answer | None]:
+    """What the study's factors change, where it has any, and the computations behind that."""
+    if len(bar.prompts) < 2 and not site.catalogue.factors():
+        return [], None
+    part = bar.scope.sweep, bar.scope.condition
+    jobs, tables = zip(*(computed_table(site, name, *part) for name in TABLES), strict=True)
+    return [*jobs], answer_of(*tables)
 
 
 def home_page(site: Site, asked: Mapping[str, str]) -> str:
@@ -20,7 +34,9 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
     bar = scope_of(site, asked)
     scope = bar.scope
     drivers, values = judged(site, bar, asked)
-    now = standing, site.catalogue.state, site.catalogue.held, values["computed"].older
+    asking, question = _question(site, bar)
+    older = [job.older for job in (values["computed"], *asking)]
+    now = standing, site.catalogue.state, site.catalogue.held, older
     seen = news_of(now, asked.get("seen", ""))
     shown = [
         one
@@ -40,7 +56,11 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         seen=seen,
         descriptions=[row["description"] for row in site.catalogue.ask(DESCRIPTIONS)],
         kinds=by_kind(shown),
-        headline=headline(models),
+        headline=headline(models, [one.kind for one in shown]),
+        question=question,
+        asking=[job for job in asking if job.content is None],
+        middle=MIDDLE,
+        linked=not scope.sweep and not scope.condition,
         other_prompts=[name for name, _ in bar.prompts if name != scope.prompt],
         notes=noted(shown),
         conditions=by_condition(site, scope, shown),

@@ -1,0 +1,459 @@
+"""The answer to a study's own question, as the first page and the report show it.
+
+Nothing here is tested or estimated: sentences, rows and charts are of the finished tables
+``effects`` and ``levels``. No sentence claims a direction that a corrected p does not carry.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from math import ceil, floor, log10
+from typing import Any
+
+from merge_runner.study.crossing import MODEL
+from merge_runner_analysis.metrics import COLLISIONS, GAP, LEFT_FIRST, RMSE
+from merge_runner_analysis.tables.model import Row, Table
+from merge_runner_analysis.web.marks import Mark
+from merge_runner_analysis.wording import ENOUGH, TIMES, brackets, capital, joined, number, p_value
+
+# What measures are called here; others keep the label of the table.
+NAMES = {
+    LEFT_FIRST.name: "goes first",
+    COLLISIONS.name: "crashes",
+    GAP.name: "gap at the merge point",
+    RMSE.name: "departs from its speed",
+    "collided_boxes_percent": "crashes by people's rule",
+    "joint_percent": "both adapt their speed",
+    "cost_usd": "cost of a trial",
+}
+# A change of the measure, as a claim names it.
+CHANGED = {LEFT_FIRST.name: "who goes first", RMSE.name: "how far it departs from its speed"}
+ALPHA = 0.05  # that of all tests: to import it would take pandas, which no page needs
+NO_BREAK = "\N{NO-BREAK SPACE}"
+MIDDLE = Mark("", None, None, zero=50.0)  # no difference, on the axis of differences
+# The shapes that tell drivers apart in a chart, and more of them are not drawn.
+SHAPES = ("dot", "square", "ring", "triangle")
+# Of a chart, in units of its drawing.
+LEFT, WIDTH, HEAD, ROW, APART, INDENT = 170.0, 480.0, 12, 20, 14, 84.0
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """A value of a driver in a chart, with its interval."""
+
+    shape: str
+    x: float
+    ends: tuple[float, float] | None
+    y: float
+    says: str
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A level of a chart; the first one of a factor is headed by it."""
+
+    y: float
+    head: str
+    name: str
+    points: list[Point]
+
+
+@dataclass(frozen=True, slots=True)
+class Chart:
+    """Levels below each other, and the drivers of each by their shapes."""
+
+    title: str
+    lines: list[Line]
+    ticks: list[tuple[float, str]]
+    even: float | None
+    height: float
+    indent: float
+    width: float = WIDTH
+
+
+@dataclass(frozen=True, slots=True)
+class Side:
+    """The value of a level, and the trials that it counts, each with the cell of its trials."""
+
+    text: str
+    cell: tuple[str, str]
+    k: int | None = None
+    n: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """An effect as a table shows it; ``mark`` is on an axis that ends at ``end`` on both sides."""
+
+    name: str
+    said: str
+    reference: Side | None
+    level: Side | None
+    difference: str
+    interval: str
+    p: str
+    mark: Mark | None
+    end: str
+    is_primary: bool
+    row: str
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """The claim, what else there is to say, charts, and the effects behind them."""
+
+    claim: str
+    rest: str
+    measure: str
+    drivers: list[tuple[str, str]]
+    trials: int
+    charts: list[Chart]
+    crossings: str
+    changes: list[Change]
+    others: list[Change]
+    could: str
+
+
+def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
+    """The answer; None where no table is there, or the study asks about no factor."""
+    if effects is None or levels is None:
+        return None
+    claim, rest = answered(effects.rows)
+    if not claim:
+        return None
+    primary = next(row for row in effects.rows if row.values.get("primary"))
+    metric = _metric(primary)
+    own = [row for row in effects.rows if _metric(row) == metric]
+    named = {LEFT_FIRST.name, COLLISIONS.name, GAP.name, RMSE.name}
+    others = [
+        row
+        for row in effects.rows
+        if _metric(row) in named - {metric} and not _crossed(row) and _tested(row)
+        and row.values["factor"] != MODEL
+    ]  # fmt: skip
+    # Of a driver that is not judged there is a row without values.
+    known = [row for row in levels.rows if row.values.get("factor")]
+    sides = {row.id: row for row in known}
+    drivers = list(
+        dict.fromkeys(str(row.values["driver"]) for row in known if row.values["driver"])
+    )
+    drawn = drivers if len(drivers) <= len(SHAPES) else []
+    shapes = dict(zip(drawn, SHAPES, strict=False))
+    charts = [
+        _chart("By factor", [r for r in known if _is_level(r)], shapes, metric),
+        _chart("In combination", [r for r in known if not _is_level(r)], shapes, metric),
+    ]
+    tested = [row for row in own if _tested(row)]
+    return Answer(
+        unbroken(claim),
+        unbroken(rest),
+        capital(_name(primary)),
+        [*shapes.items()],
+        sum(_count(row, "n") for row in _of_one_factor(known)),
+        [chart for chart in charts if chart],
+        unbroken(_interactions(tested, {str(row.values["factor"]) for row in known})),
+        _changes(tested, sides, metric),
+        _changes(others, sides, metric),
+        unbroken(_could(tested)),
+    )
+
+
+def answered(rows: Sequence[Row]) -> tuple[str, str]:
+    """The answer in a sentence, and the rest; empty where no primary test was made.
+
+    The claim is the surest of the primary tests whose corrected p is below 5 %; where there is
+    none it says so, and the rest what could have been seen.
+    """
+    tested = [row for row in rows if _tested(row)]
+    primary = sorted(
+        (row for row in tested if row.values.get("primary")), key=lambda row: _number(row, "p")
+    )
+    if not primary:
+        return "", ""
+    what = CHANGED.get(_metric(primary[0]), _name(primary[0]))
+    if few := [
+        row for row in primary if min(_count(row, "n"), _count(row, "n_reference")) < ENOUGH
+    ]:
+        counts = [f"{_level(row)} {row.values['n']}" for row in few]
+        return f"Too few trials finished to say: {joined(counts)}.", ""
+    sure = [row for row in primary if _shown(row)]
+    rest = []
+    if sure:
+        first = sure[0].values["factor"]
+        claim = f"{capital(str(first))} changes {what}: {_both(sure[0])}."
+        rest.append(f"That is {_apart(sure[0])}; p {_p(sure[0])}.")
+    else:
+        claim = f"No change of {what} is shown by {joined(_factors(primary))}."
+    for row in primary:
+        if row not in sure[:1]:
+            shown = "changes it, too" if _shown(row) else "is not shown to change it"
+            rest.append(f"{capital(_level(row))} {shown}: {_apart(row)}, p {_p(row)}.")
+    if not sure:
+        rest.append(_seen(primary))
+    crossed = [row for row in tested if _crossed(row) and _metric(row) == _metric(primary[0])]
+    rest += [
+        f"{_named(row)} interact: {_apart(row)}, p {_p(row)}." for row in crossed if _shown(row)
+    ]
+    also = [row for row in tested if _shown(row) and not _crossed(row) and row not in primary]
+    also = [row for row in also if row.values["factor"] != MODEL and _metric(row) in NAMES]
+    if not sure and also:
+        row = min(also, key=lambda row: _number(row, "p"))
+        what = CHANGED.get(_metric(row), _name(row))
+        rest.append(f"{capital(str(row.values['factor']))} changes {what}: {_both(row)}.")
+    return claim, " ".join(filter(None, rest))
+
+
+def unbroken(text: str) -> str:
+    """The text, of which no number stands apart from its unit or within its interval."""
+    return re.sub(r"(?<=\d) (?=[%m]|points)|(?<=\d,) (?=[−\d])|(?<=[<=]) (?=\d)|^ ", NO_BREAK, text)
+
+
+def _interactions(rows: Sequence[Row], drawn: set[str]) -> str:
+    """Of two factors whose combinations are drawn, whether they interact."""
+    crossed = {name for names in drawn if TIMES in names for name in names.split(TIMES)}
+    said = []
+    for row in rows:
+        if _crossed(row) and crossed >= {*str(row.values["factor"]).split(TIMES)}:
+            what = "they interact" if _shown(row) else "no interaction is shown"
+            said.append(f"{row.values['factor']}: {what}, {_apart(row)}, p {_p(row)}.")
+    return " ".join(said)
+
+
+def _could(rows: Sequence[Row]) -> str:
+    """What the tests of the primary measure could have seen, of factors and of interactions."""
+    main = [row for row in rows if row.values.get("primary")]
+    crossed = [row for row in rows if _crossed(row)]
+    return " ".join(filter(None, (_seen(main), _seen(crossed, "An interaction"))))
+
+
+def _seen(rows: Sequence[Row], what: str = "A change") -> str:
+    known = [_number(row, "detectable") for row in rows if row.values.get("detectable") is not None]
+    if not known:
+        return ""
+    least = f"{number(max(known))} {_unit(rows[0])}"
+    return f"{what} of {least} or more would have been seen in four of five studies."
+
+
+def _factors(rows: Iterable[Row]) -> list[str]:
+    return list(dict.fromkeys(str(row.values["factor"]) for row in rows))
+
+
+def _both(row: Row) -> str:
+    """``goes first in 63.00 % of trials with hurry=yes, in 50.00 % with hurry=no``."""
+    of, reference = (number(_number(row, name)) for name in ("estimate", "estimate_reference"))
+    factor, level, base = (row.values[name] for name in ("factor", "level", "reference"))
+    metric, unit = _metric(row), _unit(row)
+    if metric == LEFT_FIRST.name:
+        return (
+            f"with {factor}={level} the driver goes first in {of} % of trials, with "
+            f"{factor}={base} in {reference} %"
+        )
+    if unit == "points":
+        return f"{_name(row)} {of} % with {factor}={level}, {reference} % with {factor}={base}"
+    return f"{of} {unit} with {factor}={level}, {reference} {unit} with {factor}={base}"
+
+
+def _apart(row: Row) -> str:
+    """``+12.84 points [6.06, 19.60]``."""
+    return f"{_difference(row)} {_unit(row)} {brackets(_interval(row))}".rstrip()
+
+
+def _difference(row: Row) -> str:
+    value = _number(row, "difference")
+    return f"{'+' if value > 0 else ''}{number(value)}"
+
+
+def _p(row: Row) -> str:
+    """``= 0.012``, or that it is smaller."""
+    text = p_value(_number(row, "p_corrected"))
+    return f"< {text[1:]}" if text.startswith("<") else f"= {text}"
+
+
+def _number(row: Row, name: str) -> float:
+    value: Any = row.values[name]
+    return float(value)
+
+
+def _count(row: Row, name: str) -> int:
+    return int(_number(row, name))
+
+
+def _interval(row: Row) -> tuple[float, float] | None:
+    ends = row.values.get("ci")
+    return ends if isinstance(ends, tuple) else None
+
+
+def _metric(row: Row) -> str:
+    return row.id.rpartition("/")[2]
+
+
+def _name(row: Row) -> str:
+    """What an effect's measure is called."""
+    return NAMES.get(_metric(row), str(row.values["measure"]).rpartition(" (")[0])
+
+
+def _unit(row: Row) -> str:
+    """The unit of a difference."""
+    return str(row.values["measure"]).rpartition("(")[2].rstrip(")").replace("%", "points")
+
+
+def _level(row: Row) -> str:
+    return f"{row.values['factor']}={row.values['level']}"
+
+
+def _named(row: Row) -> str:
+    return capital(str(row.values["factor"]).replace(TIMES, " and "))
+
+
+def _crossed(row: Row) -> bool:
+    return "/interaction/" in row.id
+
+
+def _tested(row: Row) -> bool:
+    return row.values.get("p_corrected") is not None
+
+
+def _shown(row: Row) -> bool:
+    return _tested(row) and _number(row, "p_corrected") < ALPHA
+
+
+def _changes(rows: Sequence[Row], sides: dict[str, Row], primary: str) -> list[Change]:
+    """The effects with both sides of each; those of a measure have one axis."""
+    ends: dict[str, float] = {}
+    for row in rows:
+        values = (_number(row, "difference"), *(_interval(row) or ()))
+        ends[_metric(row)] = max(ends.get(_metric(row), 0.0), *map(abs, values))
+    return [_change(row, sides, ends[_metric(row)], primary) for row in rows]
+
+
+def _change(row: Row, sides: dict[str, Row], end: float, primary: str) -> Change:
+    of, base, metric = row.values["level"], row.values["reference"], _metric(row)
+    mark = " [scripted]" if str(of).endswith(" [scripted]") else ""
+    found = [sides.get(f"{row.values['factor']}={name}") for name in (f"{base}{mark}", of)]
+    reference, level = (
+        None if _crossed(row) or one is None else _side(one, metric, primary) for one in found
+    )
+    is_own = metric == primary
+    said = f"{of} against {base}"
+    if is_own and row.values.get("primary"):
+        said += ", primary"
+    at = [
+        round(50 + 48 * v / (end or 1.0), 2)
+        for v in (_number(row, "difference"), *(_interval(row) or ()))
+    ]
+    return Change(
+        capital(str(row.values["factor"])) if is_own else capital(_name(row)),
+        said if is_own else f"{row.values['factor']}: {said}",
+        reference,
+        level,
+        f"{_difference(row)} {_unit(row)}",
+        brackets(_interval(row)),
+        p_value(_number(row, "p_corrected")),
+        Mark(
+            "like" if _shown(row) else "open",
+            at[0],
+            (at[1], at[2]) if len(at) > 2 else None,
+            zero=50.0,
+        ),
+        f"{number(end)} {_unit(row)}",
+        bool(row.values.get("primary")),
+        row.id,
+    )
+
+
+def _side(row: Row, metric: str, primary: str) -> Side | None:
+    """One side of an effect, of a row of ``levels``."""
+    values: Any = row.values
+    if metric == primary:
+        unit = unbroken(" %" if metric.endswith("_percent") else "")
+        return Side(number(values["value"], unit=unit), (row.id, "value"), values["k"], values["n"])
+    if metric == COLLISIONS.name:
+        share = 100 * values["crashed"] / values["ended"] if values["ended"] else None
+        text = number(share, unit=unbroken(" %"))
+        return Side(text, (row.id, "crashed"), values["crashed"], values["ended"])
+    value = values.get(metric)
+    return None if value is None else Side(number(value), (row.id, metric))
+
+
+def _is_level(row: Row) -> bool:
+    return TIMES not in str(row.values["factor"])
+
+
+def _of_one_factor(levels: Sequence[Row]) -> list[Row]:
+    """The rows of the first factor's levels, of all drivers together: every trial once."""
+    pooled = [row for row in levels if not row.values["driver"]]
+    return [row for row in pooled if row.values["factor"] == pooled[0].values["factor"]]
+
+
+def _chart(title: str, rows: Sequence[Row], shapes: dict[str, str], metric: str) -> Chart | None:
+    """The levels of these rows, each with a point for each driver, on one axis from the data."""
+    of_model = [row for row in rows if row.values["factor"] != MODEL]
+    drawn = [
+        row
+        for row in of_model
+        if row.values["driver"] in shapes and row.values["value"] is not None
+    ]
+    if not shapes:
+        drawn = [
+            row for row in of_model if not row.values["driver"] and row.values["value"] is not None
+        ]
+    if not drawn:
+        return None
+    ends = [end for row in drawn for end in (_interval(row) or (_number(row, "value"),))]
+    low, high, step = _axis(min(ends), max(ends))
+
+    def x(value: float) -> float:
+        return round(LEFT + (WIDTH - LEFT) * (value - low) / (high - low), 1)
+
+    lines: list[Line] = []
+    y, heads = float(HEAD), set[str]()
+    for factor, name in dict.fromkeys(
+        (str(r.values["factor"]), str(r.values["level"])) for r in drawn
+    ):
+        points: list[Point] = []
+        y += ROW if factor in heads or not lines else 1.5 * ROW
+        for row in drawn:
+            if (row.values["factor"], row.values["level"]) != (factor, name):
+                continue
+            ci = _interval(row)
+            driver, value = row.values["driver"] or "all drivers", number(_number(row, "value"))
+            says = f"{driver}: {_counts(row)}{value} {brackets(ci)}".rstrip()
+            points.append(
+                Point(
+                    shapes.get(str(row.values["driver"]), SHAPES[0]),
+                    x(_number(row, "value")),
+                    None if ci is None else (x(ci[0]), x(ci[1])),
+                    y + APART * len(points),
+                    says,
+                )
+            )
+        head = "" if factor in heads or TIMES in factor else factor
+        lines.append(Line(y + APART * (len(points) - 1) / 2, head, name, points))
+        heads.add(factor)
+        y += APART * (len(points) - 1)
+    ticks = [low + step * place for place in range(round((high - low) / step) + 1)]
+    percent = metric.endswith("_percent")
+    even = 50.0 if metric == LEFT_FIRST.name and low < 50 < high else None
+    return Chart(
+        title,
+        lines,
+        [(x(tick), f"{tick:g} %" if percent else f"{tick:g}") for tick in ticks],
+        None if even is None else x(even),
+        y + ROW + 16,
+        INDENT if any(line.head for line in lines) else 0.0,
+    )
+
+
+def _counts(row: Row) -> str:
+    k = row.values.get("k")
+    return "" if k is None else f"{k} of {row.values['n']}, "
+
+
+def _axis(low: float, high: float) -> tuple[float, float, float]:
+    """Round ends around these values, and the step of four or so ticks between."""
+    width = (high - low) or 1.0
+    power = 10 ** floor(log10(width / 4))
+    step = next(power * of for of in (1, 2, 5, 10) if power * of >= width / 5)
+    return step * floor(low / step), step * ceil(high / step), step

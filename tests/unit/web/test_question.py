@@ -1,0 +1,109 @@
+"""The answer to a study's own question, of rows made by hand."""
+
+import re
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from merge_runner_analysis.tables.model import Column, Row, Table
+from merge_runner_analysis.web.question import answer_of, answered
+
+GOES_FIRST, GAP = "goes first (%)", "gap (m)"
+METRICS = {GOES_FIRST: "left_first_percent", "coll. (%)": "collided_percent", GAP: "gap_m"}
+DIRECTION = re.compile(r"\bchanges\b|\binteract:")
+
+
+def effect(factor="hurry", p=0.001, measure=GOES_FIRST, *, difference=13.0, n=400, **values):
+    of = {"level": "yes", "reference": "no", "estimate": 63.0, "estimate_reference": 50.0}
+    name = f"{factor}=yes/{METRICS[measure]}"
+    if " × " in factor:
+        name = f"persona=taxi/hurry=yes/interaction/{METRICS[measure]}"
+    main = measure == GOES_FIRST and " × " not in factor and factor != "model"
+    of |= {"factor": factor, "measure": measure, "difference": difference, "p": p}
+    of |= {"ci": (difference - 7, difference + 7), "p_corrected": p, "detectable": 10.0}
+    of |= {"n": n, "n_reference": n, "primary": "primary" if main else None}
+    return Row(name, (), of | values)
+
+
+HURRY = "Hurry changes who goes first: with hurry=yes the driver goes first in 63.00 % of trials, "
+SEEN = "A change of 10.00 points or more would have been seen in four of five studies."
+
+
+@pytest.mark.parametrize(
+    ("rows", "claim", "rest"),
+    [
+        ([], "", ""),
+        ([effect(p=None)], "", ""),
+        (
+            [effect("persona", 0.5, difference=1.0), effect()],
+            f"{HURRY}with hurry=no in 50.00 %.",
+            "That is +13.00 points [6.00, 20.00]; p = 0.001. Persona=yes is not shown to change "
+            "it: +1.00 points [−6.00, 8.00], p = 0.500.",
+        ),
+        (
+            [effect(p=0.2), effect(measure=GAP, p=0.0001, estimate=3.8, estimate_reference=4.3)],
+            "No change of who goes first is shown by hurry.",
+            "Hurry=yes is not shown to change it: +13.00 points [6.00, 20.00], p = 0.200. "
+            f"{SEEN} Hurry changes gap at the merge point: 3.80 m with hurry=yes, 4.30 m with "
+            "hurry=no.",
+        ),
+        (
+            [effect(p=0.0001), effect("hurry × persona", 0.01, difference=-8.0)],
+            f"{HURRY}with hurry=no in 50.00 %.",
+            "That is +13.00 points [6.00, 20.00]; p < 0.001. Hurry and persona interact: −8.00 "
+            "points [−15.00, −1.00], p = 0.010.",
+        ),
+        ([effect(n=12)], "Too few trials finished to say: hurry=yes 12.", ""),
+    ],
+)
+def test_the_answer_is_the_primary_test_and_else_what_could_have_been_seen(rows, claim, rest):
+    assert answered(rows) == (claim, rest)
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["hurry", "persona", "model", "hurry × persona"]),
+            st.floats(0.05, 1),
+            st.sampled_from([*METRICS]),
+            st.floats(-50, 50),
+        )
+    )
+)
+def test_no_change_is_claimed_that_no_corrected_p_carries(found):
+    rows = [effect(name, p, measure, difference=d) for name, p, measure, d in found]
+    claim, rest = answered(rows)
+    assert not DIRECTION.search(claim + rest)
+    assert "no effect" not in (claim + rest).lower()
+
+
+def test_a_side_has_its_count_and_the_chart_the_axis_of_its_data():
+    columns = (Column("factor", "factor"),)
+    sides = [
+        Row(
+            f"{driver}hurry={level}",
+            (),
+            {"factor": "hurry", "level": level, "driver": driver.rstrip("/") or None, "k": k,
+             "n": 100, "value": k, "ci": (k - 8.0, k + 8.0), "crashed": 3, "ended": 103,
+             "gap_m": None, "rmse_mps": 1.0},
+        )
+        for driver in ("", "o3/", "o4/")
+        for level, k in (("no", 50), ("yes", 63))
+    ]  # fmt: skip
+    answer = answer_of(
+        Table("effects", columns, [effect(), effect(measure="coll. (%)", p=0.3)]),
+        Table("levels", columns, sides),
+    )
+    (change,), (crashes,) = answer.changes, answer.others
+    assert (change.reference.k, change.level.k, change.level.n) == (50, 63, 100)
+    assert (change.mark.shape, crashes.mark.shape) == ("like", "open")
+    assert (crashes.level.k, crashes.level.n, crashes.level.text[:4]) == (3, 103, "2.91")
+    assert answer.trials == 200
+    (chart,) = answer.charts
+    assert [line.name for line in chart.lines] == ["no", "yes"]
+    assert [point.shape for point in chart.lines[0].points] == ["dot", "square"]
+    places = [tick[0] for tick in chart.ticks]
+    for line in chart.lines:
+        for point in line.points:
+            assert min(places) <= point.ends[0] < point.x < point.ends[1] <= max(places)
