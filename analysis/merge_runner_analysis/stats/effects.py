@@ -546,17 +546,3 @@ def _without_copies(level: Level, first: Callable[[tuple[str, ...]], tuple[str, 
     kept = every.drop_duplicates(["condition", "way"])
     pooled = replace(level.pooled, trials=kept, whole=replace(level.pooled, trials=every))
     return replace(level, groups=tuple(kept["group"].unique()), pooled=pooled)
-
-
-def balance(levels: list[Level]) -> str:
-    """Whether all levels of a factor have the same cells."""
-    found = {level.name: level.cells for level in levels}
-    every = set().union(*found.values())
-    lacking = [
-        f"{name} lacks {len(every) - len(cells)} of {len(every)} cells"
-        for name, cells in found.items()
-        if len(cells) < len(every)
-    ]
-    if lacking:
-        return f"not balanced, so that values over all trials are confounded: {'; '.join(lacking)}"
-    return f"every level has the same {len(every)} cells"

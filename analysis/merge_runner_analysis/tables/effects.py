@@ -12,7 +12,6 @@ from merge_runner_analysis.stats.effects import (
     DRIVER,
     Effect,
     Level,
-    balance,
     copied_of_shared,
     effects,
     levels_by_factor,
@@ -276,3 +275,17 @@ def _same_as_reference(study: Study) -> Iterator[str]:
     ]
     if same:
         yield f"{', '.join(dict.fromkeys(same))}, beside {study.reference}: {SAME_TRIALS}"
+
+
+def balance(levels: list[Level]) -> str:
+    """Whether all levels of a factor have the same cells."""
+    found = {level.name: level.cells for level in levels}
+    every = set().union(*found.values())
+    lacking = [
+        f"{name} lacks {len(every) - len(cells)} of {len(every)} cells"
+        for name, cells in found.items()
+        if len(cells) < len(every)
+    ]
+    if lacking:
+        return f"not balanced, so that values over all trials are confounded: {'; '.join(lacking)}"
+    return f"every level has the same {len(every)} cells"
