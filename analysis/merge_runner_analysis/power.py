@@ -59,12 +59,12 @@ COLUMNS = (
     Column("arms", "level"),
     Column("against", "against", optional=True),
     Column("truth", "truth"),
-    Column("effect", "effect", "number", 2),
+    Column("effect", "effect", "number"),
     Column("unit", "unit"),
     Column("trials", "n", "count"),
-    *(Column(f"times_{m:g}", f"x{m:g}", "percent", 0) for m in MULTIPLES),
+    *(Column(f"times_{m:g}", f"x{m:g}", "percent", digits=0) for m in MULTIPLES),
     Column("enough", "n for 80 %", "count", optional=True),
-    Column("cost_usd", "USD", "number", 2, optional=True),
+    Column("cost_usd", "USD", "number", optional=True),
 )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.metrics import (
-    DECIMALS,
     INTERVALS,
     RULES_NOTE,
     Metric,
@@ -40,7 +39,7 @@ def ablation_quantitative(study: Study) -> Table:
 def metric_table(name: str, groups: list[Group], place: str, *notes: str) -> Table:
     """A row for each group, with the metrics that a place of ``metrics.SHOWN`` has."""
     metrics = shown_in(place)
-    columns = [*GROUP_COLUMNS, Column("n", "n", "count", 0, "trials that ended")]
+    columns = [*GROUP_COLUMNS, Column("n", "n", "count", "trials that ended")]
     for one in metrics:
         kind: Kind = "percent" if one.rate else "number"
         counts = one.column if one.rate else ""
@@ -48,9 +47,9 @@ def metric_table(name: str, groups: list[Group], place: str, *notes: str) -> Tab
         if one.estimator == "median":
             of, rests_on = f"{one.trials} trials that have the measure", one.column
             meaning = f"median over the {of}: {meaning}"
-            columns.append(Optional(f"{one.name}_n", "n", "count", 0, of, rests_on=rests_on))
+            columns.append(Optional(f"{one.name}_n", "n", "count", of, rests_on=rests_on))
         columns += [
-            Column(one.name, one.heading, kind, DECIMALS, meaning, counts, rests_on=rests_on),
+            Column(one.name, one.heading, kind, meaning, counts, rests_on=rests_on),
             interval(f"{one.name}_ci", f"of {one.label}", rests_on=rests_on),
         ]
     rows = []

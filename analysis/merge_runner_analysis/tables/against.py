@@ -43,8 +43,8 @@ def against(table: Table, study: Study) -> Table:
         if one.name in named:
             meaning = f"{one.heading} as printed in the paper"
             columns += [
-                Optional(f"{one.name}_in_paper", "paper", one.kind, one.digits, meaning),
-                Optional(f"{one.name}_difference", "diff.", "number", one.digits),
+                Optional(f"{one.name}_in_paper", "paper", one.kind, meaning, digits=one.digits),
+                Optional(f"{one.name}_difference", "diff.", "number", digits=one.digits),
             ]
     groups = {group.id: group for group in (*study.groups, *study.unjudged)}
     rows = [_beside(row, groups[row.groups[0]], paper) for row in table.rows]

@@ -62,8 +62,8 @@ def _columns(name: str) -> list[Column]:
     """A column of counts, and one of their shares."""
     meaning = MEANINGS.get(name, f"answers without a valid plan: {name}")
     counts = "" if name == "trials" else FAILURES.get(name, name)
-    count = Column(name, name.replace("_", " "), "count", 0, meaning, counts)
-    share = Column(f"{name}_percent", "(%)", "percent", 2, f"share of {meaning}", counts)
+    count = Column(name, name.replace("_", " "), "count", meaning, counts)
+    share = Column(f"{name}_percent", "(%)", "percent", f"share of {meaning}", counts)
     return [count, share] if name in SHARES else [count]
 
 

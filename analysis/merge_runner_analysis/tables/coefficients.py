@@ -26,11 +26,11 @@ TESTED_ELSEWHERE = (
 KEYS = (
     Column("term", "term"),
     *GROUP_COLUMNS,
-    Column("n", "n", "count", 0, "trials in the regression"),
-    Column("b", "b", "number", 2, "coefficient"),
-    Column("se", "SE", "number", 3, "standard error"),
+    Column("n", "n", "count", "trials in the regression"),
+    Column("b", "b", "number", "coefficient"),
+    Column("se", "SE", "number", "standard error", digits=3),
 )
-P = Column("p", "p", "p", 3, "Wald test")
+P = Column("p", "p", "p", "Wald test")
 # Of the same trials: how its rows differ in name and label from the first ones, and the fit and a
 # robust one by the prefix of their values' names.
 Fit = tuple[str, str, dict[str, Regression]]

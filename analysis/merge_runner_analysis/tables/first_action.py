@@ -48,18 +48,24 @@ ONLY_ASKED = (
 # By the sign of the own relative velocity.
 VELOCITIES = {-1: "slower", 0: "equal", 1: "faster"}
 FIRST_ACTIONS = (
-    Optional("n", "n", "count", 0, "first actions: two a trial, one of a mixed pair"),
+    Optional("n", "n", "count", "first actions: two a trial, one of a mixed pair"),
     *(
-        Optional(f"mean_{name}", name, "number", 3, f"mean (m/s²) where the own velocity is {name}")
+        Optional(
+            f"mean_{name}",
+            name,
+            "number",
+            f"mean (m/s²) where the own velocity is {name}",
+            digits=3,
+        )
         for name in VELOCITIES.values()
     ),
-    Optional("brake_percent", "brake (%)", "percent", 1, f"below -{HOLD_MPS2} m/s²"),
-    Optional("hold_percent", "hold (%)", "percent", 1, f"within {HOLD_MPS2} m/s² of 0"),
-    Optional("go_percent", "go (%)", "percent", 1, f"above {HOLD_MPS2} m/s²"),
-    Optional("slope", "slope", "number", 3, "on own relative velocity, m/s² per m/s"),
-    Optional("slope_se", "SE", "number", 3, "of the slope, clustered by trial"),
-    interval("slope_ci", "of the slope", 3),
-    Optional("exchange_rate", "exchange rate", "number", 2, "m of headway that are worth 1 m/s"),
+    Optional("brake_percent", "brake (%)", "percent", f"below -{HOLD_MPS2} m/s²", digits=1),
+    Optional("hold_percent", "hold (%)", "percent", f"within {HOLD_MPS2} m/s² of 0", digits=1),
+    Optional("go_percent", "go (%)", "percent", f"above {HOLD_MPS2} m/s²", digits=1),
+    Optional("slope", "slope", "number", "on own relative velocity, m/s² per m/s", digits=3),
+    Optional("slope_se", "SE", "number", "of the slope, clustered by trial", digits=3),
+    interval("slope_ci", "of the slope", digits=3),
+    Optional("exchange_rate", "exchange rate", "number", "m of headway that are worth 1 m/s"),
     interval("exchange_rate_ci", "of the rate, by Fieller"),
 )
 

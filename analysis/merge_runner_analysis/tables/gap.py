@@ -29,12 +29,12 @@ def gap(study: Study) -> Table:
         "gap",
         (
             *KEYS,
-            Column("t", "t", "number", 2, "b / SE"),
+            Column("t", "t", "number", "b / SE"),
             P,
-            Optional("hc3_se", "HC3 SE", "number", 3, "HC3 standard error"),
-            Optional("hc3_p", "HC3 p", "p", 3, "its t test"),
-            Optional("equivalence_p", "equiv. p", "p", 3, "two one-sided tests of the margin"),
-            Optional("velocity_p", "joint p", "p", 3, "F test of all terms with relative velocity"),
+            Optional("hc3_se", "HC3 SE", "number", "HC3 standard error", digits=3),
+            Optional("hc3_p", "HC3 p", "p", "its t test"),
+            Optional("equivalence_p", "equiv. p", "p", "two one-sided tests of the margin"),
+            Optional("velocity_p", "joint p", "p", "F test of all terms with relative velocity"),
         ),
         [
             row

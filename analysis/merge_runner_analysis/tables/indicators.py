@@ -62,10 +62,10 @@ def indicators(study: Study) -> Table:
             Optional("paper", "paper's rule", "verdict", meaning="by the paper's rule"),
             Optional("robust", "robust", "verdict", meaning="by robust tests"),
             Optional("differ", "", meaning="where the two rules disagree"),
-            Optional("value", "value", "number", 2, "mean gain (I5) or measure"),
+            Optional("value", "value", "number", "mean gain (I5) or measure"),
             interval("interval", "Wilson for rates, t for means"),
             *ceiling_columns("humans pass (%)", "humans, robust (%)"),
-            Optional("n", "n", "count", 0, "trials"),
+            Optional("n", "n", "count", "trials"),
         ),
         [
             *(
@@ -82,8 +82,8 @@ def indicators(study: Study) -> Table:
 def ceiling_columns(paper: str, robust: str) -> list[Column]:
     """The columns of how often human data sets pass, by both rules."""
     return [
-        Optional("ceiling_paper", paper, "percent", 0, f"{RESAMPLED} by the paper's rule"),
-        Optional("ceiling_robust", robust, "percent", 0, f"{RESAMPLED} by the robust rule"),
+        Optional("ceiling_paper", paper, "percent", f"{RESAMPLED} by the paper's rule", digits=0),
+        Optional("ceiling_robust", robust, "percent", f"{RESAMPLED} by the robust rule", digits=0),
     ]
 
 

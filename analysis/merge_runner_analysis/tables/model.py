@@ -32,26 +32,26 @@ class Column:
     ``meaning`` describes its values in words. ``counts`` is the column of the trials, or of their
     calls, that a share or a count counts, and ``rests_on`` is as of a row, where its values rest on
     other trials. If ``optional``, a value may be missing without a note. One that is ``noted``
-    stands in the values alone: the notes say it to a reader.
+    stands in the values alone: the notes say it to a reader. ``digits`` are decimals.
     """
 
     name: str
     heading: str
     kind: Kind = "text"
-    digits: int = DECIMALS
     meaning: str = ""
     counts: str = ""
     optional: bool = False
     noted: bool = False
     rests_on: str = ""
+    digits: int = DECIMALS
 
 
 Optional = partial(Column, optional=True)
 
 
-def interval(name: str, meaning: str, digits: int = DECIMALS, rests_on: str = "") -> Column:
+def interval(name: str, meaning: str, rests_on: str = "", digits: int = DECIMALS) -> Column:
     """The column of a 95 % interval."""
-    return Optional(name, "95 % CI", "interval", digits, meaning, rests_on=rests_on)
+    return Optional(name, "95 % CI", "interval", meaning, rests_on=rests_on, digits=digits)
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,11 +32,11 @@ def who_first(study: Study) -> Table:
         "who-first",
         (
             *KEYS,
-            Column("z", "z", "number", 2, "b / SE"),
+            Column("z", "z", "number", "b / SE"),
             P,
-            Optional("firth_b", "Firth b", "number", 2, "Firth's penalised estimate"),
-            Optional("firth_se", "SE", "number", 3, "its standard error"),
-            Optional("firth_p", "LR p", "p", 3, "its likelihood-ratio test"),
+            Optional("firth_b", "Firth b", "number", "Firth's penalised estimate"),
+            Optional("firth_se", "SE", "number", "its standard error", digits=3),
+            Optional("firth_p", "LR p", "p", "its likelihood-ratio test"),
         ),
         [
             row_of_term(group, term, fit, LEFT_FIRST.column, "" if fit[1] else outcomes_note(group))
