@@ -131,7 +131,8 @@ def _source(
         rows = rows[rows["condition"].isin(conditions)]
     if copies:
         copied = {*copies}
-        rows = rows[[key not in copied for key in rows[KEYS].itertuples(index=False, name=None)]]
+        kept = [key not in copied for key in rows[KEYS].itertuples(index=False, name=None)]
+        rows = rows.loc[kept]  # an empty mask in brackets would take the columns away
     trials = tuple(rows["trial_id"])
     numerator: tuple[str, ...] = ()
     if counts:
