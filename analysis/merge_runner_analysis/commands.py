@@ -48,7 +48,8 @@ TOLD_EVERY = 100  # pages
 
 NAMES = (
     "Tables, all if none is named: verdicts, who-first, gap, indicators, ablation-qualitative, "
-    "ablation-quantitative, effects, contrasts, factors, criticality, attempts, first-action."
+    "ablation-quantitative, effects, levels, contrasts, factors, criticality, attempts, "
+    "first-action."
 )
 
 app.add_typer(human_app, name="human", rich_help_panel=KEEP)

@@ -17,6 +17,7 @@ from merge_runner_analysis.stats.indicators import (
     score,
 )
 from merge_runner_analysis.study import Study
+from merge_runner_analysis.wording import Fact, Why
 from tests.support.studies import SCENARIO, changed, write_study, yielding
 from tests.support.tables import by_id, made
 
@@ -91,7 +92,7 @@ def test_idm_moves_and_its_gap_depends_on_who_is_faster_and_projected_order_hold
 
 def test_before_an_import_humans_are_judged_by_eye_and_a_driver_by_its_accelerations(small):
     human, driver = score(small, small.human), score(small, small.models[0])
-    eye = "by eye, the paper"
+    eye = Fact(Why.BY_EYE)
     assert (human.paper["I5"], human.robust["I5"]) == (Judgement(True, eye), Judgement(None, eye))
     assert (driver.paper["I5"], driver.robust["I5"]) == (Judgement(None), Judgement(True))
 
