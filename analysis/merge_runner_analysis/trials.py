@@ -17,6 +17,7 @@ import pandas as pd
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
+from merge_runner.results.database import SETTINGS
 from merge_runner.results.frames import frame
 from merge_runner.scenarios.merge.collision import rectangles_overlap
 from merge_runner.scenarios.merge.geometry import TRACK
@@ -56,14 +57,18 @@ def with_metrics(connection: duckdb.DuckDBPyConnection, trials: str) -> pd.DataF
     types |= {metric.weight_column: "float" for metric in metrics if metric.weight}
     try:
         return _selected(connection, trials, metrics).astype(types)
+    except duckdb.OutOfMemoryException:
+        # A plug-in's metric may need more than is asked for to read what ours need.
+        connection.execute(f"SET memory_limit = '{SETTINGS['memory_limit']}'")
     except duckdb.Error:
-        for metric in metrics:
-            try:
-                _selected(connection, trials, [metric])
-            except duckdb.Error as exc:
-                reason = first_line(exc)
-                raise UsageError(f"the SQL of the metric {metric.name} fails: {reason}") from exc
-        raise
+        pass  # found again below, with the metric's name
+    for metric in metrics:
+        try:
+            _selected(connection, trials, [metric])
+        except duckdb.Error as exc:
+            reason = first_line(exc)
+            raise UsageError(f"the SQL of the metric {metric.name} fails: {reason}") from exc
+    return _selected(connection, trials, metrics).astype(types)
 
 
 def _selected(

@@ -10,12 +10,15 @@ import numpy as np
 import pandas as pd
 
 import merge_runner_analysis
+from merge_runner.results.database import read_database
 from merge_runner.results.store import Store
 from merge_runner_analysis import Study, load, load_trials, table
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.figures.gallery import rendered
+from merge_runner_analysis.frames import TRIALS
 from merge_runner_analysis.stats.indicators import fits
 from merge_runner_analysis.tables import TABLES, make_tables
+from merge_runner_analysis.trials import with_metrics
 
 
 def test_the_menu_is_small_and_loads_nothing_before_it_is_used():
@@ -53,6 +56,13 @@ def test_a_missing_truth_value_or_number_is_neither_false_nor_a_fraction(tmp_pat
     assert [str(dtype) for dtype in frame.dtypes] == ["boolean", "Int64"]
     assert frame.iloc[0].tolist() == [True, 2]
     assert frame.iloc[1].isna().all()
+
+
+def test_metrics_that_need_more_memory_than_is_asked_for_first_get_it(small):
+    with read_database(small.db) as connection:
+        expected = with_metrics(connection, TRIALS)
+        connection.execute("SET memory_limit = '3MB'; SET threads = 1")
+        pd.testing.assert_frame_equal(with_metrics(connection, TRIALS), expected)
 
 
 def used(db):
