@@ -16,7 +16,7 @@ import pandas as pd
 from merge_runner.audit.checks import ASKED_DECISIONS
 from merge_runner.paths import DEFAULT_DB
 from merge_runner.results import frames
-from merge_runner.results.database import read_database
+from merge_runner.results.database import limit_memory, read_database
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.served_model import other_models, sql_of
 from merge_runner.study.crossing import MODEL, PROMPT
@@ -143,7 +143,7 @@ def _limit(connection: duckdb.DuckDBPyConnection) -> None:
     """Let DuckDB cache little of the file, unless lists of the states need more: 40 B for each."""
     [(states,)] = connection.execute("SELECT count(*) FROM states").fetchall()
     if states < MANY_STATES:
-        connection.execute("SET memory_limit = '256MB'; SET threads = 1")
+        limit_memory(connection)
 
 
 def load_trials(db: Path | str = DEFAULT_DB) -> pd.DataFrame:
