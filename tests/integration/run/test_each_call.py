@@ -1,0 +1,125 @@
+"""What each further call of a trial takes: counted, since times differ from machine to machine."""
+
+import sqlite3
+import sys
+import threading
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+import merge_runner
+from merge_runner.run.local_runner import LocalRunner
+from merge_runner.run.plan import Options, make_plan
+from tests.support.harness import a_model, run_sweep
+
+# Of a call under a cap, and of one whose reply is recorded, by what is counted.
+BOUNDS = {
+    "changes of file": {"live": 155, "replayed": 57},
+    "functions": {"live": 530, "replayed": 247},
+    "statements": {"live": 29, "replayed": 1},
+    "on the event loop": {"live": 9, "replayed": 1},
+    "commits": {"live": 2, "replayed": 0},
+}
+GOALS = {
+    "changes of file": {"live": 75, "replayed": 45},
+    "functions": {"live": 250, "replayed": 150},
+    "statements": {"live": 8, "replayed": 1},
+    "on the event loop": {"live": 1, "replayed": 1},
+    "commits": {"live": 2, "replayed": 0},
+}
+PRICE = {"input": 1.0, "output": 1.0, "source": "contract"}
+FEW_S, MANY_S = 3, 8  # in each of which both drivers ask
+
+ROOT = f"{Path(merge_runner.__file__).parent}/"
+# What shows, checks or answers is no part of the way of a call.
+ELSEWHERE = ("audit/", "cli/", "emulator/", "planted_effect.py", "run/progress.py")
+
+
+class Counts:
+    """What is done while a trial is played and stored, ``of`` each kind."""
+
+    def __init__(self) -> None:
+        self.of: dict[str, Counter[str]] = {name: Counter() for name in BOUNDS}
+        self.calls = 0
+        self.under_way = False
+        self._file: dict[int, str] = {}  # by thread, in which it is
+
+    def profile(self, frame, event, _) -> None:
+        """Count a function that begins or goes on, and each change to another file, or back."""
+        code, thread = frame.f_code, threading.get_ident()
+        file = code.co_filename.removeprefix(ROOT)
+        if not self.under_way or file == code.co_filename or file.startswith(ELSEWHERE):
+            return
+        if event == "call":
+            self.of["functions"][f"{file} {code.co_qualname}"] += 1
+        before = self._file.get(thread, file)
+        self.of["changes of file"][f"{before} -> {file}"] += before != file
+        self._file[thread] = file
+
+    def statement(self, sql: str) -> None:
+        """Count a statement, or one of a trigger."""
+        if not self.under_way:
+            return
+        sql = " ".join(sql.partition("'")[0].split())
+        self.of["statements"][sql] += 1
+        self.of["commits"][sql] += sql == "COMMIT"
+        on_the_loop = threading.current_thread() is threading.main_thread()
+        self.of["on the event loop"][sql] += on_the_loop
+
+
+@pytest.fixture
+def counted(monkeypatch, tmp_path):
+    """Plays one trial of so many seconds, and returns its counts."""
+    monkeypatch.delenv("EMULATOR_BASE_URL", raising=False)
+    (tmp_path / "models.toml").write_text(a_model("priced", price=PRICE))
+    connect, play = sqlite3.connect, LocalRunner.play
+
+    async def run(seconds: int, *, replay: bool) -> Counts:
+        counts = Counts()
+
+        def connected(*args, **kwargs):
+            connection = connect(*args, **kwargs)
+            connection.set_trace_callback(counts.statement)
+            return connection
+
+        async def playing(*args, **kwargs):
+            counts.under_way = True
+            return await play(*args, **kwargs)
+
+        monkeypatch.setattr(sqlite3, "connect", connected)
+        monkeypatch.setattr(LocalRunner, "play", playing)
+        study = tmp_path / f"{seconds}.toml"
+        study.write_text(f"repetitions = {{ baseline = 1 }}\nscenario.timeout_s = {seconds}\n")
+        plan = make_plan(str(study), "priced", conditions=["L_4_0"], trust=True)
+        db, cache = tmp_path / f"{seconds}-{replay}.duckdb", tmp_path / f"{seconds}"
+        options = Options(db, cache, max_cost_usd=100.0, quiet=True, replay=replay)
+        threading.setprofile(counts.profile)
+        sys.setprofile(counts.profile)
+        try:
+            summary = await run_sweep(plan, options, say=lambda _: None)
+        finally:
+            sys.setprofile(None)
+            threading.setprofile(None)
+        counts.calls = summary["calls"]["cached" if replay else "live"]
+        return counts
+
+    return run
+
+
+async def test_a_further_call_takes_no_more_than_it_did(counted):
+    for way in ("live", "replayed"):
+        # The first one loads what is loaded once.
+        plays = [await counted(s, replay=way == "replayed") for s in (FEW_S - 1, FEW_S, MANY_S)]
+        few, many = plays[1:]
+        calls = many.calls - few.calls
+        assert calls == 2 * (MANY_S - FEW_S)
+        found, told = {}, []
+        for name in BOUNDS:
+            more = Counter(many.of[name])
+            more.subtract(few.of[name])
+            found[name] = more.total() / calls
+            told += [f"{way}, {name}: {found[name]:.1f}, to become {GOALS[name][way]}"]
+            told += [f"{n / calls:8.1f} {each}" for each, n in more.most_common() if n]
+        too_many = [name for name, n in found.items() if n > BOUNDS[name][way]]
+        assert not too_many, "\n".join(told)
