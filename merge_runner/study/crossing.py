@@ -36,6 +36,7 @@ class Arm:
 
     ``model`` is what ids of trials say, ``sides`` who drives, by their names in the registry, and
     ``asked`` the same, but by the names in ``entries`` of language models with these parameters.
+    ``names`` are those of ``asked``, the ego's first, without what words plant in the emulator.
     ``factors`` are the levels as texts; ``label`` names what sets this arm apart from the others.
     ``ego`` is the side of the driver whose odds are told (see ``config.ego_side``). ``focal`` is
     the same where the two drivers are given different words, parameters or perceptions, else None.
@@ -45,6 +46,7 @@ class Arm:
     model: str
     sides: dict[Side, str]
     asked: dict[Side, str]
+    names: tuple[str, str]
     entries: dict[str, ModelEntry]
     scenario: ScenarioConfig
     variant: str
@@ -70,11 +72,6 @@ class Arm:
         ego, other = self.sides[self.ego], self.sides[other_side(self.ego)]
         alone = not self.is_mixed or self.factors.get(OPPONENT, SELF) != SELF
         return ego if alone else f"{ego}+{other}"
-
-    @property
-    def names(self) -> tuple[str, str]:
-        """Who is asked, the ego first."""
-        return self.asked[self.ego], self.asked[other_side(self.ego)]
 
 
 def cross(
@@ -255,6 +252,7 @@ def _arm(
                 "out there, by skip"
             )
         one_sided |= word.given_to != "both"
+    names = asked[ego], asked[other_side(ego)]
     _plant(words.values(), ego, sides, asked, entries)
     variant = composed(texts[PROMPT], [f"{name}={texts[name]}" for name in words])
     prompts = {
@@ -274,6 +272,7 @@ def _arm(
         model="+".join(dict.fromkeys(sides.values())),
         sides=sides,
         asked=asked,
+        names=names,
         entries={asked[side]: entry for side, entry in entries.items()},
         scenario=scenario,
         variant=variant,

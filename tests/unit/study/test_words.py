@@ -146,6 +146,7 @@ def test_an_effect_is_planted_in_the_emulator_on_both_sides_and_in_no_other_mode
     planted = [arm.entries[arm.asked[side]].parameters for side in SIDES]
     assert planted == [{"x_other_first": 1.5, "x_gap_m": 2.0}, {"x_own_first": 1.5, "x_gap_m": 2.0}]
     assert arms["persona=taxi hurry=no"].entries["emulator"].parameters == {}
+    assert plan_of("mirror = true\n" + text).driver == "emulator"
     plain = [plan_of(each, "smollm2") for each in (ONE, text)]
     assert plain[0].specs() == plain[1].specs()
 

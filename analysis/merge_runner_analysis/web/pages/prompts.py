@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Collection, Mapping
 from functools import partial
 from typing import Any
 
+from merge_runner.planted_effect import PARAMETERS as PLANTED
 from merge_runner.prompts.blocks import BASELINE, Variant, blocks_of
+from merge_runner.records import SIDES
 from merge_runner_analysis.metrics import COLLISIONS
 from merge_runner_analysis.tables.formats import printed
 from merge_runner_analysis.tables.model import Row, Table
@@ -17,7 +20,7 @@ from merge_runner_analysis.web.marks import Mark
 from merge_runner_analysis.web.phrases import UNKNOWN, block_meaning, changes_text
 from merge_runner_analysis.web.scope import scope_of, unmarked
 from merge_runner_analysis.web.site import NotThere, Site
-from merge_runner_analysis.web.trial.prompt_parts import parts_of
+from merge_runner_analysis.web.trial.prompt_parts import Part, parts_of
 
 # The blocks of a prompt, as its specs name them; a program has none.
 STORED = """
@@ -25,17 +28,30 @@ SELECT any_value(names) AS names FROM listed JOIN (
     SELECT spec_hash, json_keys(spec, '$.prompt_blocks') AS names FROM specs
 ) USING (spec_hash) WHERE variant = ? AND len(names) > 0
 """
-# What each variant asks first: of all of them in the same condition, as far as that was played.
+# What each variant asks first, beside what the baseline asks on the same side: of all of them in the
+# same condition, as far as that was played. Where the two drivers are told different things, what
+# each is.
 FIRST = """
-SELECT variant, arg_min(prompt, (condition, decisions.side, trial_id)) AS prompt
-FROM decisions JOIN trials USING (trial_id, spec_hash)
-WHERE decision = 0 AND prompt IS NOT NULL GROUP BY variant ORDER BY variant <> ?, variant
+WITH asked AS (
+    SELECT *, CASE WHEN focal IS NULL THEN 'both' WHEN side = focal THEN 'ego' ELSE 'other' END
+        AS reader
+    FROM decisions JOIN trials USING (trial_id, spec_hash)
+    WHERE decision = 0 AND prompt IS NOT NULL
+), firsts AS (
+    SELECT variant, reader, arg_min(side, (condition, side, trial_id)) AS side,
+        arg_min(prompt, (condition, side, trial_id)) AS prompt
+    FROM asked GROUP BY ALL
+), baselines AS (
+    SELECT side, arg_min(prompt, (condition, trial_id)) AS baseline
+    FROM asked WHERE variant = $1 GROUP BY ALL
+)
+FROM firsts LEFT JOIN baselines USING (side) ORDER BY variant <> $1, variant, reader
 """
 # Trials of a variant and of its driver's baseline in equal conditions and repetitions, whose specs
-# differ in nothing but the prompt.
+# differ in nothing but the prompt, and what it plants in the emulator.
 PAIRS = """
 WITH tasks AS (
-    SELECT spec_hash, json_merge_patch(spec, '{"prompt_blocks": null}') AS task FROM specs
+    SELECT spec_hash, json_merge_patch(spec, ?) AS task FROM specs
 ), tasked AS (FROM listed JOIN tasks USING (spec_hash) WHERE source <> 'human')
 SELECT one.condition, one.rep, one.trial_id, one.spec_hash, one.outcome,
     base.trial_id AS base_id, base.spec_hash AS base_hash, base.outcome AS base_outcome
@@ -43,6 +59,8 @@ FROM tasked AS one JOIN tasked AS base USING (model, model_left, condition, rep,
 WHERE one.model = ? AND one.variant = ? AND base.variant = ?
 ORDER BY one.trial_id, one.spec_hash, base.spec_hash
 """
+_UNPLANTED = {"body": dict.fromkeys(PLANTED)}
+WITHOUT_PROMPT = json.dumps({"prompt_blocks": None, **dict.fromkeys(SIDES, _UNPLANTED)})
 
 
 def prompts_page(site: Site, asked: Mapping[str, str]) -> str:
@@ -55,7 +73,6 @@ def prompts_page(site: Site, asked: Mapping[str, str]) -> str:
     for one in played:
         if unmarked(one.name) in chosen:
             driven.setdefault(one.name, []).append(one)
-    texts = {row["variant"]: row["prompt"] for row in site.catalogue.ask(FIRST, BASELINE)}
     drivers, ends = differences(contrasts, chosen) if contrasts else ({}, {})
     return site.render(
         "prompts.html",
@@ -63,7 +80,7 @@ def prompts_page(site: Site, asked: Mapping[str, str]) -> str:
         **values | {"headings": {}},
         found=found,
         contrasts=contrasts,
-        prompts={name: parts_of(text, texts.get(BASELINE)) for name, text in texts.items()},
+        prompts=_told(site),
         left_out=partial(left_out, site),
         drivers=drivers,
         ends=ends,
@@ -75,6 +92,19 @@ def prompts_page(site: Site, asked: Mapping[str, str]) -> str:
             if len(prompts) > 1
         },
     )
+
+
+def _told(site: Site) -> dict[str, dict[str, list[Part]]]:
+    """What each prompt asks first, by its reader: one, or the two drivers where these differ."""
+    told: dict[str, dict[str, list[Part]]] = {}
+    seen: dict[str, list[list[Part]]] = {}
+    for row in site.catalogue.ask(FIRST, BASELINE):
+        variant, parts = row["variant"], parts_of(row["prompt"], row["baseline"])
+        said = [part for part in parts if part.changed or row["baseline"] is None]
+        if said not in seen.setdefault(variant, []):
+            seen[variant].append(said)
+            told.setdefault(variant, {})[row["reader"]] = parts
+    return told
 
 
 def differences(
@@ -146,7 +176,7 @@ def discordant_page(site: Site, asked: Mapping[str, str]) -> str:
     driver, variant = asked.get("model", ""), asked.get("variant", "")
     if not driver or not variant:
         raise NotThere("/discordant needs model=MODEL and variant=VARIANT")
-    pairs = site.catalogue.ask(PAIRS, unmarked(driver), variant, BASELINE)
+    pairs = site.catalogue.ask(PAIRS, WITHOUT_PROMPT, unmarked(driver), variant, BASELINE)
     differing = [pair for pair in pairs if pair["outcome"] != pair["base_outcome"]]
     kinds = Counter((pair["base_outcome"], pair["outcome"]) for pair in differing)
     return site.render(

@@ -1,0 +1,60 @@
+"""Prompts of a study whose words are given to one driver, side by side and pair by pair."""
+
+import pytest
+
+from merge_runner.results.store import query
+from tests.support.harness import FAST
+from tests.support.serving import Page, client_of
+
+STUDY = """
+models = ["emulator"]
+repetitions = 5
+conditions = ["N_0_0"]
+[factors]
+persona = ["none", "taxi"]
+hurry = ["no", "yes"]
+[texts.persona.taxi]
+add = [{ after = "C3.human", text = "You are a taxi driver." }]
+given_to = "ego"
+[texts.hurry.yes]
+add = [{ after = "C3.human", text = "You are late." }]
+given_to = "other"
+emulator = { own_first = 3.0 }
+"""
+DIFFERING = """
+SELECT count(*) FILTER (one.merged_first <> base.merged_first), count(*)
+FROM trials AS one JOIN trials AS base USING (rep)
+WHERE one.variant = 'hurry=yes' AND base.variant = 'baseline'
+"""
+
+
+@pytest.fixture(scope="module")
+def db(prepare, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("prompts")
+    (folder / "study.toml").write_text(STUDY)
+    done = prepare(folder, "sweep", "study.toml", "--db", "t.duckdb", *FAST)
+    assert done.code == 0, done.err
+    return folder / "t.duckdb"
+
+
+def test_what_each_driver_is_told_is_shown_where_the_two_differ(db):
+    with client_of(db) as client:
+        cards = client.get("/prompts").text.split('<section class="card"')[1:]
+    said = {card.partition('"')[2].partition('"')[0]: Page(card).text for card in cards}
+    assert "driver is told" not in said["baseline"]
+    told, words = "The other driver is told: Text without a name", "You are late."
+    one = said["hurry=yes"]
+    assert "The ego is told what the baseline says." in one
+    assert f"{told} {words}" in one
+    both = said["persona=taxi hurry=yes"]
+    assert "The ego is told: Text without a name You are a taxi driver." in both
+    assert f"{told} {words}" in both
+
+
+def test_pairs_are_found_although_an_effect_is_planted_with_the_prompt(db):
+    _, [(differing, pairs)] = query(db, DIFFERING)
+    assert pairs == 5
+    assert differing > 0
+    with client_of(db) as client:
+        text = Page(client.get("/discordant?model=emulator&variant=hurry%3Dyes").text).text
+    assert f"{differing} of {pairs} ended differently" in text
