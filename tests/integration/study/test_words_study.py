@@ -1,30 +1,18 @@
 """A study of words that are given to one driver, from its file to what is stored and replayed."""
 
 import math
+import re
 
 import pytest
 
 from merge_runner.results.store import query, results_digest
-from tests.support.harness import FAST
+from tests.support.harness import FAST, PROJECT
 
-# A study in 15 lines, but for who is given the hurry and what is planted.
-STUDY = """\
-description = "Does a driver in a hurry go first?"
-models = ["emulator"]
-repetitions = 20
-conditions = ["N_0_0"]
-mirror = true
-[factors]
-persona = ["none", "taxi"]
-hurry = ["no", "yes"]
-opponent = ["self", "projected-order"]
-[texts.persona.taxi]
-add = [{ after = "C3.human", text = "You are a taxi driver." }]
-given_to = "ego"
-[texts.hurry.yes]
-add = [{ after = "C3.human", text = "You are late, and in a hurry." }]
-"""
-PLANTED = STUDY + 'given_to = "ego"\nemulator = { own_first = 1.5 }\n'
+PAGE = (PROJECT / "docs/how-to/run-a-study.md").read_text("utf-8")
+# The study that the page about them shows, in one condition.
+EXAMPLE = re.search(r"## Words that cross\n+```toml\n(.*?)```", PAGE, re.DOTALL)[1]
+PLANTED = EXAMPLE.replace("repetitions = 10", 'repetitions = 20\nconditions = ["N_0_0"]')
+STUDY = PLANTED.replace("emulator = { own_first = 1.5 }\n", "")
 FIRST = """
 SELECT value, focal, count(*) FILTER (merged_first = coalesce(focal, 'left')),
     count(*) FILTER (merged_first IS NOT NULL)
@@ -42,6 +30,10 @@ def db(prepare, tmp_path_factory):
         done = prepare(folder, "sweep", "words.toml", *part, *FAST)
         assert done.code == 0, done.err
     return folder / "results/merge.duckdb"
+
+
+def test_two_factors_of_words_and_one_of_opponents_take_15_lines():
+    assert len([line for line in EXAMPLE.splitlines() if line]) <= 15
 
 
 def test_the_planted_effect_is_that_of_the_treated_driver_on_both_sides(db):
@@ -108,7 +100,7 @@ async def test_it_replays_from_its_recording_to_the_same_digest_and_is_audited(
 
 
 async def test_a_run_says_where_several_prompts_gave_the_same_trials(merge_runner, tmp_path):
-    text = STUDY.replace("repetitions = 20", "repetitions = 2") + 'given_to = "ego"\n'
+    text = STUDY.replace("repetitions = 20", "repetitions = 2")
     (tmp_path / "words.toml").write_text(text)
     told = await merge_runner("sweep", "words.toml", "--only", "opponent=self", *FAST)
     assert told.code == 0, told.err

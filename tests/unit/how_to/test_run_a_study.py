@@ -42,7 +42,7 @@ def plan_of(folder, example, **asked):
         ("Who, how often, where", 2),
         ("What varies", 12 + 6 + 4 + 2),  # those against projected-order both ways round
         ("Prompts", 5),
-        ("Words that cross", 1 + 7 * 2),
+        ("Words that cross", 1 + 3 * 2 + 4 * 2),
         ("The driving task", 1),
         ("What a driver perceives", 2),
         ("Drivers", 3),
