@@ -271,7 +271,7 @@ def test_what_the_pages_compute_knows_the_study_as_the_explorer_was_given_it(gol
         connection.execute("DELETE FROM trials WHERE model_left <> 'cheap'")
 
     def compute():
-        use(load_study(golden_copy / "mine.toml", trust=True)[1])
+        use(load_study(str(golden_copy / "mine.toml"), trust=True)[1])
         plugin.write_text("raise RuntimeError('nobody agreed to this')")
         with closing(Computing(db)) as computing:
             return computing.ask(("table", "factors"), (1, 1), wait_s=HANGS_S).content

@@ -28,9 +28,9 @@ SELECT any_value(names) AS names FROM listed JOIN (
     SELECT spec_hash, json_keys(spec, '$.prompt_blocks') AS names FROM specs
 ) USING (spec_hash) WHERE variant = ? AND len(names) > 0
 """
-# What each variant asks first, beside what the baseline asks on the same side: of all of them in the
-# same condition, as far as that was played. Where the two drivers are told different things, what
-# each is.
+# What each variant asks first, beside the baseline on the same side: of all of them in the same
+# condition, as far as that was played. Where the two drivers may be told different things: what the
+# ego and what the other is.
 FIRST = """
 WITH asked AS (
     SELECT *, CASE WHEN focal IS NULL THEN 'both' WHEN side = focal THEN 'ego' ELSE 'other' END
