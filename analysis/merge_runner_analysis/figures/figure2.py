@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from merge_runner.prompts.blocks import title_of
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.figures.style import (
     GREY,
     LINE_IN,
@@ -60,10 +61,7 @@ SHOWN = 0.95
 
 def figure2(study: Study, chosen: list[Group]) -> Figure:
     """Return left speeds (A, B), who was first (C), gap (D) and speed deviation (E) of groups."""
-    # Humans drove in conditions, too, that no driver of this study did.
-    groups = [
-        group.part(lambda trials: trials["condition"].isin(study.conditions)) for group in chosen
-    ]
+    groups = [_played(study, group) for group in chosen]
     velocities = sorted({velocity for _, velocity in study.conditions.values()})
     styles = {velocity: style(number) for number, velocity in enumerate(velocities)}
     names = [
@@ -79,7 +77,7 @@ def figure2(study: Study, chosen: list[Group]) -> Figure:
         row[0].set_ylabel(name, rotation=0, ha="right", va="center", multialignment="right")
         for axis, first in zip(row[:2], ("left", "right"), strict=True):
             _draw_traces(axis, study, group, first, styles)
-        for axis, summary in zip(row[2:], SUMMARIES, strict=True):
+        for axis, summary in zip(row[2:], COLUMNS, strict=True):
             _draw_estimates(axis, group, summary, styles)
             if group.setting and groups[0].driver == HUMAN:
                 _draw_humans(axis, groups[0], summary, styles, ":")
@@ -106,40 +104,55 @@ def figure2(study: Study, chosen: list[Group]) -> Figure:
     return figure
 
 
-def left_first(trials: pd.DataFrame) -> Estimate:
+def left_first(merged_first: pd.Series) -> Estimate:
     """Panel C: how often the left vehicle merges first."""
-    known = trials["merged_first"].dropna()
+    known = merged_first.dropna()
     return proportion(int((known == "left").sum()), len(known))
 
 
-def gap(trials: pd.DataFrame) -> Estimate:
+def gap(gaps_m: pd.Series) -> Estimate:
     """Panel D: mean gap in m."""
-    return mean(trials["gap_m"].to_numpy(float))
+    return mean(gaps_m.to_numpy(float))
 
 
-def deviation(trials: pd.DataFrame) -> Estimate:
+def deviation(rmse_mps: pd.Series) -> Estimate:
     """Panel E: mean RMSE of the speed in m/s, of a trial that of both vehicles; never below 0."""
-    found = mean(trials["rmse_mps"].to_numpy(float))
+    found = mean(rmse_mps.to_numpy(float))
     return found if found.low is None else replace(found, low=max(0.0, found.low))
 
 
-Summary = Callable[[pd.DataFrame], Estimate]
-SUMMARIES: tuple[Summary, ...] = (left_first, gap, deviation)
+Summary = Callable[[pd.Series], Estimate]
+COLUMNS: dict[Summary, str] = {left_first: "merged_first", gap: "gap_m", deviation: "rmse_mps"}
 
 
 def points(group: Group, velocity_mps: float, summary: Summary) -> Points:
     """A summary of the finished trials of each condition with this velocity, by headway in m."""
+    return _points(group, summary).get(velocity_mps, [])
+
+
+@remembered
+def _points(group: Group, summary: Summary) -> dict[float, Points]:
+    """By relative velocity in m/s."""
     if summary is not left_first and not group.measured:
-        return []
+        return {}
     trials = group.outcomes if summary is left_first else group.trials
-    chosen = trials[
-        (trials["status"] == "finished") & (trials["relative_velocity_mps"] == velocity_mps)
-    ]
-    conditions = chosen.groupby(["projected_headway_m", "condition"])
-    found = [(headway_m, summary(rows)) for (headway_m, _), rows in conditions]
-    return [(x, estimate) for x, estimate in found if estimate.value is not None]
+    columns = ["relative_velocity_mps", "projected_headway_m", "condition"]
+    chosen = trials.loc[trials["status"] == "finished", [*columns, COLUMNS[summary]]]
+    found: dict[float, Points] = {}
+    for (velocity, headway_m, _), values in chosen.groupby(columns)[COLUMNS[summary]]:
+        estimate = summary(values)
+        if estimate.value is not None:
+            found.setdefault(velocity, []).append((headway_m, estimate))
+    return found
 
 
+@remembered
+def _played(study: Study, group: Group) -> Group:
+    """The group in the conditions of the study: humans drove in others, too."""
+    return group.part(lambda trials: trials["condition"].isin(study.conditions))
+
+
+@remembered
 def left_traces(study: Study, group: Group, first: str) -> dict[float, list[Array]]:
     """Panels A and B: times in s and left speeds in m/s, (n, 2), where ``first`` merged first.
 
@@ -223,13 +236,12 @@ def _scale(axes: NDArray[np.object_], groups: list[Group], study: Study) -> None
         axis.set_ylim(min(speeds), max(speeds))
     axes[0, 2].set(ylim=(-0.08, 1.08), yticks=[0, 0.5, 1])
     velocities = {velocity for _, velocity in study.conditions.values()}
-    for axis, summary in zip(axes[0, 3:], SUMMARIES[1:], strict=True):
+    for axis, summary in zip(axes[0, 3:], (gap, deviation), strict=True):
         found = [one for g in groups for v in velocities for _, one in points(g, v, summary)]
         if not found:
             continue
         frame = pd.DataFrame([(one.value, one.low, one.high) for one in found], dtype=float)
-        column = "gap_m" if summary is gap else "rmse_mps"
-        single = pd.concat([group.finished[column] for group in groups if group.measured])
+        single = pd.concat([g.finished[COLUMNS[summary]] for g in groups if g.measured])
         ends = frame[1].quantile(1 - SHOWN), frame[2].quantile(SHOWN)
         values = [*frame[0], max(ends[0], single.min()), min(ends[1], single.max())]
         if summary is gap and not all(group.measured for group in groups):

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from merge_runner_analysis.explain import explain
+from merge_runner_analysis.explain import explain, sources_of
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import Study
 from tests.support.studies import changed, write_study, yielding
@@ -59,6 +59,13 @@ def test_a_level_counts_each_trial_of_a_program_once(db, factors):
     (note,) = notes_with(factors, "trials of programs are equal to others")
     assert "model=one: 44 of 88, model=two: 44 of 88" in note
     assert "model: every level has the same 11 cells" in factors.notes
+
+
+def test_a_row_with_copies_and_no_other_trial_has_none(db, factors):
+    row = by_id(factors)["model=one/left_first_percent"]
+    study, copies = Study(db), (("one/A1", "one-A1"),)
+    sources = sources_of(study, factors, replace(row, conditions=("none",), copies=copies))
+    assert {source.trials for source in sources} == {()}
 
 
 def test_two_programs_are_compared_by_distinct_trials(db):
