@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 import signal
 import stat
@@ -22,6 +21,8 @@ def on_signal(stop: Callable[[], object] | None, drop: Callable[[], object]) -> 
     if threading.current_thread() is not threading.main_thread():
         yield
         return
+    import asyncio
+
     loop = asyncio.get_running_loop()
     handled = [signal.SIGINT, signal.SIGTERM]
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 import json
 from collections.abc import Callable
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import duckdb
 
@@ -58,10 +59,8 @@ class Numbers:
             case ["cell", table, row, column]:
                 found = self._cell(table, row, column)
             case ["figure", name, "svg" | "png" as form]:
-                from merge_runner_analysis.figures.gallery import rendered
-
                 digest, _ = results_digest(self.db)
-                found = {"file": rendered(self.study, name, form), "digest": digest}
+                found = {"file": self._figure(name, form), "digest": digest}
             case ["audit"]:
                 found = {"notes": json.loads(self._kept("audit", self._audit))}
             case _:
@@ -101,6 +100,16 @@ class Numbers:
             return to_text(make_tables(study, [name])[0])
 
         return self._kept(name, make, selection.key(self.db))
+
+    def _figure(self, name: str, form: Literal["svg", "png"]) -> bytes:
+        """Return a figure as a file; one that a report has drawn is that of the report."""
+
+        def draw() -> str:
+            from merge_runner_analysis.figures.gallery import rendered
+
+            return base64.b64encode(rendered(self.study, name, form)).decode()
+
+        return base64.b64decode(self._kept(f"{name}.{form}", draw))
 
     def _audit(self) -> str:
         """Return what the audit of each run found and notes, by its id; nothing is replayed."""
