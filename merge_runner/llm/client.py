@@ -566,11 +566,14 @@ class LlmClient:
             )
         error = error or self._error(call, outcome)
         if error is None:
-            kept = await paid.keep(CachedCall(call.request, tuple(call.attempts)))
+            attempts = tuple(call.attempts)
+            answered = CachedCall(call.request, attempts)
+            kept = await paid.keep(answered)
             self._answered.add(call.request.key)
-            return self._read(
-                kept, call.earlier
-            )  # not what was sent here where an import was first
+            if kept is not answered:  # an import was first
+                return self._read(kept, call.earlier)
+            text = outcome.reading.text
+            return ChatReply(text, record.outcome, call.request, attempts, call.earlier)
         if outcome.pause:
             self.limiter.pause(outcome.delay_s or backoff_s(len(call.own_attempts)))
         await paid.settle(call.attempts)  # before the error, which may end the whole run

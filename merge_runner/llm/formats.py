@@ -183,10 +183,12 @@ def outcome_of(
 def at(value: object, path: str) -> Any:  # noqa: ANN401 # whatever JSON holds there
     """Return the JSON at a path such as ``choices.0.message``, None where there is none."""
     for name in path.split("."):
-        if isinstance(value, list):
-            value = value[0] if value and name == "0" else None
+        if isinstance(value, dict):
+            value = value.get(name)
+        elif isinstance(value, list) and value and name == "0":
+            value = value[0]
         else:
-            value = as_dict(value).get(name)
+            return None
     return value
 
 
@@ -334,17 +336,18 @@ class OpenAIChat(WireFormat):
 
     def read(self, payload: dict[str, Any]) -> Reading:
         """Read the first choice."""
-        choice = at(payload, "choices.0")
-        content = at(choice, "message.content")  # a list of parts at some servers
-        text = content if isinstance(content, str) else joined(as_dicts(content))
-        thoughts = [at(choice, f"message.{name}") for name in ("reasoning_content", "reasoning")]
+        choice = as_dict(at(payload, "choices.0"))
+        message = as_dict(choice.get("message"))
+        content = message.get("content")
+        parts = as_dicts(content)  # at some servers
+        text = content if isinstance(content, str) else joined(parts)
         # Mistral's parts hold parts; OpenRouter and vLLM send the same words in both members.
-        thinking = [part.get("thinking") for part in as_dicts(content)]
-        thoughts += [joined(as_dicts(each)) for each in thinking]
-        refusal = as_text(at(choice, "message.refusal"))
-        finish = as_text(at(choice, "finish_reason"))
+        thoughts = [message.get("reasoning_content"), message.get("reasoning")]
+        thoughts += [joined(as_dicts(part.get("thinking"))) for part in parts]
+        refusal = as_text(message.get("refusal"))
+        finish = as_text(choice.get("finish_reason"))
         # Routers answer 200 and put the failure of a generation into the body.
-        failed = is_error(payload.get("error")) or is_error(at(choice, "error"))
+        failed = is_error(payload.get("error")) or is_error(choice.get("error"))
         return Reading(
             outcome_of(
                 text,
