@@ -40,6 +40,7 @@ from merge_runner.llm.durable import (
     ResultT,
     alone,
     connect,
+    each_or_alone,
     making,
 )
 from merge_runner.llm.ledger import LedgerFile
@@ -218,7 +219,6 @@ class ResponseCache:
 
     async def put(self, entry: CachedCall) -> CachedCall:
         """Keep an entry durably; returns what is kept, another one where an import was first."""
-        await self.quarantine(entry.request.key)
         return await self.write(partial(self._keep, entry))
 
     def put_now(
@@ -286,7 +286,8 @@ class ResponseCache:
         """Run operations in one durable transaction, each with its result or its own error."""
         told = self._told("written")
         # Of this thread, in which the transaction is.
-        return self.run_now([partial(alone, self._texts._sql, told(each)) for each in operations])
+        execute = self._texts._sql
+        return each_or_alone(self.run_now, lambda each: alone(execute, told(each)), operations)
 
     def read(self, name: str) -> str | None:
         """Return the text under a name, or None; raises RecordingError where it is damaged."""
@@ -349,10 +350,17 @@ class ResponseCache:
             self._texts.close()
 
     def _keep(self, entry: CachedCall) -> CachedCall:
-        """Keep an entry unless there is one, and return what is kept; an operation."""
-        key = entry.request.key
-        if not self._texts.add(key, _behind_checksum(entry.to_json())):
-            return self._kept(key) or entry
+        """Keep an entry unless there is one, and return what is kept; an operation.
+
+        One that is damaged goes to quarantine.
+        """
+        key, text = entry.request.key, _behind_checksum(entry.to_json())
+        if not self._texts.add(key, text):
+            try:
+                return self._kept(key) or entry
+            except RecordingError:
+                self._move_aside([key])
+                self._texts.add(key, text)
         self._texts.delete(_UNANSWERED + key)
         return entry
 

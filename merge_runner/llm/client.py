@@ -26,7 +26,7 @@ from merge_runner.errors import (
     ReplayMiss,
     SweepStopped,
 )
-from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.llm.cache import Attempts, CachedCall, ResponseCache
 from merge_runner.llm.formats import FORMATS, WireFormat, as_text, read_reply
 from merge_runner.llm.http_outcome import (
     UNSURE,
@@ -106,7 +106,7 @@ class Call:
     ``earlier`` of them by earlier runs. While the call waits, ``wait`` says for what; otherwise it
     is in flight, or being saved. ``task`` makes it. ``asking`` counts those who wait for its
     answer. It goes ``singly`` where a batch brought no answer, and ``open`` says in which batch it
-    waits already.
+    waits already. What is recorded of it may be ``damaged``.
     """
 
     request: ChatRequest
@@ -114,6 +114,7 @@ class Call:
     asked: Asked
     worst: Usage
     left_s: float
+    damaged: bool = False
     attempts: list[Attempt] = field(default_factory=list)
     earlier: int = 0
     wait: Wait | None = None
@@ -226,7 +227,13 @@ class LlmClient:
         Raises CallFailed, TrialSuspended or SweepStopped.
         """
         request = self._request(prompt, slot)
-        reply = self._known(request)
+        reply, damaged = None, False
+        try:
+            reply = self._known(request)
+        except RecordingError as exc:
+            if self.sealed:
+                raise CallFailed(f"{self.name}: call {request.key}: {exc}", request) from exc
+            damaged = True
         if reply is None and self.sealed:
             raise ReplayMiss("no recorded reply", request)
         if reply is None:
@@ -234,7 +241,7 @@ class LlmClient:
             call = self.under_way.get(request.key)
             shared = call is not None and not call.task.cancelling()
             if call is None or not shared:
-                call = self._start(request, order)
+                call = self._start(request, order, damaged=damaged)
             call.asking += 1
             try:
                 # Shielded: the call may be paid for already when its trial is cancelled.
@@ -325,13 +332,8 @@ class LlmClient:
             call.wait = None
 
     def _known(self, request: ChatRequest) -> ChatReply | None:
-        """Return the recorded reply; a damaged one is None, and in a replay raises CallFailed."""
-        try:
-            recorded = self.cache.get(request.key)
-        except RecordingError as exc:
-            if not self.sealed:
-                return None
-            raise CallFailed(f"{self.name}: call {request.key}: {exc}", request) from exc
+        """Return the recorded reply; raises RecordingError for a damaged one."""
+        recorded = self.cache.get(request.key)
         return self._read(recorded, len(recorded.attempts)) if recorded else None
 
     def _count(self, reply: ChatReply) -> None:
@@ -355,7 +357,7 @@ class LlmClient:
             attempts = (*attempts[:-1], last)
         return ChatReply(reading.text, last.outcome, recorded.request, attempts, earlier)
 
-    def _start(self, request: ChatRequest, order: int) -> Call:
+    def _start(self, request: ChatRequest, order: int, *, damaged: bool) -> Call:
         # An upper bound: no tokeniser makes more tokens than bytes.
         worst = Usage(
             input_tokens=len(request.body.encode()), output_tokens=self.entry.max_output_tokens
@@ -363,7 +365,7 @@ class LlmClient:
         tier = as_text(self.entry.parameters.get("service_tier"))
         dearest_usd = max(cost_usd(self.entry, worst, each) or 0.0 for each in (None, tier))
         asked = Asked(self.driver, str(request.slot), dearest_usd)
-        call = Call(request, order, asked, worst, self.entry.deadline_s)
+        call = Call(request, order, asked, worst, self.entry.deadline_s, damaged)
         call.task = asyncio.create_task(self._call(call))
         self.under_way[request.key] = call
 
@@ -419,7 +421,12 @@ class LlmClient:
     async def _resume(self, call: Call) -> None:
         """Give a call the attempts of earlier runs; what is damaged goes to quarantine."""
         key = call.request.key
-        for name in await self.cache.quarantine(key):
+        attempts: Attempts = ()
+        try:
+            attempts = self.cache.unanswered(key)
+        except RecordingError:
+            call.damaged = True
+        for name in await self.cache.quarantine(key) if call.damaged else ():
             self.meter.damaged.append(name)
             self.meter.notes.append(
                 f"{self.driver}: {call.asked.slot}: what is recorded is damaged; it is set aside "
@@ -427,7 +434,7 @@ class LlmClient:
             )
         # The attempt that has begun in a batch is the one that goes on.
         end = call.open.note.lines[key] if call.open else math.inf
-        call.attempts = [each for each in self.cache.unanswered(key) if each.number < end]
+        call.attempts = [each for each in attempts if each.number < end]
         call.earlier = len(call.attempts)
 
     async def _attempts(self, call: Call) -> ChatReply:

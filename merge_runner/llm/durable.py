@@ -15,6 +15,7 @@ import os
 import re
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -67,6 +68,20 @@ def alone(execute: Callable[[str], object], operation: Operation) -> object:
         result = exc
     execute("RELEASE operation")
     return result
+
+
+def each_or_alone(
+    run_now: Callable[[list[Operation]], list[Any]],
+    alone: Callable[[Operation], object],
+    operations: list[Operation],
+) -> list[Any]:
+    """Run operations in one transaction; where one fails all are run again, each alone in it."""
+    try:
+        return run_now(operations)
+    except CacheFailed:
+        raise
+    except (MergeRunnerError, *DAMAGED):
+        return run_now([partial(alone, each) for each in operations])
 
 
 class BatchWriter:

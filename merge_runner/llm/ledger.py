@@ -37,7 +37,7 @@ from typing import TYPE_CHECKING, Any
 
 from merge_runner.config import ModelEntry, Price
 from merge_runner.errors import CacheFailed, RecordingError, TrialSuspended, UsageError
-from merge_runner.llm.durable import BatchWriter, Operation, alone, connect, making
+from merge_runner.llm.durable import BatchWriter, Operation, alone, connect, each_or_alone, making
 from merge_runner.records import Attempt, Usage
 
 if TYPE_CHECKING:
@@ -196,35 +196,48 @@ class LedgerFile:
 
     def read(self, sql: str, *values: object) -> Rows:
         """Return the rows of a query; raises UsageError for a damaged file, and CacheFailed."""
-        with self._told(), self._one_query:
-            if not (self._connections or self._has_tables()):
-                return []
-            return self._connection("ro").execute(sql, values).fetchall()
+        try:
+            with self._one_query:
+                if not (self._connections or self._has_tables()):
+                    return []
+                return self._connection("ro").execute(sql, values).fetchall()
+        except sqlite3.Error as exc:
+            raise self._unusable(exc) from exc
 
     def spending(self, scope: str, ask: Callable[..., Rows]) -> Spending:
         """Return the sums of a sweep, by ``read`` or ``write``; raises UsageError for odd ones."""
-        with self._told():
-            (_, reserved_usd, attempts, _), *spent = ask(_SUMS, scope) or [(None, 0.0, 0, 0)]
-            spent_usd, overrun_usd = (sum((r[column] for r in spent), 0.0) for column in (1, 2))
-            if not (spent_usd >= 0 and reserved_usd >= 0):
-                raise sqlite3.IntegrityError("no sweep can have spent that")
-        overruns = {driver: most for driver, _, _, most in spent if most > 0}
+        (_, reserved_usd, attempts, _), *spent = ask(_SUMS, scope) or [(None, 0.0, 0, 0)]
+        spent_usd = overrun_usd = 0.0
+        overruns = {}
+        for driver, usd, over_usd, most in spent:
+            spent_usd += usd
+            overrun_usd += over_usd
+            if most > 0:
+                overruns[driver] = most
+        if not (spent_usd >= 0 and reserved_usd >= 0):
+            raise self._unusable(sqlite3.IntegrityError("no sweep can have spent that"))
         return Spending(spent_usd, reserved_usd, attempts, overrun_usd, overruns)
 
     def write(self, sql: str, *values: object) -> Rows:
         """Execute a statement, and return its rows; an operation."""
-        with self._told(), self._one_writer:
-            return self._connection("rwc").execute(sql, values).fetchall()
+        try:
+            with self._one_writer:
+                return self._connection("rwc").execute(sql, values).fetchall()
+        except sqlite3.Error as exc:
+            raise self._unusable(exc) from exc
 
     def run_now(self, operations: list[Operation]) -> list[Any]:
         """Run operations in one durable transaction, in this thread; raises UsageError."""
-        with self._told(), self._one_writer, self._connection("rwc") as connection:
-            connection.execute("BEGIN IMMEDIATE")
-            return [operation() for operation in operations]
+        try:
+            with self._one_writer, self._connection("rwc") as connection:
+                connection.execute("BEGIN IMMEDIATE")
+                return [operation() for operation in operations]
+        except sqlite3.Error as exc:
+            raise self._unusable(exc) from exc
 
     def _run_each(self, operations: list[Operation]) -> list[Any]:
         """Run operations in one durable transaction, each with its result or its own error."""
-        return self.run_now([partial(alone, self.write, each) for each in operations])
+        return each_or_alone(self.run_now, partial(alone, self.write), operations)
 
     def begun(self, call: str, tried: int) -> Iterator[Attempt]:
         """Yield the attempts at a call, beyond those ``tried``, whose end nobody has seen."""
@@ -258,22 +271,19 @@ class LedgerFile:
             self._connections[mode] = connection  # not before: the event loop reads meanwhile
         return self._connections[mode]
 
-    @contextlib.contextmanager
-    def _told(self) -> Iterator[None]:
-        try:
-            yield
-        except sqlite3.Error as exc:
-            if isinstance(exc, sqlite3.OperationalError) and "no such" not in str(exc):
-                raise CacheFailed(
-                    f"{self._file} cannot be written: {exc}. When that is mended, run the same "
-                    "command again"
-                ) from exc
-            raise UsageError(
-                f"the record of what sweeps have spent ({self._file}) cannot be used, so that no "
-                f"cap could hold ({exc}): put a copy of it back, or take the replies with "
-                f"`merge-runner recording import {self._file.parent} --cache NEW`, and go on with "
-                "--cache NEW, which counts from 0"
-            ) from exc
+    def _unusable(self, why: sqlite3.Error) -> CacheFailed | UsageError:
+        """Return the error of a file that cannot be written, or is damaged."""
+        if isinstance(why, sqlite3.OperationalError) and "no such" not in str(why):
+            return CacheFailed(
+                f"{self._file} cannot be written: {why}. When that is mended, run the same "
+                "command again"
+            )
+        return UsageError(
+            f"the record of what sweeps have spent ({self._file}) cannot be used, so that no "
+            f"cap could hold ({why}): put a copy of it back, or take the replies with "
+            f"`merge-runner recording import {self._file.parent} --cache NEW`, and go on with "
+            "--cache NEW, which counts from 0"
+        )
 
 
 def scopes(cache: ResponseCache) -> list[str]:
