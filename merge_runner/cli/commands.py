@@ -451,11 +451,11 @@ def ledger(
     from merge_runner.run.progress import as_table
 
     with closing(ResponseCache(cache, read_only=True)) as opened:
-        names = scopes(opened)
+        names = scopes(opened.money)
         if release is not None:
             if release not in names:
                 raise unknown_name("sweep", release, names, f"with a ledger in {cache}")
-            chosen = Ledger(opened, release)
+            chosen = Ledger(opened.money, release)
             spending = chosen.read()
             agree(
                 f"{spending.reserved_usd:.4f} USD are set aside for {spending.open_attempts} "
@@ -472,7 +472,7 @@ def ledger(
                 )
             chosen.release()
             names = [release]
-        ledgers = [Ledger(opened, name) for name in names]
+        ledgers = [Ledger(opened.money, name) for name in names]
         rows = [
             {"sweep": each.scope, **asdict(each.read()), "reasons": each.reasons()}
             for each in ledgers

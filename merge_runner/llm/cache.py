@@ -261,6 +261,11 @@ class ResponseCache:
         tried = self._tried(key)
         return (*tried, *self.money.begun(key, len(tried)))
 
+    def all_attempts(self, key: str) -> Attempts:
+        """Return the attempts at a call: those of its entry, or of one without an answer."""
+        entry = self.get(key)
+        return entry.attempts if entry else self.unanswered(key)
+
     async def put_unanswered(self, key: str, attempts: Attempts) -> None:
         """Keep the attempts at a call that has no answer yet, durably."""
         await self.write(partial(self._keep_tried, key, attempts))

@@ -214,7 +214,8 @@ class LlmClient:
         self.driver = driver_name(self.name, self.endpoint)
         self._wire = FORMATS[self.entry.format]
         self._own_names = frozenset({None, self.entry.id, *self.entry.aliases})
-        self.money = self.budget or Budget(Ledger(self.cache, ""))  # a ledger that keeps nothing
+        # Without a name a ledger keeps nothing.
+        self.money = self.budget or Budget(Ledger(self.cache.money, ""))
 
     @property
     def sealed(self) -> bool:
@@ -575,7 +576,8 @@ class LlmClient:
         if error is None:
             attempts = tuple(call.attempts)
             answered = CachedCall(call.request, attempts)
-            kept = await paid.keep(answered)
+            kept = await self.cache.put(answered)
+            await paid.settle(record)
             self._answered.add(call.request.key)
             if kept is not answered:  # an import was first
                 return self._read(kept, call.earlier)
@@ -583,7 +585,9 @@ class LlmClient:
             return ChatReply(text, record.outcome, call.request, attempts, call.earlier)
         if outcome.pause:
             self.limiter.pause(outcome.delay_s or backoff_s(len(call.own_attempts)))
-        await paid.settle(call.attempts)  # before the error, which may end the whole run
+        # Before the error, which may end the whole run.
+        await self.cache.put_unanswered(call.request.key, tuple(call.attempts))
+        await paid.settle(record)
         raise error
 
     def _error(self, call: Call, outcome: AttemptOutcome) -> MergeRunnerError | None:

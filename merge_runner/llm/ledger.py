@@ -33,15 +33,12 @@ from functools import partial
 from operator import itemgetter
 from pathlib import Path
 from threading import Lock, RLock
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from merge_runner.config import ModelEntry, Price
 from merge_runner.errors import CacheFailed, RecordingError, TrialSuspended, UsageError
 from merge_runner.llm.durable import BatchWriter, Operation, alone, connect, each_or_alone, making
 from merge_runner.records import Attempt, Usage
-
-if TYPE_CHECKING:
-    from merge_runner.llm.cache import CachedCall, ResponseCache
 
 FILE = "ledger.db"
 TOLERANCE_USD = 1e-9  # sums of floats
@@ -286,9 +283,9 @@ class LedgerFile:
         )
 
 
-def scopes(cache: ResponseCache) -> list[str]:
-    """Return the names of all ledgers in a cache."""
-    rows = cache.money.read("SELECT scope FROM spent UNION SELECT scope FROM open ORDER BY 1")
+def scopes(money: LedgerFile) -> list[str]:
+    """Return the names of all ledgers in a file."""
+    rows = money.read("SELECT scope FROM spent UNION SELECT scope FROM open ORDER BY 1")
     return [scope for (scope,) in rows]
 
 
@@ -299,12 +296,11 @@ class Ledger:
     nothing has no name, and keeps no record. What ``others`` hold counts under the same cap.
     """
 
-    def __init__(self, cache: ResponseCache, scope: str, others: Sequence[str] = ()) -> None:
+    def __init__(self, money: LedgerFile, scope: str, others: Sequence[str] = ()) -> None:
         self.spending = Spending()
         self.scope = scope
         self._others, self._elsewhere_usd = json.dumps(others), 0.0
-        self.cache = cache
-        self._money = cache.money
+        self._money = money
         # A damaged record is an error only where money is to be spent: a replay needs none.
         with contextlib.suppress(UsageError, CacheFailed):
             self.read()
@@ -381,15 +377,21 @@ class Ledger:
         self._money.write(_PAY, scope, driver, usd, *over)
         return driver, usd, over[0]
 
-    def settle_kept(self, drivers: Collection[str]) -> None:
-        """Settle what was kept right before a run of these drivers was killed; none goes on."""
+    def settle_kept(
+        self, drivers: Collection[str], kept: Callable[[str], Iterable[Attempt]]
+    ) -> None:
+        """Settle what was ``kept`` right before a run of these drivers was killed; none goes on."""
         rows = self._money.read(_IN_FLIGHT, self.scope)
         for key, number, driver in (row for row in rows if row[2] in drivers):
             with contextlib.suppress(RecordingError):
-                entry = self.cache.get(key)
-                for attempt in entry.attempts if entry else self.cache.unanswered(key):
+                for attempt in kept(key):
                     if attempt.number == number and attempt.outcome != "unknown":
                         self._money.run_now([partial(self._settled, key, attempt, driver)])
+
+    def reserved_usd(self, key: str) -> float:
+        """Return the USD reserved for the last attempt at a call; 0: a user has released them."""
+        rows = self._money.read("SELECT usd FROM open WHERE call = ? ORDER BY attempt", key)
+        return float(rows[-1][0]) if rows else 0.0
 
     def rows(self) -> tuple[Rows, Rows]:
         """Return the rows of what is spent and of what is open, for ``settle_share``."""
@@ -421,7 +423,7 @@ class PaidAttempt:
 
     ``aside_usd`` is reserved in this process while it is ``queued``, and from ``begin`` on in the
     ledger. An attempt that ends before ``begin`` (cancelled while waiting, refused by the cap)
-    gives all of it back to its trial. After ``settle`` or ``keep`` it gives back what was not
+    gives all of it back to its trial. After ``settle`` it gives back what was not
     spent, where the cost is known. Otherwise it may have been charged: all of it stays in the
     ledger until a user releases it.
     """
@@ -457,18 +459,8 @@ class PaidAttempt:
         self.queued = False
         self.budget.queued_usd -= self.aside_usd
 
-    async def settle(self, attempts: Sequence[Attempt]) -> None:
-        """Settle the attempt, the last of these, which brought no answer."""
-        await self.budget.ledger.cache.put_unanswered(self.key, tuple(attempts))
-        await self._pay(attempts[-1])
-
-    async def keep(self, entry: CachedCall) -> CachedCall:
-        """Keep the answer that the attempt brought, then settle what it cost."""
-        kept = await self.budget.ledger.cache.put(entry)
-        await self._pay(entry.attempts[-1])
-        return kept
-
-    async def _pay(self, attempt: Attempt) -> None:
+    async def settle(self, attempt: Attempt) -> None:
+        """Settle what the attempt cost, when it is kept."""
         await self.budget.ledger.settle(self.key, attempt, self.asked.driver)
         self.cost_usd = attempt.cost_usd
 
@@ -541,9 +533,7 @@ class Budget:
 
     def going_on(self, trial: int, key: str, asked: Asked) -> PaidAttempt:
         """Return the money of an attempt that an earlier run, perhaps another sweep, has begun."""
-        sql = "SELECT usd FROM open WHERE call = ? ORDER BY attempt"
-        reserved = self.ledger.cache.money.read(sql, key)
-        aside_usd = reserved[-1][0] if reserved else 0.0  # 0: a user has released it
+        aside_usd = self.ledger.reserved_usd(key)
         return PaidAttempt(self, trial, key, asked, aside_usd, queued=False)
 
     def charge(self, trial: int, usd: float) -> None:

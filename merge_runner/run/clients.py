@@ -48,7 +48,7 @@ def live_clients(
     registered model go on from earlier clients, and get those that are made. Raises UsageError
     where a key is missing, or a cap could not be enforced.
     """
-    _check_money(plan, options, ledger)
+    _check_money(plan, options, ledger, cache)
     _allow_files(options.connections + SPARE_FILES)
     connect = _connections(plan, options, {**os.environ, **(urls or {})}, rounds)
     limiters = {} if limiters is None else limiters
@@ -119,7 +119,7 @@ def _connections(
     return connect
 
 
-def _check_money(plan: Plan, options: Options, ledger: Ledger) -> None:
+def _check_money(plan: Plan, options: Options, ledger: Ledger, cache: ResponseCache) -> None:
     """Settle what a killed run has kept.
 
     Raises UsageError where a price is unknown under a cap, or what is spent is damaged.
@@ -132,7 +132,8 @@ def _check_money(plan: Plan, options: Options, ledger: Ledger) -> None:
                 "experiments/models.toml"
             )
     if not plan.is_free:
-        ledger.settle_kept({driver_name(name, plan.endpoints[name]) for name in plan.entries})
+        drivers = {driver_name(name, plan.endpoints[name]) for name in plan.entries}
+        ledger.settle_kept(drivers, cache.all_attempts)
         ledger.read()
 
 

@@ -42,7 +42,7 @@ from merge_runner.errors import (
 )
 from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.client import Meter, Wait
-from merge_runner.llm.ledger import Asked, Ledger, Rows
+from merge_runner.llm.ledger import Asked, Ledger, LedgerFile, Rows
 from merge_runner.llm.limiter import Limiter
 from merge_runner.records import Attempt, TrialRecord, TrialSpec, Usage
 from merge_runner.registry import plugin_sources, using
@@ -265,8 +265,8 @@ class Desk:
 class ToldLedger(Ledger):
     """A worker's ledger, whose attempts the coordinator reserves before they begin."""
 
-    def __init__(self, cache: ResponseCache, scope: str, desk: Desk) -> None:
-        super().__init__(cache, scope)
+    def __init__(self, money: LedgerFile, scope: str, desk: Desk) -> None:
+        super().__init__(money, scope)
         self._desk = desk
         self._numbers: dict[str, int] = {}  # by key of a call, which has one attempt at a time
 
@@ -354,7 +354,7 @@ async def _play(task: Task, kept: dict[str, Any]) -> Played:
     async with AsyncExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="merge-runner-")))
         replies = stack.enter_context(closing(ResponseCache(folder)))
-        ledger = ToldLedger(replies, task.plan.ledger, kept.setdefault(task.name, Desk()))
+        ledger = ToldLedger(replies.money, task.plan.ledger, kept.setdefault(task.name, Desk()))
         replies.put_now(*task.recorded)
         ledger.settle_share("", [(driver, 0, 0, ratio) for driver, ratio in task.overruns], [])
         try:

@@ -104,7 +104,7 @@ def make(cache):
             cache=cache,
             transport=Server(*replies),
             limiter=limiter or Limiter(),
-            budget=None if entry.price == "free" else Budget(Ledger(cache, "test"), cap),
+            budget=None if entry.price == "free" else Budget(Ledger(cache.money, "test"), cap),
             passed=passed,
             known=known,
             under_way=under_way,

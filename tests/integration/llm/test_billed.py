@@ -110,7 +110,7 @@ async def asked(cache, till, faults, *, cap, name, calls=CALLS, passed=True):
             cache=cache,
             transport=transport,
             limiter=Limiter(),
-            budget=Budget(Ledger(cache, name), cap * worst, each(worst)),
+            budget=Budget(Ledger(cache.money, name), cap * worst, each(worst)),
             passed=passed,
         )
 

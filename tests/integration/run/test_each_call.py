@@ -15,8 +15,8 @@ from tests.support.harness import a_model, run_sweep
 
 # Of a call under a cap, and of one whose reply is recorded, by what is counted.
 BOUNDS = {
-    "changes of file": {"live": 150, "replayed": 57},
-    "functions": {"live": 390, "replayed": 224},
+    "changes of file": {"live": 125, "replayed": 57},
+    "functions": {"live": 330, "replayed": 224},
     "statements": {"live": 19, "replayed": 1},
     "on the event loop": {"live": 5, "replayed": 1},
     "commits": {"live": 2, "replayed": 0},

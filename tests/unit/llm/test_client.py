@@ -295,7 +295,7 @@ async def test_drain_gives_up_calls_that_wait_for_their_turn(make):
 @pytest.mark.parametrize("drains", [False, True])
 async def test_a_call_that_waits_for_its_coordinator_can_be_given_up(make, cache, drains, told):
     client, desk = make(answer(), price=PRICE), Desk()
-    client.money.ledger = ToldLedger(cache, "test", desk)
+    client.money.ledger = ToldLedger(cache.money, "test", desk)
     asked = await begun(client.ask("prompt", slot()))
     if told:
         assert (await desk.exchange({})).asking.keys() == {1}

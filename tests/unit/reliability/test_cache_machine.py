@@ -46,8 +46,8 @@ class Process:
 
     def __init__(self, folder, cap_usd):
         self.cache = ResponseCache(folder)
-        self.budget = Budget(Ledger(self.cache, "s"), cap_usd)
-        self.in_flight_calls = {}  # the paid attempt and the attempts before, by question
+        self.budget = Budget(Ledger(self.cache.money, "s"), cap_usd)
+        self.in_flight_calls = {}  # its cache, the paid attempt and those before, by question
 
 
 class CacheMachine(RuleBasedStateMachine):
@@ -95,7 +95,7 @@ class CacheMachine(RuleBasedStateMachine):
         earlier = list(process.cache.unanswered(key))
         if paid := self.paid_for(process, question, earlier):
             self.tried.pop(question, None)
-            process.in_flight_calls[question] = paid, earlier
+            process.in_flight_calls[question] = process.cache, paid, earlier
 
     def paid_for(self, process, question, earlier):
         """Set the worst case aside; None where there is no money, or none before others end."""
@@ -131,13 +131,14 @@ class CacheMachine(RuleBasedStateMachine):
     @precondition(in_flight)
     @rule(data=st.data(), cost=costs)
     def answer(self, data, cost):
-        question, paid, attempts = self.landed(data)
+        question, cache, paid, attempts = self.landed(data)
         self.made += 1
         self.charged_usd += cost
         reply = f'{{"text": "ä {self.made}"}}'
         attempts.append(Attempt(len(attempts) + 1, "ok", 200, reply=reply, cost_usd=float(cost)))
         entry = CachedCall(REQUESTS[question], tuple(attempts))
-        kept = self.wait(paid.keep(entry))
+        kept = self.wait(cache.put(entry))
+        self.wait(paid.settle(attempts[-1]))
         paid.close()
         assert kept == entry
         self.answered[question] = entry
@@ -147,11 +148,12 @@ class CacheMachine(RuleBasedStateMachine):
     @rule(data=st.data(), cost=costs, known=st.booleans())
     def fail(self, data, cost, known):
         """An attempt brings no answer, and what it cost is told or not."""
-        question, paid, attempts = self.landed(data)
+        question, cache, paid, attempts = self.landed(data)
         self.charged_usd += cost
         told = float(cost) if known else None
         attempts.append(Attempt(len(attempts) + 1, "server_error", 500, cost_usd=told))
-        self.wait(paid.settle(attempts))
+        self.wait(cache.put_unanswered(REQUESTS[question].key, tuple(attempts)))
+        self.wait(paid.settle(attempts[-1]))
         paid.close()
         self.tried[question] = tuple(attempts)
 
@@ -199,7 +201,7 @@ class CacheMachine(RuleBasedStateMachine):
     @invariant()
     def the_sum_never_passes_the_cap(self):
         for process in self.running.values():
-            counted_usd = Ledger(process.cache, "s").read().committed_usd
+            counted_usd = Ledger(process.cache.money, "s").read().committed_usd
             assert self.charged_usd <= counted_usd + 1e-6
             assert counted_usd <= self.cap_usd + 1e-6
 

@@ -134,7 +134,7 @@ class Run:
         self.cache, self.said, self.alone = cache, [], Alone()
         self.rounds = Rounds(cache, {"m"}, submits=submits, say=self.said.append)
         self.rounds.services["m"] = service
-        self.ledger = Ledger(cache, scope)
+        self.ledger = Ledger(cache.money, scope)
         entry = ModelEntry(
             provider="openai", format="openai-chat", id="m-1", max_output_tokens=100, price=price
         )
@@ -409,7 +409,7 @@ async def test_where_no_batch_can_be_created_the_next_run_looks_for_it_first(cac
     service.creations = []
     assert texts(await Run(cache, service).ask(3)) == ["batched 1", "batched 2", "batched 3"]
     assert service.sizes == [3]
-    assert Ledger(cache, "test").read().open_attempts == 0
+    assert Ledger(cache.money, "test").read().open_attempts == 0
 
 
 async def test_a_provider_that_is_down_while_a_batch_waits_is_waited_for(service, run):
