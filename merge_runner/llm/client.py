@@ -512,7 +512,9 @@ class LlmClient:
                 outcome, record = await self._send(call, paid)
                 return await self._concluded(call, paid, outcome, record)
             with self._waiting(call, f"for batches of {self.model}", idle=True, paid=True):
-                outcome, batch = await rounds.ask(call, paid, self.model)
+                outcome, batch = await rounds.ask(
+                    call.request, len(call.attempts) + 1, paid, self.model, call.open
+                )
             call.open, call.singly = None, True
             record, raw = self._record(call, outcome, batch.note.submitted_at), outcome.raw
             usd = record.cost_usd and record.cost_usd * self.batch_price
@@ -532,13 +534,12 @@ class LlmClient:
             settle = await self.limiter.acquire(estimate, order=call.order)
         with self._waiting(call, "for the coordinator, which shares --max-cost out"):
             await paid.ask()
-        await paid.begin(call.attempts)
+        number = len(call.attempts) + 1
+        await paid.begin(number)
         began, clock_s = datetime.now(UTC), asyncio.get_running_loop().time
         began_s, timeout_s = clock_s(), min(self.entry.timeout_s, call.left_s)
         try:
-            raw = await self.transport.send(
-                call.request, attempt=len(call.attempts) + 1, timeout_s=timeout_s
-            )
+            raw = await self.transport.send(call.request, attempt=number, timeout_s=timeout_s)
             outcome = judge(raw, self._wire)
         except TransportFailure as exc:
             outcome = AttemptOutcome(

@@ -449,11 +449,11 @@ class PaidAttempt:
         if self.queued and not await self.budget.ledger.ask(self.key, self.aside_usd, self.asked):
             raise TrialSuspended(USED_UP)
 
-    async def begin(self, attempts: Sequence[Attempt]) -> None:
+    async def begin(self, number: int) -> None:
         """Make the reservation durable, since the attempt is sent now; raises TrialSuspended."""
         if not self.queued:  # in a smaller batch than before, or in one of an earlier run
             return
-        ledger, cap_usd, number = self.budget.ledger, self.budget.cap_usd, len(attempts) + 1
+        ledger, cap_usd = self.budget.ledger, self.budget.cap_usd
         if not await ledger.begin(self.key, number, self.aside_usd, cap_usd, self.asked):
             raise TrialSuspended(USED_UP)
         self.queued = False

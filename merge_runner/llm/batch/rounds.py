@@ -23,7 +23,7 @@ from collections.abc import Awaitable, Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 from pydantic import AwareDatetime, BaseModel, ValidationError
 
@@ -40,9 +40,6 @@ from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.http_outcome import AttemptOutcome, backoff_s, judge
 from merge_runner.llm.ledger import USED_UP, PaidAttempt
 from merge_runner.records import ChatRequest
-
-if TYPE_CHECKING:
-    from merge_runner.llm.client import Call
 
 # The prefix of names in the cache.
 _BATCH = "batch "
@@ -98,9 +95,10 @@ class Batch:
 
 @dataclass(slots=True, eq=False)
 class Line:
-    """A call whose next attempt waits for a batch; ``batch`` will be the one that it goes to."""
+    """An attempt that waits for a batch; ``batch`` will be the one that it goes to."""
 
-    call: Call
+    request: ChatRequest
+    number: int
     paid: PaidAttempt
     model: str
     batch: asyncio.Future[Batch]
@@ -145,20 +143,22 @@ class Rounds:
         for mark in ended:
             del self.batches[mark]
 
-    async def ask(self, call: Call, paid: PaidAttempt, model: str) -> tuple[AttemptOutcome, Batch]:
-        """Return what became of a call's next attempt, in the next round or where it waits."""
-        batch = call.open or await self._next_round(call, paid, model)
+    async def ask(
+        self, request: ChatRequest, number: int, paid: PaidAttempt, model: str, batch: Batch | None
+    ) -> tuple[AttemptOutcome, Batch]:
+        """Return what became of an attempt, in the ``batch`` where it waits or the next round."""
+        batch = batch or await self._next_round(request, number, paid, model)
         while True:
             await asyncio.shield(batch.work or self._start(batch))
-            if call.request.key not in batch.note.lines:
+            if request.key not in batch.note.lines:
                 raise TrialSuspended(USED_UP)
-            end = batch.ends.pop(call.request.key, batch.rest)
+            end = batch.ends.pop(request.key, batch.rest)
             if end is None and not self.submits:
                 end = _no_answer("not_created", "the run ended before", charged=False)
             if end is not None:
-                self.waiting.pop(call.request.key, None)
+                self.waiting.pop(request.key, None)
                 return end, batch
-            batch = await self._next_round(call, paid, model)
+            batch = await self._next_round(request, number, paid, model)
 
     async def watch(self, is_idle: Callable[[], bool]) -> None:
         """Close each round when nothing else goes on; ``is_idle`` says whether that is so."""
@@ -203,8 +203,10 @@ class Rounds:
             return outcome != "unknown" or self._cache.get(key) is not None
         return False
 
-    async def _next_round(self, call: Call, paid: PaidAttempt, model: str) -> Batch:
-        line = Line(call, paid, model, asyncio.get_running_loop().create_future())
+    async def _next_round(
+        self, request: ChatRequest, number: int, paid: PaidAttempt, model: str
+    ) -> Batch:
+        line = Line(request, number, paid, model, asyncio.get_running_loop().create_future())
         self._forming.append(line)
         return await line.batch
 
@@ -226,7 +228,7 @@ class Rounds:
                     model=model,
                     number=next(self._numbers),
                     submitted_at=datetime.now(UTC),
-                    lines={each.call.request.key: len(each.call.attempts) + 1 for each in part},
+                    lines={each.request.key: each.number for each in part},
                 )
                 batch = self.batches[note.mark] = Batch(note)
                 self._start(batch, part)
@@ -263,8 +265,8 @@ class Rounds:
 
         async def begin(line: Line) -> None:
             with contextlib.suppress(TrialSuspended):
-                await line.paid.begin(line.call.attempts)
-                begun.append(line.call.request)
+                await line.paid.begin(line.number)
+                begun.append(line.request)
 
         await asyncio.gather(*map(begin, lines))
         await self._note(batch, lines={each.key: batch.note.lines[each.key] for each in begun})

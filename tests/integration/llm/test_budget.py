@@ -56,7 +56,7 @@ async def attempt(budget, trial, worst, actual, turns=0, model="m"):
     await budget.admit(trial)
     paid = await budget.set_aside(trial, f"key {model}", asked(worst))
     with contextlib.closing(paid):
-        await paid.begin([])
+        await paid.begin(1)
         for _ in range(turns):
             await asyncio.sleep(0)
         await paid.settle(tried(actual))
@@ -159,7 +159,7 @@ async def test_money_goes_to_trials_in_their_order_and_never_beyond_the_cap(cach
 async def test_an_attempt_that_a_dead_process_began_counts_too(ledger, cache):
     dead = Budget(ledger, 1.0)
     paid = await set_aside(dead, 1, 0.75)
-    await paid.begin([])
+    await paid.begin(1)
     assert [a.outcome for a in cache.unanswered("key 1")] == ["unknown"]
     with pytest.raises(TrialSuspended):
         await set_aside(Budget(ledger, 1.0), 1, 0.5)
@@ -169,9 +169,9 @@ async def test_the_ledger_refuses_what_two_processes_reserved_at_once(ledger, ca
     both = [Budget(Ledger(cache.money, "shared"), 1.0) for _ in range(2)]
     # Neither knows of the other's yet.
     paid = [await set_aside(budget, trial, 0.75) for trial, budget in enumerate(both)]
-    await paid[0].begin([])
+    await paid[0].begin(1)
     with pytest.raises(TrialSuspended, match="others under the same cap"):
-        await paid[1].begin([])
+        await paid[1].begin(1)
     assert both[1].ledger.read().committed_usd == 0.75
 
 
@@ -312,7 +312,7 @@ def test_a_ledger_that_cannot_be_written_is_no_damaged_one(tmp_path):
 async def test_after_a_reply_that_cost_more_than_its_worst_case_as_much_is_set_aside(ledger, cache):
     budget = Budget(ledger, 10.0)
     with contextlib.closing(await budget.set_aside(1, "key", O3)) as paid:
-        await paid.begin([])
+        await paid.begin(1)
         await paid.settle(tried(0.75))
     assert (ledger.spending.spent_usd, ledger.spending.overrun_usd) == (0.75, 0.5)
     assert ledger.spending.dearest == "o3 at gateway up to 3.00 times as much"
@@ -320,7 +320,7 @@ async def test_after_a_reply_that_cost_more_than_its_worst_case_as_much_is_set_a
     assert (await set_aside(next_run, 2, 0.25, "another driver")).aside_usd == 0.25
     with contextlib.closing(await next_run.set_aside(1, "other", O3)) as paid:
         assert paid.aside_usd == 0.75
-        await paid.begin([])
+        await paid.begin(1)
         # A reply within what is now set aside does not count as another overrun of it.
         await paid.settle(tried(0.5))
     assert ledger.spending.overruns[O3.driver] == 3
@@ -362,7 +362,7 @@ async def test_however_an_attempt_ends_its_money_ends_in_the_right_place(
     async def ended():
         with contextlib.closing(await budget.set_aside(1, "key", asked(0.5))) as paid:
             if begun:
-                await paid.begin([])
+                await paid.begin(1)
             if tried:
                 await paid.settle(tried)
             raise error("whatever")

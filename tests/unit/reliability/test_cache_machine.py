@@ -109,7 +109,7 @@ class CacheMachine(RuleBasedStateMachine):
                 waiting.cancel()
             paid = await waiting
             try:
-                await paid.begin(earlier)
+                await paid.begin(len(earlier) + 1)
             except TrialSuspended:
                 paid.close()
                 raise
