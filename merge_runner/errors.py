@@ -3,11 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from merge_runner.records import Attempt, ChatRequest
-
 
 MOST_NAMES = 40
 
@@ -37,29 +32,6 @@ def unknown_name(kind: str, name: str, names: Iterable[str], hint: str = "") -> 
         + (f" ({hint})" if hint else "")
         + (f". Did you mean {' or '.join(near)}?" if near else "")
     )
-
-
-class CallFailed(MergeRunnerError):
-    """A call ended without an answer.
-
-    ``attempts`` holds what was tried, the first ``earlier`` times by earlier runs.
-    """
-
-    def __init__(
-        self,
-        message: str,
-        request: ChatRequest,
-        attempts: tuple[Attempt, ...] = (),
-        earlier: int = 0,
-    ) -> None:
-        super().__init__(message)
-        self.request, self.attempts, self.earlier = request, attempts, earlier
-
-
-class ReplayMiss(CallFailed):
-    """A sealed replay needs a reply that is not recorded."""
-
-    exit_code = 4
 
 
 class SweepStopped(MergeRunnerError):

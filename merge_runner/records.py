@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, JsonValue
 
+from merge_runner.errors import MergeRunnerError
 from merge_runner.registry import NAME
 
 if TYPE_CHECKING:
@@ -172,6 +173,29 @@ class ChatRequest:
     headers: dict[str, str]
     body: str
     slot: Slot
+
+
+class CallFailed(MergeRunnerError):
+    """A call ended without an answer.
+
+    ``attempts`` holds what was tried, the first ``earlier`` times by earlier runs.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        request: ChatRequest,
+        attempts: tuple[Attempt, ...] = (),
+        earlier: int = 0,
+    ) -> None:
+        super().__init__(message)
+        self.request, self.attempts, self.earlier = request, attempts, earlier
+
+
+class ReplayMiss(CallFailed):
+    """A sealed replay needs a reply that is not recorded."""
+
+    exit_code = 4
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,14 +16,16 @@ from statistics import NormalDist
 from merge_runner.chance import draw
 from merge_runner.config import PERFECT, Perception, ScenarioConfig
 from merge_runner.drivers.base import Driver
-from merge_runner.errors import CallFailed, ReplayMiss, UsageError
+from merge_runner.errors import UsageError
 from merge_runner.records import (
     FAR_BEHIND_M,
     SIDES,
+    CallFailed,
     Decision,
     DecisionRow,
     FailedCall,
     Observation,
+    ReplayMiss,
     Side,
     TrialRecord,
     TrialSpec,

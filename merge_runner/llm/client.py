@@ -17,13 +17,11 @@ from typing import TYPE_CHECKING
 
 from merge_runner.config import ModelEntry, driver_name
 from merge_runner.errors import (
-    CallFailed,
     EndpointRefused,
     MergeRunnerError,
     ProviderDown,
     QuotaExhausted,
     RecordingError,
-    ReplayMiss,
     SweepStopped,
 )
 from merge_runner.llm.cache import Attempts, CachedCall, ResponseCache
@@ -56,8 +54,10 @@ from merge_runner.records import (
     ANSWERS,
     SCRIPTED_HEADER,
     Attempt,
+    CallFailed,
     ChatReply,
     ChatRequest,
+    ReplayMiss,
     Slot,
     Usage,
     is_scripted,

@@ -25,12 +25,11 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, NonNegativeInt
 
 from merge_runner.audit.checks import Audit
 from merge_runner.drivers.registry import EMULATOR
-from merge_runner.errors import ReplayMiss
 from merge_runner.llm.client import Meter
 from merge_runner.llm.ledger import Ledger
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, command_at
 from merge_runner.prompts.blocks import decomposed
-from merge_runner.records import Status
+from merge_runner.records import ReplayMiss, Status
 from merge_runner.results.export import write_table
 from merge_runner.run.estimate import Estimate
 from merge_runner.run.plan import Options, Plan

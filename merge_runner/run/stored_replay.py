@@ -20,7 +20,7 @@ from typing import Any, cast
 import duckdb
 
 from merge_runner.audit.checks import Audit, Finding, audited_database, check_rest, check_sweep
-from merge_runner.errors import CallFailed, MergeRunnerError, RecordingError
+from merge_runner.errors import MergeRunnerError, RecordingError
 from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.formats import WireFormat
 from merge_runner.llm.http_outcome import RawReply, judge
@@ -29,6 +29,7 @@ from merge_runner.records import (
     DAMAGED,
     SIDES,
     Attempt,
+    CallFailed,
     Slot,
     TrialRecord,
     TrialSpec,

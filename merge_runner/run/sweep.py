@@ -32,7 +32,6 @@ from merge_runner.errors import (
     MergeRunnerError,
     NoValidDecision,
     ProviderDown,
-    ReplayMiss,
     StoreError,
     TrialSuspended,
     UsageError,
@@ -43,7 +42,7 @@ from merge_runner.llm.client import LONG_WAIT_S
 from merge_runner.llm.http_outcome import REGISTRY, TransportFailure, if_nobody, set_base_url
 from merge_runner.llm.ledger import Ledger, scopes
 from merge_runner.paths import DEFAULT_DB, SHIPPED_RECORDINGS, command_at
-from merge_runner.records import TrialRecord, TrialSpec, canonical_json
+from merge_runner.records import ReplayMiss, TrialRecord, TrialSpec, canonical_json
 from merge_runner.registry import using
 from merge_runner.results.database import in_thread, unreadable_is_usage
 from merge_runner.results.provenance import git_state, versions

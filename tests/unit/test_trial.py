@@ -10,8 +10,8 @@ from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Seat, take_seat
 from merge_runner.drivers.pace import model_pace, program_pace
 from merge_runner.drivers.registry import PROGRAMS
-from merge_runner.errors import CallFailed, SweepStopped, TrialSuspended, UsageError
-from merge_runner.records import SIDES, Attempt, ChatRequest, Decision, Slot
+from merge_runner.errors import SweepStopped, TrialSuspended, UsageError
+from merge_runner.records import SIDES, Attempt, CallFailed, ChatRequest, Decision, Slot
 from merge_runner.results.database import SCHEMA
 from merge_runner.trial import play_trial
 from tests.support import driven_trials

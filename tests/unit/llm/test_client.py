@@ -7,20 +7,13 @@ from collections import Counter
 import diskcache
 import pytest
 
-from merge_runner.errors import (
-    CallFailed,
-    EndpointRefused,
-    QuotaExhausted,
-    ReplayMiss,
-    TrialSuspended,
-    UsageError,
-)
+from merge_runner.errors import EndpointRefused, QuotaExhausted, TrialSuspended, UsageError
 from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.client import Meter
 from merge_runner.llm.http_outcome import TransportFailure
 from merge_runner.llm.ledger import Asked
 from merge_runner.llm.limiter import Limiter, Pause
-from merge_runner.records import Attempt, Usage
+from merge_runner.records import Attempt, CallFailed, ReplayMiss, Usage
 from merge_runner.run.cluster import Desk, ToldLedger
 from tests.support.clients import PRICE, answer, begun, error, raw, slot, ticks
 from tests.support.virtual_time import now_s

@@ -5,9 +5,10 @@ from functools import partial
 
 import pytest
 
-from merge_runner.errors import CallFailed, EndpointRefused, ProviderDown
+from merge_runner.errors import EndpointRefused, ProviderDown
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.http_outcome import TransportFailure
+from merge_runner.records import CallFailed
 from tests.support.cases import cases
 from tests.support.clients import PRICE, answer, begun, error, raw, slot, ticks
 from tests.support.virtual_time import now_s

@@ -5,9 +5,9 @@ from itertools import pairwise
 
 import pytest
 
-from merge_runner.errors import CallFailed
 from merge_runner.llm.http_outcome import backoff_s
 from merge_runner.llm.limiter import Limiter
+from merge_runner.records import CallFailed
 from tests.support.clients import answer, error, slot
 from tests.support.virtual_time import now_s
 

@@ -6,12 +6,12 @@ import pytest
 from llmock.scenarios import Delay, Fail, Match, Reply
 
 from merge_runner.config import Endpoint, ModelEntry
-from merge_runner.errors import CallFailed, EndpointRefused
+from merge_runner.errors import EndpointRefused
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.limiter import Limiter
-from merge_runner.records import Slot
+from merge_runner.records import CallFailed, Slot
 from tests.weekly.foreign.conftest import PROVIDERS
 
 PASSING = (408, 409, 429, 500, 502, 503, 504, 529)
