@@ -15,8 +15,8 @@ from tests.support.harness import a_model, run_sweep
 
 # Of a call under a cap, and of one whose reply is recorded, by what is counted.
 BOUNDS = {
-    "changes of file": {"live": 125, "replayed": 57},
-    "functions": {"live": 330, "replayed": 224},
+    "changes of file": {"live": 154, "replayed": 57},
+    "functions": {"live": 420, "replayed": 224},
     "statements": {"live": 19, "replayed": 1},
     "on the event loop": {"live": 5, "replayed": 1},
     "commits": {"live": 2, "replayed": 0},
@@ -40,10 +40,14 @@ class Counts:
     """What is done while a trial is played and stored, ``of`` each kind."""
 
     def __init__(self) -> None:
-        self.of: dict[str, Counter[str]] = {name: Counter() for name in BOUNDS}
-        self.calls = 0
+        self.begin()
         self.under_way = False
+
+    def begin(self) -> None:
+        """Count from 0."""
+        self.of: dict[str, Counter[str]] = {name: Counter() for name in BOUNDS}
         self._file: dict[int, str] = {}  # by thread, in which it is
+        self.under_way = True
 
     def profile(self, frame, event, _) -> None:
         """Count a function that begins or goes on, and each change to another file, or back."""
@@ -70,54 +74,51 @@ class Counts:
 
 @pytest.fixture
 def counted(monkeypatch, tmp_path):
-    """Plays one trial of so many seconds, and returns its counts."""
+    """Plays one trial of so many seconds, and returns the number of its calls and its counts."""
     monkeypatch.delenv("EMULATOR_BASE_URL", raising=False)
     (tmp_path / "models.toml").write_text(a_model("priced", price=PRICE))
-    connect, play = sqlite3.connect, LocalRunner.play
+    connect, play, counts = sqlite3.connect, LocalRunner.play, Counts()
 
-    async def run(seconds: int, *, replay: bool) -> Counts:
-        counts = Counts()
+    def connected(*args, **kwargs):
+        connection = connect(*args, **kwargs)
+        connection.set_trace_callback(counts.statement)
+        return connection
 
-        def connected(*args, **kwargs):
-            connection = connect(*args, **kwargs)
-            connection.set_trace_callback(counts.statement)
-            return connection
+    async def playing(*args, **kwargs):
+        counts.begin()
+        return await play(*args, **kwargs)
 
-        async def playing(*args, **kwargs):
-            counts.under_way = True
-            return await play(*args, **kwargs)
-
-        monkeypatch.setattr(sqlite3, "connect", connected)
-        monkeypatch.setattr(LocalRunner, "play", playing)
+    async def run(seconds: int, *, replay: bool) -> tuple[int, dict[str, Counter[str]]]:
         study = tmp_path / f"{seconds}.toml"
         study.write_text(f"repetitions = {{ baseline = 1 }}\nscenario.timeout_s = {seconds}\n")
         plan = make_plan(str(study), "priced", conditions=["L_4_0"], trust=True)
         db, cache = tmp_path / f"{seconds}-{replay}.duckdb", tmp_path / f"{seconds}"
         options = Options(db, cache, max_cost_usd=100.0, quiet=True, replay=replay)
-        threading.setprofile(counts.profile)
-        sys.setprofile(counts.profile)
-        try:
-            summary = await run_sweep(plan, options, say=lambda _: None)
-        finally:
-            sys.setprofile(None)
-            threading.setprofile(None)
-        counts.calls = summary["calls"]["cached" if replay else "live"]
-        return counts
+        summary = await run_sweep(plan, options, say=lambda _: None)
+        counts.under_way = False
+        return summary["calls"]["cached" if replay else "live"], counts.of
 
-    return run
+    monkeypatch.setattr(sqlite3, "connect", connected)
+    monkeypatch.setattr(LocalRunner, "play", playing)
+    # Threads outlive a run.
+    threading.setprofile(counts.profile)
+    sys.setprofile(counts.profile)
+    yield run
+    sys.setprofile(None)
+    threading.setprofile(None)
 
 
 async def test_a_further_call_takes_no_more_than_it_did(counted):
     for way in ("live", "replayed"):
         # The first one loads what is loaded once.
         plays = [await counted(s, replay=way == "replayed") for s in (FEW_S - 1, FEW_S, MANY_S)]
-        few, many = plays[1:]
-        calls = many.calls - few.calls
+        (few_calls, few), (many_calls, many) = plays[1:]
+        calls = many_calls - few_calls
         assert calls == 2 * (MANY_S - FEW_S)
         found, told = {}, []
         for name in BOUNDS:
-            more = Counter(many.of[name])
-            more.subtract(few.of[name])
+            more = Counter(many[name])
+            more.subtract(few[name])
             found[name] = more.total() / calls
             told += [f"{way}, {name}: {found[name]:.1f}, to become {GOALS[name][way]}"]
             told += [f"{n / calls:8.1f} {each}" for each, n in more.most_common() if n]
