@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain, combinations, product
 
-import numpy as np
 import pandas as pd
 
 from merge_runner.registry import require
@@ -29,7 +28,7 @@ from merge_runner_analysis.stats.contrasts import (
     shared_cells,
 )
 from merge_runner_analysis.stats.estimate import Estimate
-from merge_runner_analysis.stats.intervals import difference, wilson
+from merge_runner_analysis.stats.intervals import difference
 from merge_runner_analysis.stats.measures import estimate, linear, undecided
 from merge_runner_analysis.study import Study, in_one_study
 from merge_runner_analysis.wording import TIMES
@@ -82,9 +81,8 @@ class Level:
 class Effect:
     """A level against the reference of its factor, in one measure, in the unit of that.
 
-    ``at_level`` and ``at_reference`` are the estimates of all their trials, ``means`` those of both
-    in the shared cells, with the weights of the ``difference``, which is the first less the second
-    within the shared cells with its interval, p and detectable; its value is None where nothing is
+    ``at_level`` and ``at_reference`` are the estimates of all their trials, the ``difference`` is
+    within the shared cells, with its interval, p and detectable; its value is None where nothing is
     compared. ``n`` and ``n_reference`` are the trials that it rests on, without ``left_out``.
     Of an interaction ``across`` are the same two levels at the reference of the other factor.
     ``p_corrected`` is by Holm's method, in the family that ``primary`` tells.
@@ -96,7 +94,6 @@ class Effect:
     at_level: Estimate
     at_reference: Estimate
     difference: Estimate
-    means: tuple[float, float] | None
     n: int
     n_reference: int
     left_out: tuple[tuple[str, str], ...] = ()
@@ -205,9 +202,9 @@ def _of_levels(study: Study, levels: Sequence[Level]) -> Iterator[Effect]:
     """Each level but the first against that one, measure by measure."""
     reference, *others = levels
     for metric in measured(study):
-        first = level_estimate(study, reference, metric)
+        first = estimate(reference.pooled, metric)
         for level in others:
-            both = level_estimate(study, level, metric), first
+            both = estimate(level.pooled, metric), first
             yield _effect(study, metric, (level, reference), both)
 
 
@@ -260,29 +257,14 @@ def _effect(
     found = _difference(ordered, metric) or Estimate()
     # Where nothing varies it is not known what could have been seen.
     found = replace(found, detectable=found.detectable or None)
-    unit = 100 if metric.rate else 1
     return Effect(
         *(levels[0], levels[1], metric, *both),
-        difference=found.times(unit),
-        means=_means(frames, unit) if len(frames) == 2 and found.p is not None else None,
+        difference=found.times(100 if metric.rate else 1),
         n=frames[0].index.nunique() if frames else 0,
         n_reference=frames[1].index.nunique() if frames else 0,
         left_out=tuple(sorted(left_out)),
         across=(levels[2], levels[3]) if len(levels) > 2 else None,
     )
-
-
-def _means(frames: Sequence[pd.DataFrame], unit: float) -> tuple[float, float]:
-    """Both means over the cells, which weigh n m / (n + m) as in their difference."""
-    codes, cells = pd.factorize(pd.concat([frame["condition"] for frame in frames]))
-    parts = np.split(codes, [len(frames[0])])
-    n, m = (np.bincount(part, minlength=len(cells)) for part in parts)
-    weights = n * m / (n + m)
-    one, other = (
-        float(np.bincount(part, frame["value"].astype(float)) / size @ weights / weights.sum())
-        for part, frame, size in zip(parts, frames, (n, m), strict=True)
-    )
-    return unit * one, unit * other
 
 
 def _difference(frames: Sequence[pd.DataFrame], metric: Metric) -> Estimate | None:
@@ -404,24 +386,6 @@ def _image(study: Study, condition: str) -> str:
         return condition
     found = sorted(name for name, numbers in study.conditions.items() if numbers == mirrored)
     return found[0] if found else f"{condition} mirrored"
-
-
-def level_estimate(study: Study, level: Level, metric: Metric) -> Estimate:
-    """What a level comes to, over all of its trials.
-
-    Where one driver is given something, who goes first of two that are not is each of them in half
-    of the trials: the share of readings from both sides.
-    """
-    if metric is not LEFT_FIRST or not one_sided(study):
-        return estimate(level.pooled, metric)
-    trials = level.pooled.trials
-    known = trials[trials[metric.column].notna()]
-    if not (n := len(known)):
-        return Estimate()
-    same = known["focal"].isna() & _of_equals(known)
-    k = float(known.loc[~same, metric.column].sum()) + same.sum() / 2
-    low, high = wilson(k / n, n)
-    return Estimate(100 * k / n, 100 * low, 100 * high, n, k=round(k))
 
 
 @remembered

@@ -13,7 +13,6 @@ from merge_runner_analysis.metrics import COLLISIONS, GAP, RMSE, Metric
 from merge_runner_analysis.stats.effects import (
     Level,
     crossing,
-    level_estimate,
     levels_by_factor,
     primary,
 )
@@ -45,7 +44,7 @@ def levels(study: Study) -> Table:
             Optional("gap_m", GAP.heading, "number", GAP.meaning, rests_on=GAP.column),
             Optional("rmse_mps", RMSE.heading, "number", RMSE.meaning, rests_on=RMSE.column),
         ),
-        [_row(study, level, driver, metric) for driver, level in _every(study)],
+        [_row(level, driver, metric) for driver, level in _every(study)],
         (
             "all trials of a level, whether or not another level has the same cells: differences "
             "are in the table effects. A crossing leaves out the driver and the opponent",
@@ -99,16 +98,14 @@ def _names(study: Study, factors: tuple[str, ...]) -> list[list[str]]:
     return [[*known] for known in names.values()]
 
 
-def _row(study: Study, level: Level, driver: str, metric: Metric) -> Row:
-    group, found = level.pooled, level_estimate(study, level, metric)
+def _row(level: Level, driver: str, metric: Metric) -> Row:
+    group, found = level.pooled, estimate(level.pooled, metric)
     crashed, ended = counts(group, COLLISIONS)
-    k = counts(group, metric)[0] if metric.rate else None
     values: dict[str, Value] = {
         "factor": level.factor,
         "level": f"{level.name}{level.mark}",
         "driver": driver or None,
-        # Where trials are read from both sides, the share is not that of those that are counted.
-        "k": k if k == found.k else None,
+        "k": counts(group, metric)[0] if metric.rate else None,
         "n": found.n,
         "value": found.value,
         "ci": found.bounds(),
