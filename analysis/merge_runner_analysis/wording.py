@@ -12,7 +12,17 @@ from enum import Enum
 from typing import Any, NamedTuple
 
 from merge_runner.prompts.blocks import BASELINE
-from merge_runner_analysis.metrics import BOXES, DECIMALS, GAP, LEFT_FIRST
+from merge_runner_analysis.metrics import (
+    BOXES,
+    COLLISIONS,
+    COST,
+    DECIMALS,
+    GAP,
+    JOINT,
+    LEFT_FIRST,
+    RMSE,
+    VALID,
+)
 
 TABLE = "verdicts"
 # Kinds of drivers: language models are in the headline, scripts that pose as one are not.
@@ -21,6 +31,30 @@ HUMANS, LANGUAGE_MODEL, PROGRAM, MOCK = "humans", "language model", "program", "
 SHOWN, WEAKER, STRONGER, UNLIKE, OPEN = "shown", "weaker", "stronger", "unlike", "inconclusive"
 DIFFERS = frozenset({WEAKER, STRONGER, UNLIKE})
 ENOUGH = 20  # trials with an outcome; with fewer of them a headline says nothing of likeness
+ALPHA = 0.05  # that of all tests: to import it would take pandas, which no page needs
+# What metrics are called in sentences and pages; others keep the label of the table.
+METRIC_NAMES = {
+    LEFT_FIRST.name: "goes first",
+    COLLISIONS.name: "crashes",
+    GAP.name: "gap at the merge point",
+    RMSE.name: "departs from its speed",
+    BOXES.name: "crashes by people's rule",
+    JOINT.name: "both adapt their speed",
+    COST.name: "cost of a trial",
+}
+# What is said of a driver that has more or less than another, and what no difference is shown in.
+COMPARED = {
+    LEFT_FIRST.name: ("goes first more often", "goes first less often", "who goes first"),
+    GAP.name: ("leaves a larger gap", "leaves a smaller gap", "the gap"),
+    RMSE.name: ("departs more from its speed", "keeps closer to its speed", "speed"),
+    JOINT.name: (
+        "has both adapt their speed more often",
+        "has both adapt their speed less often",
+        "how often both adapt their speed",
+    ),
+    VALID.name: ("replies more reliably", "replies less reliably", "valid replies"),
+    COST.name: ("costs more", "costs less", "cost"),
+}
 # The collision rules that trials may be played by, as sentences name them.
 PLAYED_RULES = {
     "euclid2d": "the paper's rule",
@@ -334,6 +368,48 @@ def _percent(collisions: Values, count: int) -> float:
     return 100 * count / ended if ended else 0.0
 
 
+def apart(one: str, other: str, rows: Mapping[str, Values]) -> tuple[str, str]:
+    """The headline of one driver less another, and what else is shown, of rows by their metric.
+
+    ``A crashed in 12 of 110 trials, B in 33 of 110: 19.09 points fewer [8.55, 29.31]; p < 0.001``.
+    """
+    crashed = rows.get(COLLISIONS.name, {})
+    counts = [crashed.get(f"{name}{of}") for of in ("", "_reference") for name in ("k", "n")]
+    if any(count is None for count in counts):
+        return f"{one} against {other}.", _others(rows)
+    k, n, k_other, n_other = counts
+    claim = f"{one} crashed in {k} of {n} trials, {other} in {k_other} of {n_other}"
+    difference, p, ci = (crashed.get(name) for name in ("difference", "p_corrected", "ci"))
+    if min(n or 0, n_other or 0) < ENOUGH:
+        return f"{claim}: too few to say more.", ""
+    if difference is None or p is None:
+        return f"{claim}.", _others(rows)
+    if p >= ALPHA:
+        said = f"no difference is shown, {number(difference)} points {brackets(ci)}"
+        return f"{claim}: {said}; p {equal_p(p)}.", _others(rows)
+    # Of fewer, the ends change their signs and their places.
+    ends = ci and sorted(end if difference > 0 else -end for end in ci)
+    more = "more" if difference > 0 else "fewer"
+    said = f"{number(abs(difference))} points {more} {brackets(ends)}".rstrip()
+    return f"{claim}: {said}; p {equal_p(p)}.", _others(rows)
+
+
+def _others(rows: Mapping[str, Values]) -> str:
+    """Of all measures but crashes, in which a difference is shown and in which not."""
+    shown, unshown = [], []
+    for name, (more, less, what) in COMPARED.items():
+        values = rows.get(name, {})
+        if (p := values.get("p_corrected")) is None:
+            continue
+        if p < ALPHA:
+            shown.append(more if values["difference"] > 0 else less)
+        else:
+            unshown.append(what)
+    said = [f"The first one {joined(shown)}."] if shown else []
+    said += [f"No difference is shown in {joined(unshown)}."] if unshown else []
+    return " ".join(said)
+
+
 def share(collisions: Values) -> str:
     """A rate in percent, or ``13.64 to 68.18`` where trials are undecided."""
     k, undecided = collisions.get("k") or 0, collisions.get("undecided") or 0
@@ -501,6 +577,12 @@ def number(value: float | None, decimals: int = DECIMALS, unit: str = "") -> str
 def p_value(p: float | None) -> str:
     """A p of three decimals, or that it is smaller."""
     return "<0.001" if p is not None and p < 0.001 else number(p, 3)
+
+
+def equal_p(p: float) -> str:
+    """``= 0.012``, or that it is smaller."""
+    text = p_value(p)
+    return f"< {text[1:]}" if text.startswith("<") else f"= {text}"
 
 
 def verdict_word(values: Values) -> str:

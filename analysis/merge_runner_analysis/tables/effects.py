@@ -12,6 +12,7 @@ from merge_runner_analysis.stats.effects import (
     DRIVER,
     Effect,
     Level,
+    compared,
     copied_of_shared,
     effects,
     levels_by_factor,
@@ -46,6 +47,8 @@ UNTESTED = (
     "several studies or the same ones at two levels"
 )
 
+SIDES = ("", "_reference")  # of a comparison
+
 
 def effects_table(study: Study) -> Table:
     """A row per factor, level, and measure, and per interaction of two factors."""
@@ -74,6 +77,44 @@ def effects_table(study: Study) -> Table:
         [_row(study, one) for one in effects(study, by) if _is_shown(one)],
         tuple(_notes(study, by)),
     )
+
+
+def comparison(study: Study, one: str, other: str) -> Table:
+    """A driver with its prompt less another, by their groups' ids: a row per measure.
+
+    ``k`` of ``n`` trials and the value are of all of a driver's, the difference is within the
+    situations of both. Without rows where one of them is not judged.
+    """
+    known = {group.id: group for group in study.models}
+    found = compared(study, known[one], known[other]) if {one, other} <= {*known} else []
+    return Table(
+        "comparison",
+        (
+            Column("measure", "measure"),
+            *(Optional(f"{name}{of}", name, "count") for of in SIDES for name in ("k", "n")),
+            *(Optional(f"value{of}", f"value{of}", "number") for of in SIDES),
+            Optional("difference", "difference", "number", "the first less the second"),
+            interval("ci", "of the same test"),
+            Optional("p", "p", "p", TEST),
+            Optional("p_corrected", "p, corr.", "p", "corrected by Holm"),
+            Optional("detectable", "detectable", "number", "at p < .05 with power .8"),
+        ),
+        [_compared_row(study, effect) for effect in found if _is_shown(effect)],
+        (),
+    )
+
+
+def _compared_row(study: Study, one: Effect) -> Row:
+    values: dict[str, Value] = {
+        "measure": one.metric.heading,
+        **_difference(one),
+        "p_corrected": one.p_corrected,
+        "detectable": one.difference.detectable,
+    }
+    for of, own in zip(SIDES, (one.at_level, one.at_reference), strict=True):
+        k = own.k if one.metric.rate else None  # that of valid replies counts replies
+        values |= {f"k{of}": k, f"n{of}": own.n, f"value{of}": own.value}
+    return Row(one.id, one.groups, values, problem(study, one), one.metric.column, (), one.left_out)
 
 
 def _is_shown(one: Effect) -> bool:

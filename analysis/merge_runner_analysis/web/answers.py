@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 FOUND = 3  # findings of a run that its page shows
 Request = tuple[str, ...]
-"""``table NAME [SWEEP CONDITION]``, ``cell TABLE ROW COLUMN``, ``figure NAME FORM``,
-``audit``."""
+"""``table NAME [SWEEP CONDITION]``, ``comparison GROUP GROUP SWEEP CONDITION``,
+``cell TABLE ROW COLUMN``, ``figure NAME FORM``, ``audit``."""
 RUNS = """
 SELECT sweep_id, coalesce(exit_code = 0, false) FROM sweeps
 ORDER BY started_at DESC, sweep_id DESC
@@ -56,6 +56,8 @@ class Numbers:
         match request:
             case ["table", name, *part]:
                 found: dict[str, Any] = {"table": self._table(name, *part)}
+            case ["comparison", one, other, *part]:
+                found = {"table": self._comparison(one, other, *part)}
             case ["cell", table, row, column]:
                 found = self._cell(table, row, column)
             case ["figure", name, "svg" | "png" as form]:
@@ -91,15 +93,28 @@ class Numbers:
 
     def _table(self, name: str, sweep: str = "", condition: str = "") -> str:
         """Return a table of all trials, or of those of a sweep and a condition."""
-        selection = Selection(sweep=sweep, condition=condition)
+        part = Selection(sweep=sweep, condition=condition)
+        return self._kept(
+            name,
+            lambda: to_text(make_tables(self._part(part), [name])[0]),
+            part.key(self.db),
+        )
+
+    def _comparison(self, one: str, other: str, sweep: str = "", condition: str = "") -> str:
+        """Return how two drivers differ, each with its prompt, as ``_table`` does."""
+        part = Selection(sweep=sweep, condition=condition)
 
         def make() -> str:
-            from merge_runner_analysis.study import Study
+            from merge_runner_analysis.tables.effects import comparison
 
-            study = Study(self.db, selection) if sweep or condition else self.study
-            return to_text(make_tables(study, [name])[0])
+            return to_text(comparison(self._part(part), one, other))
 
-        return self._kept(name, make, selection.key(self.db))
+        return self._kept(f"comparison {one} {other}", make, part.key(self.db))
+
+    def _part(self, selection: Selection) -> Study:
+        from merge_runner_analysis.study import Study
+
+        return self.study if selection == Selection() else Study(self.db, selection)
 
     def _figure(self, name: str, form: Literal["svg", "png"]) -> bytes:
         """Return a figure as a file; one that a report has drawn is that of the report."""

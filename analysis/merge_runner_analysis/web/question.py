@@ -16,21 +16,21 @@ from merge_runner.study.crossing import MODEL
 from merge_runner_analysis.metrics import COLLISIONS, GAP, LEFT_FIRST, RMSE
 from merge_runner_analysis.tables.model import Row, Table
 from merge_runner_analysis.web.marks import Mark
-from merge_runner_analysis.wording import ENOUGH, TIMES, brackets, capital, joined, number, p_value
+from merge_runner_analysis.wording import (
+    ALPHA,
+    ENOUGH,
+    METRIC_NAMES,
+    TIMES,
+    brackets,
+    capital,
+    equal_p,
+    joined,
+    number,
+    p_value,
+)
 
-# What measures are called here; others keep the label of the table.
-NAMES = {
-    LEFT_FIRST.name: "goes first",
-    COLLISIONS.name: "crashes",
-    GAP.name: "gap at the merge point",
-    RMSE.name: "departs from its speed",
-    "collided_boxes_percent": "crashes by people's rule",
-    "joint_percent": "both adapt their speed",
-    "cost_usd": "cost of a trial",
-}
 # A change of the measure, as a claim names it.
 CHANGED = {LEFT_FIRST.name: "who goes first", RMSE.name: "how far it departs from its speed"}
-ALPHA = 0.05  # that of all tests: to import it would take pandas, which no page needs
 NO_BREAK = "\N{NO-BREAK SPACE}"
 MIDDLE = Mark("", None, None, zero=50.0)  # no difference, on the axis of differences
 # The shapes that tell drivers apart in a chart, and more of them are not drawn.
@@ -124,13 +124,13 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
     if not claim:
         return None
     primary = next(row for row in effects.rows if row.values.get("primary"))
-    metric = _metric(primary)
-    own = [row for row in effects.rows if _metric(row) == metric]
+    metric = metric_of(primary)
+    own = [row for row in effects.rows if metric_of(row) == metric]
     named = {LEFT_FIRST.name, COLLISIONS.name, GAP.name, RMSE.name}
     others = [
         row
         for row in effects.rows
-        if _metric(row) in named - {metric} and not _crossed(row) and _tested(row)
+        if metric_of(row) in named - {metric} and not _crossed(row) and _tested(row)
         and row.values["factor"] != MODEL
     ]  # fmt: skip
     # Of a driver that is not judged there is a row without values.
@@ -149,7 +149,7 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
     return Answer(
         unbroken(claim),
         unbroken(rest),
-        capital(_name(primary)),
+        capital(name_of(primary)),
         [*shapes.items()],
         sum(_count(row, "n") for row in _of_one_factor(known)),
         [chart for chart in charts if chart],
@@ -172,7 +172,7 @@ def answered(rows: Sequence[Row]) -> tuple[str, str]:
     )
     if not primary:
         return "", ""
-    what = CHANGED.get(_metric(primary[0]), _name(primary[0]))
+    what = CHANGED.get(metric_of(primary[0]), name_of(primary[0]))
     if few := [
         row for row in primary if min(_count(row, "n"), _count(row, "n_reference")) < ENOUGH
     ]:
@@ -192,15 +192,15 @@ def answered(rows: Sequence[Row]) -> tuple[str, str]:
             rest.append(f"{capital(_level(row))} {shown}: {_apart(row)}, p {_p(row)}.")
     if not sure:
         rest.append(_seen(primary))
-    crossed = [row for row in tested if _crossed(row) and _metric(row) == _metric(primary[0])]
+    crossed = [row for row in tested if _crossed(row) and metric_of(row) == metric_of(primary[0])]
     rest += [
         f"{_named(row)} interact: {_apart(row)}, p {_p(row)}." for row in crossed if _shown(row)
     ]
     also = [row for row in tested if _shown(row) and not _crossed(row) and row not in primary]
-    also = [row for row in also if row.values["factor"] != MODEL and _metric(row) in NAMES]
+    also = [row for row in also if row.values["factor"] != MODEL and metric_of(row) in METRIC_NAMES]
     if not sure and also:
         row = min(also, key=lambda row: _number(row, "p"))
-        what = CHANGED.get(_metric(row), _name(row))
+        what = CHANGED.get(metric_of(row), name_of(row))
         rest.append(f"{capital(str(row.values['factor']))} changes {what}: {_both(row)}.")
     return claim, " ".join(filter(None, rest))
 
@@ -232,7 +232,7 @@ def _seen(rows: Sequence[Row], what: str = "A change") -> str:
     known = [_number(row, "detectable") for row in rows if row.values.get("detectable") is not None]
     if not known:
         return ""
-    least = f"{number(max(known))} {_unit(rows[0])}"
+    least = f"{number(max(known))} {unit_of(rows[0])}"
     return f"{what} of {least} or more would have been seen in four of five studies."
 
 
@@ -244,20 +244,20 @@ def _both(row: Row) -> str:
     """``goes first in 63.00 % of trials with hurry=yes, in 50.00 % with hurry=no``."""
     of, reference = (number(_number(row, name)) for name in ("estimate", "estimate_reference"))
     factor, level, base = (row.values[name] for name in ("factor", "level", "reference"))
-    metric, unit = _metric(row), _unit(row)
+    metric, unit = metric_of(row), unit_of(row)
     if metric == LEFT_FIRST.name:
         return (
             f"with {factor}={level} the driver goes first in {of} % of trials, with "
             f"{factor}={base} in {reference} %"
         )
     if unit == "points":
-        return f"{_name(row)} {of} % with {factor}={level}, {reference} % with {factor}={base}"
+        return f"{name_of(row)} {of} % with {factor}={level}, {reference} % with {factor}={base}"
     return f"{of} {unit} with {factor}={level}, {reference} {unit} with {factor}={base}"
 
 
 def _apart(row: Row) -> str:
     """``+12.84 points [6.06, 19.60]``."""
-    return f"{_difference(row)} {_unit(row)} {brackets(_interval(row))}".rstrip()
+    return f"{_difference(row)} {unit_of(row)} {brackets(_interval(row))}".rstrip()
 
 
 def _difference(row: Row) -> str:
@@ -266,9 +266,7 @@ def _difference(row: Row) -> str:
 
 
 def _p(row: Row) -> str:
-    """``= 0.012``, or that it is smaller."""
-    text = p_value(_number(row, "p_corrected"))
-    return f"< {text[1:]}" if text.startswith("<") else f"= {text}"
+    return equal_p(_number(row, "p_corrected"))
 
 
 def _number(row: Row, name: str) -> float:
@@ -285,16 +283,17 @@ def _interval(row: Row) -> tuple[float, float] | None:
     return ends if isinstance(ends, tuple) else None
 
 
-def _metric(row: Row) -> str:
+def metric_of(row: Row) -> str:
+    """The metric of an effect, by its name."""
     return row.id.rpartition("/")[2]
 
 
-def _name(row: Row) -> str:
+def name_of(row: Row) -> str:
     """What an effect's measure is called."""
-    return NAMES.get(_metric(row), str(row.values["measure"]).rpartition(" (")[0])
+    return METRIC_NAMES.get(metric_of(row), str(row.values["measure"]).rpartition(" (")[0])
 
 
-def _unit(row: Row) -> str:
+def unit_of(row: Row) -> str:
     """The unit of a difference."""
     return str(row.values["measure"]).rpartition("(")[2].rstrip(")").replace("%", "points")
 
@@ -324,12 +323,12 @@ def _changes(rows: Sequence[Row], sides: dict[str, Row], primary: str) -> list[C
     ends: dict[str, float] = {}
     for row in rows:
         values = (_number(row, "difference"), *(_interval(row) or ()))
-        ends[_metric(row)] = max(ends.get(_metric(row), 0.0), *map(abs, values))
-    return [_change(row, sides, ends[_metric(row)], primary) for row in rows]
+        ends[metric_of(row)] = max(ends.get(metric_of(row), 0.0), *map(abs, values))
+    return [_change(row, sides, ends[metric_of(row)], primary) for row in rows]
 
 
 def _change(row: Row, sides: dict[str, Row], end: float, primary: str) -> Change:
-    of, base, metric = row.values["level"], row.values["reference"], _metric(row)
+    of, base, metric = row.values["level"], row.values["reference"], metric_of(row)
     mark = " [scripted]" if str(of).endswith(" [scripted]") else ""
     found = [sides.get(f"{row.values['factor']}={name}") for name in (f"{base}{mark}", of)]
     reference, level = (
@@ -339,28 +338,27 @@ def _change(row: Row, sides: dict[str, Row], end: float, primary: str) -> Change
     said = f"{of} against {base}"
     if is_own and row.values.get("primary"):
         said += ", primary"
-    at = [
-        round(50 + 48 * v / (end or 1.0), 2)
-        for v in (_number(row, "difference"), *(_interval(row) or ()))
-    ]
     return Change(
-        capital(str(row.values["factor"])) if is_own else capital(_name(row)),
+        capital(str(row.values["factor"])) if is_own else capital(name_of(row)),
         said if is_own else f"{row.values['factor']}: {said}",
         reference,
         level,
-        f"{_difference(row)} {_unit(row)}",
+        f"{_difference(row)} {unit_of(row)}",
         brackets(_interval(row)),
         p_value(_number(row, "p_corrected")),
-        Mark(
-            "like" if _shown(row) else "open",
-            at[0],
-            (at[1], at[2]) if len(at) > 2 else None,
-            zero=50.0,
-        ),
-        f"{number(end)} {_unit(row)}",
+        difference_mark(row, end),
+        f"{number(end)} {unit_of(row)}",
         bool(row.values.get("primary")),
         row.id,
     )
+
+
+def difference_mark(row: Row, end: float) -> Mark:
+    """A difference on an axis with 0 in its middle; filled where its corrected p is below 5 %."""
+    values = (_number(row, "difference"), *(_interval(row) or ()))
+    at, *ends = (round(50 + 48 * value / (end or 1.0), 2) for value in values)
+    shape = "like" if _shown(row) else "open"
+    return Mark(shape, at, (ends[0], ends[1]) if ends else None, zero=50.0)
 
 
 def _side(row: Row, metric: str, primary: str) -> Side | None:

@@ -30,9 +30,11 @@ from merge_runner_analysis.study import Study
 from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import finished_tables
 from merge_runner_analysis.tables.against import FILES, against
+from merge_runner_analysis.tables.effects import comparison
 from merge_runner_analysis.tables.formats import render, table_view
 from merge_runner_analysis.tables.model import Column, Row, Table
 from merge_runner_analysis.tables.verdicts import verdicts
+from merge_runner_analysis.web.comparison import Comparison, comparison_of, no_trials
 from merge_runner_analysis.web.question import MIDDLE, answer_of
 from merge_runner_analysis.web.rendering import STYLE, environment, inlined_texts, policy_of
 from merge_runner_analysis.web.scope import DESCRIPTIONS
@@ -136,6 +138,7 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
         headline=headline,
         sentences=others,
         question=question,
+        apart=_apart(study),
         linked=False,
         middle=MIDDLE,
         figures=[(name, FIGURES[name].caption, data) for name, data in figures.items()],
@@ -151,6 +154,16 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
         cited=published("sources"),
         program=program(),
     )
+
+
+def _apart(study: Study) -> Comparison | None:
+    """How two drivers differ, where just two are judged that had the prompt all are compared by."""
+    groups = [group for group in study.models if group.setting == study.reference]
+    if len(groups) != 2:
+        return None
+    one, other = groups
+    names = (one.driver, other.driver)
+    return comparison_of(comparison(study, one.id, other.id), names, (no_trials, no_trials))
 
 
 def _once(tables: Iterable[Mapping[str, Any]]) -> dict[str, list[str]]:

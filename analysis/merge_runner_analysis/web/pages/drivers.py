@@ -8,7 +8,9 @@ from typing import Any
 from merge_runner_analysis.published import HUMAN
 from merge_runner_analysis.tables.formats import printed
 from merge_runner_analysis.tables.model import Row as TableRow
-from merge_runner_analysis.web.computed import computed_table
+from merge_runner_analysis.tables.model import from_text
+from merge_runner_analysis.web.comparison import Comparison, comparison_of, trials_of
+from merge_runner_analysis.web.computed import computed, computed_table
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.display_text import with_minus
 from merge_runner_analysis.web.judged import (
@@ -20,6 +22,7 @@ from merge_runner_analysis.web.judged import (
     noted,
 )
 from merge_runner_analysis.web.marks import rate
+from merge_runner_analysis.web.question import MIDDLE
 from merge_runner_analysis.web.scope import Scope, scope_of, unmarked
 from merge_runner_analysis.web.site import NotThere, Site
 from merge_runner_analysis.wording import DIFFERS, OPEN, SHOWN, UNLIKE
@@ -57,6 +60,7 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     was_asked = own and own.facts and own.facts["asked"]
     awaited, first = _first(site, name, scope) if was_asked else (None, "")
     beside = by_name.get(asked.get("with", ""))
+    compared, apart = _apart(site, own, beside, scope) if own and beside else (None, None)
     conditions = by_condition(site, scope, [one for one in (own, beside) if one])
     # Of each condition, the humans' and the drivers' share of trials in which left goes first.
     shares = (
@@ -69,6 +73,10 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         name=name,
         own=own,
         beside=beside,
+        compared=compared,
+        apart=apart,
+        linked=True,
+        middle=MIDDLE,
         others=[one for one in by_name.values() if one is not own],
         **values | {"human": humans_of(values["table"], own)},
         awaited=awaited,
@@ -86,6 +94,16 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         rates=zip(*shares, strict=True),
         notes=noted([own] if own else []),
     )
+
+
+def _apart(site: Site, own: Driver, other: Driver, scope: Scope) -> tuple[Job, Comparison | None]:
+    """One driver less another, each with the prompt of the page, once that is computed."""
+    groups = (f"{one.name}/{one.prompt}" for one in (own, other))
+    job = computed(site, ("comparison", *groups, scope.sweep, scope.condition))
+    if job.content is None:
+        return job, None
+    trials = trials_of(own, scope), trials_of(other, scope)
+    return job, comparison_of(from_text(job.content["table"]), (own.name, other.name), trials)
 
 
 def _summary(own: Driver) -> str:

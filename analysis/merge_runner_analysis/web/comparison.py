@@ -1,0 +1,149 @@
+"""One driver less another, as its page and the report show it: of a finished ``comparison``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from merge_runner_analysis.metrics import COLLISIONS, LEFT_FIRST
+from merge_runner_analysis.tables.model import Row, Table
+from merge_runner_analysis.web.judged import Driver
+from merge_runner_analysis.web.marks import Mark
+from merge_runner_analysis.web.question import (
+    difference_mark,
+    metric_of,
+    name_of,
+    unbroken,
+    unit_of,
+)
+from merge_runner_analysis.web.scope import Scope
+from merge_runner_analysis.wording import apart, brackets, capital, number, p_value
+
+# The trials behind a count, as a filter of their list; None where no filter keeps just these.
+Filter = dict[str, Any] | None
+TrialsOf = Callable[[str, int], Filter]
+"""By a metric, of which a driver has so many trials that count, or by ``k METRIC``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Side:
+    """A driver's value in a measure, with the trials that it counts and their filters."""
+
+    text: str
+    k: int | None
+    n: int
+    k_trials: Filter
+    n_trials: Filter
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """A measure of both drivers; ``mark`` is on an axis that ends at ``end`` on both sides."""
+
+    name: str
+    sides: tuple[Side, Side]
+    difference: str
+    interval: str
+    mark: Mark | None
+    end: str
+    p: str
+    p_corrected: str
+    note: str
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """The claim on two drivers, what else there is to say, and all measures."""
+
+    names: tuple[str, str]
+    claim: str
+    rest: str
+    rows: list[Difference]
+    tested: int
+    could: str
+
+
+def comparison_of(
+    table: Table, names: tuple[str, str], trials: tuple[TrialsOf, TrialsOf]
+) -> Comparison | None:
+    """The comparison of two drivers; None where one of them is not judged."""
+    if not table.rows:
+        return None
+    # What a person sees at once comes first.
+    rows = sorted(table.rows, key=lambda row: metric_of(row) != COLLISIONS.name)
+    claim, rest = apart(*names, {metric_of(row): row.values for row in rows})
+    seen = [
+        f"{name_of(row)}, {_with_unit(row, 'detectable')}"
+        for row in rows
+        if row.values["detectable"] is not None
+    ]
+    return Comparison(
+        names,
+        unbroken(claim),
+        unbroken(rest),
+        [_difference(row, trials) for row in rows],
+        sum(row.values["p_corrected"] is not None for row in rows),
+        unbroken("; ".join(seen)),
+    )
+
+
+def trials_of(own: Driver, scope: Scope) -> TrialsOf:
+    """The filters of a driver's trials, of those that keep just as many as are counted."""
+    every, facts = scope.trials(own.name, own.prompt), own.facts or {}
+
+    def behind(what: str, count: int) -> Filter:
+        named = {
+            f"k {COLLISIONS.name}": ("collided", {"outcome": "collided"}),
+            f"k {LEFT_FIRST.name}": ("left_first", {"outcome": "left first"}),
+        }
+        field, more = named.get(what, ("trials", {}))
+        if facts.get(field) == count:
+            return every | more
+        # A finished trial has a gap, and an ended one is in the row of crashes.
+        for cell in own.cells.values() if not (scope.sweep or scope.condition) else ():
+            if what[:2] != "k " and cell.values["n"] == count and cell.measure.name == "gap":
+                return {"cell": f"verdicts/{cell.values['row']}:n"}
+        return None
+
+    return behind
+
+
+def no_trials(_what: str, _count: int) -> Filter:
+    """No filter: a report has no list of trials."""
+    return None
+
+
+def _difference(row: Row, trials: tuple[TrialsOf, TrialsOf]) -> Difference:
+    values: Any = row.values
+    ci, is_tested = values["ci"], values["difference"] is not None
+    end = max(map(abs, (values["difference"], *(ci or ())))) if is_tested else 0.0
+    one, other = (
+        _side(row, of, behind) for of, behind in zip(("", "_reference"), trials, strict=True)
+    )
+    return Difference(
+        capital(name_of(row)),
+        (one, other),
+        unbroken(_with_unit(row, "difference", sign="+")) if is_tested else "–",
+        unbroken(brackets(ci)),
+        difference_mark(row, end) if is_tested and values["p_corrected"] is not None else None,
+        unbroken(f"{number(end)} {unit_of(row)}"),
+        p_value(values["p"]),
+        p_value(values["p_corrected"]),
+        row.note,
+    )
+
+
+def _side(row: Row, of: str, behind: TrialsOf) -> Side:
+    values: Any = row.values
+    metric, k, n = metric_of(row), values[f"k{of}"], values[f"n{of}"]
+    unit = unit_of(row).replace("points", "%")
+    text = unbroken(number(values[f"value{of}"], unit=f" {unit}"))
+    k_trials = None if k is None else behind(f"k {metric}", k)
+    return Side(text, k, n, k_trials, behind(metric, n))
+
+
+def _with_unit(row: Row, name: str, sign: str = "") -> str:
+    values: Any = row.values
+    plus = sign if values[name] > 0 else ""
+    return f"{plus}{number(values[name])} {unit_of(row)}"

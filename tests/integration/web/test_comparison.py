@@ -1,0 +1,81 @@
+"""Two drivers side by side: the page's numbers are the table's, and its counts lead to trials."""
+
+import re
+from dataclasses import replace
+from html import unescape
+
+import pytest
+
+from merge_runner_analysis.selection import Selection
+from merge_runner_analysis.study import Study
+from merge_runner_analysis.wording import brackets, number, p_value
+from tests.support.serving import client_of, listed
+from tests.support.studies import Said, write_study, yielding
+from tests.support.tables import values_of
+
+A, B = "gpt-5.2", "o3"
+
+
+@pytest.fixture(scope="module")
+def db(tmp_path_factory):
+    """B collides in three of five repetitions, A in one and brakes harder; a trial of A is lost."""
+    drives = []
+    for name, crashes, strength in ((A, {5}, 1.0), (B, {3, 4, 5}, 0.8)):
+        for drive in yielding(name, reps=5):
+            sides = {s: tuple(strength * x for x in getattr(drive, s)) for s in ("left", "right")}
+            if drive.rep in crashes:
+                sides = {"left": (0.0,), "right": (0.0,)}
+            is_lost = (name, drive.condition, drive.rep) == (A, "N_0_0", 2)
+            said = {1: Said(("timeout",), lost=True)} if is_lost else {}
+            drives.append(replace(drive, **sides, said=said))
+    return write_study(tmp_path_factory.mktemp("compared") / "t.duckdb", drives)
+
+
+@pytest.fixture(scope="module")
+def client(db):
+    return client_of(db)
+
+
+def text_of(html):
+    return " ".join(unescape(re.sub(r"<[^>]*>", " ", html)).split())
+
+
+def test_a_less_b_is_the_table_of_effects_with_its_interval_and_both_p(db, client):
+    page = text_of(client.get(f"/drivers/{A}?with={B}").text)
+    rows = values_of(Study(db, Selection([B, A])), "effects")
+    tested = [
+        row for name, row in rows.items() if name.startswith("model=") and row["p"] is not None
+    ]
+    assert len(tested) >= 6
+    for row in tested:
+        unit = row["measure"].rpartition("(")[2].rstrip(")").replace("%", "points")
+        sign = "+" if row["difference"] > 0 else ""
+        shown = f"{sign}{number(row['difference'])} {unit} {brackets(row['ci'])}"
+        assert shown in page
+        _, _, rest = page.partition(shown)
+        numbers = re.match(r" (?:± [\d.]+ \S+ )?(\S+) (\S+)", rest).groups()
+        assert numbers == (p_value(row["p"]), p_value(row["p_corrected"]))
+        assert row["detectable"] is None or f"{number(row['detectable'])} {unit}" in page
+
+
+def test_the_headline_says_crashes_in_counts_then_points_interval_and_p(client):
+    page = client.get(f"/drivers/{A}?with={B}").text
+    claim = text_of(re.search(r'<p class="answer">(.*?)</p>', page, re.S)[1])
+    assert re.fullmatch(
+        rf"{A} crashed in 11 of 54 trials, {B} in 33 of 55: "
+        r"\d\d\.\d\d points fewer \[\d\d\.\d\d, \d\d\.\d\d\]; p < 0\.001\.",
+        claim,
+    )
+    turned = text_of(client.get(f"/drivers/{B}?with={A}").text)
+    assert f"{B} crashed in 33 of 55 trials, {A} in 11 of 54" in turned
+    assert "points more" in turned
+
+
+def test_every_count_leads_to_so_many_trials(client):
+    page = client.get(f"/drivers/{A}?with={B}").text
+    section = page[page.index('aria-labelledby="apart"') :]
+    section = section[: section.index("</section>")]
+    links = re.findall(r'<a href="([^"]*)">(\d+)</a>', section)
+    assert {"11", "33", "55"} <= {count for _, count in links}
+    for address, count in links:
+        assert listed(client.get(unescape(address)).text) == int(count)
