@@ -17,10 +17,10 @@ from merge_runner_analysis.stats.intervals import (
     LEVEL,
     POWER,
     ROUNDING,
-    Z,
     tested,
     two_sided_p,
 )
+from merge_runner_analysis.stats.score_interval import Z
 
 # Where less of a trial's deviation is left over than this, it alone decides the difference.
 LEVERAGE = 1e-9

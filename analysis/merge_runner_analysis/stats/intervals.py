@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy import optimize, special, stats
 
 from merge_runner_analysis.stats.estimate import Estimate
+from merge_runner_analysis.stats.score_interval import wilson
 
 LEVEL = 0.95
 POWER = 0.8
@@ -22,7 +23,6 @@ TINY = 1e-300
 # Points and weights of Gauss and Legendre's rule on 0 to 1, for chances.
 _POINTS, _SHARES = np.polynomial.legendre.leggauss(200)
 NODES, WEIGHTS = (1 + _POINTS) / 2, _SHARES / 2
-Z = float(stats.norm.ppf((1 + LEVEL) / 2))
 
 
 NOTHING = Estimate()
@@ -37,14 +37,6 @@ def proportion(successes: int, n: int) -> Estimate:
     if n == 0:
         return NOTHING
     return Estimate(successes / n, *wilson(successes / n, n), n)
-
-
-def wilson(p: float, n: float, z: float = Z) -> tuple[float, float]:
-    """Return the score interval of a proportion of ``n`` trials at a quantile ``z``."""
-    middle = (p + z**2 / (2 * n)) / (1 + z**2 / n)
-    half = z / (1 + z**2 / n) * sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
-    # The exact bounds at 0 and n are 0 and 1; rounding must not leave the estimate outside.
-    return min(p, max(0.0, middle - half)), max(p, min(1.0, middle + half))
 
 
 def melded(

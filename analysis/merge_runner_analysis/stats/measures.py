@@ -12,8 +12,9 @@ from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.metrics import BOXES, JUDGED, Metric
 from merge_runner_analysis.published import citation, published
 from merge_runner_analysis.stats.estimate import Estimate
-from merge_runner_analysis.stats.intervals import LEVEL, NOTHING, mean, wilson
+from merge_runner_analysis.stats.intervals import LEVEL, NOTHING, mean
 from merge_runner_analysis.stats.intervals import estimate as interval_of
+from merge_runner_analysis.stats.score_interval import wilson
 from merge_runner_analysis.wording import Fact, Why
 
 PAPER = "paper_ablation_quantitative"

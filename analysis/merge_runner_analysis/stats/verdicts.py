@@ -50,7 +50,7 @@ from merge_runner_analysis.stats.indicators import (
     judge,
     less_humans,
 )
-from merge_runner_analysis.stats.intervals import LEVEL, melded, wilson
+from merge_runner_analysis.stats.intervals import LEVEL, melded
 from merge_runner_analysis.stats.measures import (
     counts,
     estimate,
@@ -70,6 +70,7 @@ from merge_runner_analysis.stats.regressions import (
     gap_ols,
     who_first_firth,
 )
+from merge_runner_analysis.stats.score_interval import wilson
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.wording import (
     MEASURES,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from merge_runner_analysis.stats.score_interval import wilson
 from merge_runner_analysis.wording import (
     MEASURES,
     OPEN,
@@ -66,9 +67,6 @@ def mark(measure: Measure, values: Values) -> Mark | None:
 
 def rate(count: int, of: int) -> Mark:
     """The mark of a share on an axis from 0 to 100 %, with its score interval; empty of none."""
-    # Imported here: scipy takes a second, and only a driver's page has rates.
-    from merge_runner_analysis.stats.intervals import wilson
-
     if not of:
         return Mark("", None, None)
     low, high = wilson(count / of, of)

@@ -11,8 +11,8 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.frames import read_frames
 from merge_runner_analysis.metrics import BOXES, COLLISIONS
 from merge_runner_analysis.published import human_counts
-from merge_runner_analysis.stats.intervals import wilson
 from merge_runner_analysis.stats.measures import counts
+from merge_runner_analysis.stats.score_interval import wilson
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables import make_tables
 from tests.support.studies import Drive, changed, write_study

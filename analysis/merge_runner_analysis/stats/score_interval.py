@@ -1,0 +1,15 @@
+"""The score interval of a proportion, for pages too: scipy would take a second to start."""
+
+from __future__ import annotations
+
+from math import sqrt
+
+Z = 1.959963984540054  # of 95 %, as scipy has it; that of statistics.NormalDist rounds up
+
+
+def wilson(p: float, n: float, z: float = Z) -> tuple[float, float]:
+    """Return the score interval of a proportion of ``n`` trials at a quantile ``z``."""
+    middle = (p + z**2 / (2 * n)) / (1 + z**2 / n)
+    half = z / (1 + z**2 / n) * sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
+    # The exact bounds at 0 and n are 0 and 1; rounding must not leave the estimate outside.
+    return min(p, max(0.0, middle - half)), max(p, min(1.0, middle + half))
