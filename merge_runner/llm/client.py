@@ -364,7 +364,7 @@ class LlmClient:
             input_tokens=len(request.body.encode()), output_tokens=self.entry.max_output_tokens
         )
         tier = as_text(self.entry.parameters.get("service_tier"))
-        dearest_usd = max(cost_usd(self.entry, worst, each) or 0.0 for each in (None, tier))
+        dearest_usd = max(cost_usd(self.entry, worst, each) or 0.0 for each in {None, tier})
         asked = Asked(self.driver, str(request.slot), dearest_usd)
         call = Call(request, order, asked, worst, self.entry.deadline_s, damaged)
         call.task = asyncio.create_task(self._call(call))

@@ -133,20 +133,16 @@ def _plan(places: Iterable[str], plan_actions: int) -> tuple[tuple[float, ...] |
 
 def _failure(array: tuple[float | str, ...], plan_actions: int) -> str | None:
     """Why an array is no plan; None: it is one."""
-    if len(array) == plan_actions and all(map(_is_action, array)):
-        return None
     numbers = [entry for entry in array if isinstance(entry, float)]
     words = [entry for entry in array if isinstance(entry, str)]
+    if not words and len(numbers) == plan_actions and -1 <= min(numbers) <= max(numbers) <= 1:
+        return None
     # A literal can be too large for a float.
     if any(_NOT_FINITE.fullmatch(word) for word in words) or not all(map(math.isfinite, numbers)):
         return "not_finite"
     if words:
         return "not_a_number"
     return "wrong_length" if len(numbers) != plan_actions else "out_of_range"
-
-
-def _is_action(entry: float | str) -> bool:
-    return isinstance(entry, float) and -1 <= entry <= 1
 
 
 def _entries(inside: str) -> tuple[float | str, ...]:

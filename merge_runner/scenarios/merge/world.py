@@ -86,7 +86,7 @@ class World:
         self.step += 1
         if self._collided():
             self.status = "collided"
-        elif max(each.positions[-1] for each in self._vehicles.values()) >= self._track.end_m:
+        elif max(self._positions()) >= self._track.end_m:
             self.status = "finished"
         elif self.step >= config.timeout_steps:
             self.status = "timeout"
@@ -120,22 +120,27 @@ class World:
 
     def states(self) -> tuple[StateRow, ...]:
         """The trace, one row per vehicle and sample."""
-        return tuple(
-            StateRow(
-                step=step,
-                time_s=_time(step, self._config.step_s),
-                side=side,
-                position_m=vehicle.positions[step],
-                velocity_mps=vehicle.velocities[step],
-                acceleration_mps2=vehicle.accelerations[step],
-            )
-            for step in range(self.step + 1)
-            for side, vehicle in self._vehicles.items()
-        )
+        rows = []
+        for step in range(self.step + 1):
+            time_s = _time(step, self._config.step_s)
+            for side, vehicle in self._vehicles.items():
+                row = StateRow(
+                    step=step,
+                    time_s=time_s,
+                    side=side,
+                    position_m=vehicle.positions[step],
+                    velocity_mps=vehicle.velocities[step],
+                    acceleration_mps2=vehicle.accelerations[step],
+                )
+                rows.append(row)
+        return tuple(rows)
 
     def _collided(self) -> bool:
-        positions = (self._vehicles[side].positions[-1] for side in SIDES)
-        return collided(self._config, self._track, *positions)
+        return collided(self._config, self._track, *self._positions())
+
+    def _positions(self) -> tuple[float, float]:
+        """Where the left and the right vehicle are now."""
+        return self._vehicles["left"].positions[-1], self._vehicles["right"].positions[-1]
 
     def _history(self, samples: list[float], before: float) -> tuple[float, ...]:
         wanted = self._config.memory_samples
