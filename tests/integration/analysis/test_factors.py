@@ -42,16 +42,16 @@ def copy(played, tmp_path):
 
 
 def test_the_summary_of_a_sweep_counts_by_model_and_by_each_factor(played):
-    blocks = [block.splitlines() for block in played.out.split("\n\n")]
-    by_factor = {block[0].split()[0]: [row.split()[:2] for row in block[1:]] for block in blocks}
-    assert by_factor["model"] == [["cheap", "24"], ["dear", "12"]]
-    assert by_factor["temperature"] == [["1.0", "18"], ["0.2", "18"]]
-    assert by_factor["opponent"] == [["self", "24"], ["sleepy", "12"]]
     (played.folder / "again.duckdb").write_bytes(played.db.read_bytes())
     again = played.run("sweep", "mine.toml", "--yes", "--trust", "--json", db="again.duckdb")
     outcomes = again.summary["outcomes_by_level"]
     trials = {(one["factor"], one["level"]): one["trials"] for one in outcomes}
-    assert (trials["temperature", "0.2"], trials["model", "dear"]) == (18, 12)
+    counted = {
+        ("model", "cheap"): 24, ("model", "dear"): 12,
+        ("temperature", "1.0"): 18, ("temperature", "0.2"): 18,
+        ("opponent", "self"): 24, ("opponent", "sleepy"): 12,
+    }  # fmt: skip
+    assert counted.items() <= trials.items()
 
 
 def test_conditions_of_another_mean_speed_stay_in_the_group_of_their_driver(study):
