@@ -14,7 +14,7 @@ import duckdb
 from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner.results.database import SETTINGS, fetched, in_memory
 from merge_runner.results.store import answering
-from merge_runner.text_safety import csv_writer, first_line, in_spreadsheet
+from merge_runner.text_safety import csv_writer, in_spreadsheet
 from merge_runner_analysis.web.database_copy import Copies
 from merge_runner_analysis.web.display_text import csv_cell, text_of
 
@@ -112,7 +112,8 @@ class Queries:
                     yield found
             # Python has no values for some of DuckDB's, such as intervals of millions of years.
             except (MergeRunnerError, duckdb.Error, OverflowError, ValueError) as exc:
-                said = first_line(exc)
+                # With the candidates and the place that DuckDB names, without its stack trace.
+                said = str(exc).partition("\n\nStack Trace")[0].strip()
                 if isinstance(exc.__cause__ or exc, duckdb.OutOfMemoryException):
                     said = f"the query needed more than {MEMORY_MB} MB"
                 if late.is_set():

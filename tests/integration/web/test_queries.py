@@ -51,7 +51,7 @@ def own(study, tmp_path):
 def refusal(queries, sql):
     with pytest.raises(UsageError) as refused:
         queries.result(sql)
-    assert len(str(refused.value).splitlines()) == 1
+    assert "Stack Trace" not in str(refused.value)
     return str(refused.value)
 
 
@@ -62,6 +62,12 @@ def test_what_is_more_than_a_query_of_the_database_is_refused_and_changes_nothin
     before = contents(study.parent)
     assert case["told"] in refusal(queries, case["sql"])
     assert contents(study.parent) == before
+
+
+def test_an_unknown_column_is_said_with_its_place_and_with_those_that_it_may_have_been(queries):
+    first, candidates, *_, line, place = refusal(queries, "SELECT statu FROM trials").splitlines()
+    assert ("not found" in first, "status" in candidates) == (True, True)
+    assert (line, place.strip()) == ("LINE 1: SELECT statu FROM trials", "^^^^^")
 
 
 def test_what_is_too_long_cannot_be_copied_or_is_no_database_is_said_in_a_line(

@@ -145,7 +145,7 @@ def test_nothing_in_a_result_or_an_error_is_more_than_text_and_a_download_is_a_f
     assert reply.headers["content-type"] == "text/csv; charset=utf-8"
     assert reply.headers["content-disposition"] == 'attachment; filename="query.csv"'
     reply = running.get("/sql.csv", params={"q": "selekt"})
-    said = "syntax error at or near &#34;selekt&#34;</p>"
+    said = "syntax error at or near &#34;selekt&#34;"
     assert (reply.status_code, said in reply.text) == (503, True)
 
 
