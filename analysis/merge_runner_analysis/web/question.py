@@ -7,7 +7,7 @@ Nothing here is tested or estimated: sentences, rows and charts are of the finis
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil, floor, log10
 from typing import Any
@@ -102,9 +102,12 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The claim, what else there is to say, charts, and the effects behind them."""
+    """The claim, what else there is to say, charts, and the effects behind them.
 
-    claim: str
+    The claim is in pieces, each with the cell of its trials where it is a count.
+    """
+
+    claim: list[tuple[str, tuple[str, str] | None]]
     rest: str
     measure: str
     drivers: list[tuple[str, str]]
@@ -120,10 +123,16 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
     """The answer; None where no table is there, or the study asks about no factor."""
     if effects is None or levels is None:
         return None
-    claim, rest = answered(effects.rows)
+    # Of a driver that is not judged there is a row without values.
+    known = [row for row in levels.rows if row.values.get("factor")]
+    sides = {row.id: row for row in known}
+    claim, rest = answered(effects.rows, sides)
     if not claim:
         return None
-    primary = next(row for row in effects.rows if row.values.get("primary"))
+    primary = min(
+        (row for row in effects.rows if row.values.get("primary") and _tested(row)),
+        key=lambda row: _number(row, "p"),
+    )
     metric = metric_of(primary)
     own = [row for row in effects.rows if metric_of(row) == metric]
     named = {LEFT_FIRST.name, COLLISIONS.name, GAP.name, RMSE.name}
@@ -133,9 +142,6 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
         if metric_of(row) in named - {metric} and not _crossed(row) and _tested(row)
         and row.values["factor"] != MODEL
     ]  # fmt: skip
-    # Of a driver that is not judged there is a row without values.
-    known = [row for row in levels.rows if row.values.get("factor")]
-    sides = {row.id: row for row in known}
     drivers = list(
         dict.fromkeys(str(row.values["driver"]) for row in known if row.values["driver"])
     )
@@ -147,7 +153,7 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
     ]
     tested = [row for row in own if _tested(row)]
     return Answer(
-        unbroken(claim),
+        _pieces(unbroken(claim), primary),
         unbroken(rest),
         capital(name_of(primary)),
         [*shapes.items()],
@@ -160,8 +166,10 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
     )
 
 
-def answered(rows: Sequence[Row]) -> tuple[str, str]:
+def answered(rows: Sequence[Row], sides: Mapping[str, Row] | None = None) -> tuple[str, str]:
     """The answer in a sentence, and the rest; empty where no primary test was made.
+
+    ``sides`` are the rows of ``levels``, whose counts the sentence has.
 
     The claim is the surest of the primary tests whose corrected p is below 5 %; where there is
     none it says so, and the rest what could have been seen.
@@ -182,8 +190,8 @@ def answered(rows: Sequence[Row]) -> tuple[str, str]:
     rest = []
     if sure:
         first = sure[0].values["factor"]
-        claim = f"{capital(str(first))} changes {what}: {_both(sure[0])}."
-        rest.append(f"That is {_apart(sure[0])}; p {_p(sure[0])}.")
+        claim = f"{capital(str(first))} changes {what}: {_both(sure[0], sides or {})}."
+        rest.append(f"In like situations that is {_apart(sure[0])}; p {_p(sure[0])}.")
     else:
         claim = f"No change of {what} is shown by {joined(_factors(primary))}."
     for row in primary:
@@ -201,8 +209,15 @@ def answered(rows: Sequence[Row]) -> tuple[str, str]:
     if not sure and also:
         row = min(also, key=lambda row: _number(row, "p"))
         what = CHANGED.get(metric_of(row), name_of(row))
-        rest.append(f"{capital(str(row.values['factor']))} changes {what}: {_both(row)}.")
+        rest.append(f"{capital(str(row.values['factor']))} changes {what}: {_both(row, {})}.")
     return claim, " ".join(filter(None, rest))
+
+
+def _pieces(claim: str, row: Row) -> list[tuple[str, tuple[str, str] | None]]:
+    """The claim of this effect, cut at its counts: that of the level, then of the reference."""
+    names = [f"{row.values['factor']}={row.values[name]}" for name in ("level", "reference")]
+    parts = enumerate(re.split(r"(?<=\()(\d+)(?= of \d+\))", claim))
+    return [(text, (names[place // 2], "k") if place % 2 else None) for place, text in parts]
 
 
 def unbroken(text: str) -> str:
@@ -240,15 +255,19 @@ def _factors(rows: Iterable[Row]) -> list[str]:
     return list(dict.fromkeys(str(row.values["factor"]) for row in rows))
 
 
-def _both(row: Row) -> str:
-    """``goes first in 63.00 % of trials with hurry=yes, in 50.00 % with hurry=no``."""
+def _both(row: Row, sides: Mapping[str, Row]) -> str:
+    """``with hurry=yes the driver goes first in 63.00 % of trials (63 of 100), with ...``."""
     of, reference = (number(_number(row, name)) for name in ("estimate", "estimate_reference"))
     factor, level, base = (row.values[name] for name in ("factor", "level", "reference"))
     metric, unit = metric_of(row), unit_of(row)
     if metric == LEFT_FIRST.name:
+        counts = [
+            f" ({_counted(sides[name])})" if name in sides else ""
+            for name in (f"{factor}={level}", f"{factor}={base}")
+        ]
         return (
-            f"with {factor}={level} the driver goes first in {of} % of trials, with "
-            f"{factor}={base} in {reference} %"
+            f"with {factor}={level} the driver goes first in {of} % of trials{counts[0]}, with "
+            f"{factor}={base} in {reference} %{counts[1]}"
         )
     if unit == "points":
         return f"{name_of(row)} {of} % with {factor}={level}, {reference} % with {factor}={base}"
@@ -445,8 +464,11 @@ def _chart(title: str, rows: Sequence[Row], shapes: dict[str, str], metric: str)
 
 
 def _counts(row: Row) -> str:
-    k = row.values.get("k")
-    return "" if k is None else f"{k} of {row.values['n']}, "
+    return "" if row.values.get("k") is None else f"{_counted(row)}, "
+
+
+def _counted(row: Row) -> str:
+    return f"{row.values['k']} of {row.values['n']}"
 
 
 def _axis(low: float, high: float) -> tuple[float, float, float]:

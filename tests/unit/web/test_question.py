@@ -38,8 +38,8 @@ SEEN = "A change of 10.00 points or more would have been seen in four of five st
         (
             [effect("persona", 0.5, difference=1.0), effect()],
             f"{HURRY}with hurry=no in 50.00 %.",
-            "That is +13.00 points [6.00, 20.00]; p = 0.001. Persona=yes is not shown to change "
-            "it: +1.00 points [−6.00, 8.00], p = 0.500.",
+            "In like situations that is +13.00 points [6.00, 20.00]; p = 0.001. Persona=yes is not "
+            "shown to change it: +1.00 points [−6.00, 8.00], p = 0.500.",
         ),
         (
             [effect(p=0.2), effect(measure=GAP, p=0.0001, estimate=3.8, estimate_reference=4.3)],
@@ -51,8 +51,8 @@ SEEN = "A change of 10.00 points or more would have been seen in four of five st
         (
             [effect(p=0.0001), effect("hurry × persona", 0.01, difference=-8.0)],
             f"{HURRY}with hurry=no in 50.00 %.",
-            "That is +13.00 points [6.00, 20.00]; p < 0.001. Hurry and persona interact: −8.00 "
-            "points [−15.00, −1.00], p = 0.010.",
+            "In like situations that is +13.00 points [6.00, 20.00]; p < 0.001. Hurry and persona "
+            "interact: −8.00 points [−15.00, −1.00], p = 0.010.",
         ),
         ([effect(n=12)], "Too few trials finished to say: hurry=yes 12.", ""),
     ],
