@@ -251,8 +251,9 @@ def _effect(
     frames = trials_by_cell(study, [level.pooled for level in levels], metric)
     left_out = {copy for level in levels for copy in level.copies}
     for level, frame in zip(levels, frames, strict=False):
-        unused = level.pooled.trials[KEYS].drop(index=frame.index)
-        left_out |= {*unused.itertuples(index=False, name=None)}
+        unused = ~level.pooled.trials.index.isin(frame.index)
+        if unused.any():
+            left_out |= {*level.pooled.trials.loc[unused, KEYS].itertuples(index=False, name=None)}
     ordered = [frames[place] for place in (0, 2, 1, 3)] if turned and frames else frames
     found = _difference(ordered, metric) or Estimate()
     # Where nothing varies it is not known what could have been seen.
@@ -324,10 +325,13 @@ def trials_by_cell(study: Study, groups: Sequence[Group], metric: Metric) -> lis
         return []
     copied, frames = copied_cells(study, tuple(groups)), []
     for group in groups:
-        trials = group.trials[~group.trials["cell"].isin(copied)] if copied else group.trials
+        trials = group.trials
+        counted = trials[metric.column].notna().to_numpy()
+        if copied:
+            counted &= ~trials["cell"].isin(copied).to_numpy()
         columns = {"condition": "cell", "value": metric.column, "weight": metric.weight_column}
         named = {name: trials[own] for name, own in columns.items() if own in trials}
-        frame = pd.DataFrame(named).dropna(subset="value")
+        frame = pd.DataFrame(named)[counted]
         if metric.weight:
             frame["value"] = linear(frame["value"], frame["weight"], frame["condition"])
         elif metric is LEFT_FIRST and one_sided(study):
