@@ -63,6 +63,7 @@ class Estimate:
     They are ``measured`` where tokens are those of earlier answers. Calls that are asked singly
     cost ``singly_usd``; in batches they cost less, and take so many ``rounds`` in place of minutes.
     ``usd_by_model`` has the models of the registry. Of ``planned`` trials some are ``stored``.
+    A cap leaves ``left_usd`` of what it covers; without one that is None.
     """
 
     driver: str
@@ -79,6 +80,7 @@ class Estimate:
     planned: int = 0
     stored: int = 0
     usd_by_model: dict[str, float | None] = field(default_factory=dict)
+    left_usd: float | None = None
 
 
 def estimate(

@@ -563,6 +563,16 @@ def _by_model(expected: Estimate) -> Iterator[str]:
         yield from (f"        {name}: {_about(usd)}" for name, usd in expected.usd_by_model.items())
 
 
+def _by_cap(expected: Estimate) -> Iterator[str]:
+    """How far the money goes, where it will not do for all."""
+    left_usd, cost_usd = expected.left_usd, expected.cost_usd
+    if left_usd is not None and cost_usd and left_usd < cost_usd:
+        yield (
+            f"        stops at {left_usd:.2f} USD, about {100 * left_usd / cost_usd:.0f} % of it: "
+            "what --max-cost, or the study's budget, leaves"
+        )
+
+
 def prompt_lines(plan: Plan) -> Iterator[str]:
     """The blocks, in order, of each prompt that has words of the study's factors."""
     for name, prompt in plan.parts.prompts.items():
@@ -588,11 +598,13 @@ def estimate_lines(expected: Estimate) -> Iterator[str]:
     if not expected.rounds:
         yield f"cost    {_about(expected.cost_usd)}"
         yield from _by_model(expected)
+        yield from _by_cap(expected)
         yield f"time    about {expected.minutes} minutes"
         return
     singly = f"{_about(expected.singly_usd)} and {expected.minutes} minutes if asked singly"
     yield f"cost    {_about(expected.cost_usd)} in batches; {singly}"
     yield from _by_model(expected)
+    yield from _by_cap(expected)
     yield (
         f"time    about {expected.rounds} rounds; each takes as long as its slowest batch: "
         "minutes, an hour, a day at most"

@@ -276,7 +276,7 @@ class Sweep:
                 if name in arm.entries:
                     answered = sum(row.side == side for row in record.decisions) if record else 0
                     calls[spec.arm][name] += max(1.0, usual_prompts(arm) - answered)
-        return estimate(
+        expected = estimate(
             self._plan,
             self._options,
             trials=trials,
@@ -284,6 +284,11 @@ class Sweep:
             calls=calls,
             facts=earlier_answers(self._plan, self._cache),
         )
+        cap_usd = self._options.max_cost_usd
+        if cap_usd is None or whole:
+            return expected
+        self._ledger.read()
+        return replace(expected, left_usd=max(0.0, cap_usd - self._ledger.committed_usd))
 
     async def _begin(self, store: Store) -> str:
         started_at = datetime.now(UTC).replace(tzinfo=None)

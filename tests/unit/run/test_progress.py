@@ -123,6 +123,15 @@ def test_a_dry_run_says_how_many_trials_are_left():
     ]
 
 
+def test_an_estimate_says_how_far_a_cap_that_it_exceeds_goes():
+    def stops(left_usd):
+        return [line for line in estimate_lines(expected(3, left_usd=left_usd)) if "stops" in line]
+
+    assert (stops(None), stops(1.5)) == ([], [])
+    (line,) = stops(0.3)
+    assert line.strip().startswith("stops at 0.30 USD, about 20 % of it: ")
+
+
 def test_an_estimate_says_what_each_of_several_models_costs():
     lines = [*estimate_lines(expected(3, usd_by_model={"o3": 1.25, "o4": None}))]
     assert lines[lines.index("cost    about 1.50 USD") + 1 :][:2] == [
