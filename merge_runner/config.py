@@ -423,8 +423,10 @@ def without_endpoint(driver: str) -> str:
 
     >>> without_endpoint("bold at localhost:8123 [temperature=0.2]")
     'bold [temperature=0.2]'
+    >>> without_endpoint("bold at localhost:8123/set1")
+    'bold/set1'
     """
-    return re.sub(r" at [^\s+]+", "", driver)
+    return re.sub(r" at [^\s+]+?(?=/set\d+(?: |$)|[\s+]|$)", "", driver)
 
 
 def both_sides(model: str) -> dict[Side, str]:
