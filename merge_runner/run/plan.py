@@ -38,7 +38,7 @@ from merge_runner.records import (
     canonical_json,
     spec_hash,
 )
-from merge_runner.registry import Catalogue, using
+from merge_runner.registry import Catalogue, Registry, require, using
 from merge_runner.results.database import read_database
 from merge_runner.scenarios.merge.conditions import (
     CONDITIONS,
@@ -60,7 +60,13 @@ from merge_runner.study.crossing import (
     file_prompts,
     listed_levels,
 )
-from merge_runner.study.file import EVERY_CONDITION, EVERY_PROMPT, StudyFile, StudySource
+from merge_runner.study.file import (
+    EVERY_CONDITION,
+    EVERY_PROMPT,
+    MEASURES,
+    StudyFile,
+    StudySource,
+)
 from merge_runner.study.parts import load_study
 from merge_runner.text_safety import in_a_name
 
@@ -427,6 +433,9 @@ def make_plan(
     drivers = chosen_models(file, asked)
     pairs = (dict.fromkeys(both_sides(name).values()) for name in drivers)
     with using(catalogue):
+        metrics = [name for each in Registry.made if each.kind == "metric" for name in each]
+        measures = dict.fromkeys([*MEASURES, *metrics])
+        require(measures, "measure", file.primary, "as the study's primary one")
         registry = load_models(study.path.parent)
         wanted = _repetitions(study, variants, repetitions)
         names = _conditions(file, conditions)

@@ -33,6 +33,25 @@ EVERY_CONDITION = "all"
 """In the list of conditions: the scenario's own ones."""
 GivenTo = Literal["both", "ego", "other"]
 """Which drivers have a level: both, the one that is asked about, or the one that it meets."""
+MEASURES = (
+    "goes_first",
+    "collided",
+    "gap_m",
+    "left_first_percent",
+    "collided_percent",
+    "collided_boxes_percent",
+    "rmse_mps",
+    "joint_percent",
+    "valid_percent",
+    "cost_usd",
+    "conflict_resolution_s",
+    "time_to_merge_s",
+    "post_encroachment_s",
+    "min_ttc_s",
+    "max_acceleration_mps2",
+)
+"""What ``StudyFile.primary`` may name beside the metrics of plug-ins: what an ``Effect`` may be on,
+and the analysis' own metrics, which the runner does not import."""
 ONE_OF_EACH = "give it a block, a text, or merge and straight"
 TEMPLATE = Path(__file__).with_name("template")
 PLUGIN = "plugin.py"
@@ -175,7 +194,7 @@ class StudyFile(Frozen):
     leaves crossings out: each row names levels, or lists of them. Tables compare the levels of a
     factor with its first one, or with that which ``reference`` names; ``effect`` is by factor what
     each other level adds, for ``merge-runner power``. ``primary`` is the measure that is tested by
-    itself, by its name in the analysis, which knows them: all others are corrected together.
+    itself, one of ``MEASURES`` or a plug-in's metric: all others are corrected together.
 
     With ``mirror`` two different drivers are played both ways round. ``perception`` holds by name
     what the levels of the factors perception, perception_left and perception_right stand for.

@@ -14,8 +14,9 @@ from itertools import chain, combinations, product
 
 import pandas as pd
 
-from merge_runner.registry import require
+from merge_runner.registry import in_use, require
 from merge_runner.study.crossing import MODEL
+from merge_runner.study.file import StudySource
 from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.frames import KEYS
 from merge_runner_analysis.grouping import Group, levels_of
@@ -174,10 +175,14 @@ def compared(study: Study, one: Group, other: Group) -> list[Effect]:
 def primary(study: Study) -> Metric:
     """The measure that the study names as its primary one, else who goes first.
 
+    Without a chosen study it is the one whose parts are in use, as in the explorer.
+
     Raises UsageError where there is no such measure.
     """
-    named = PRIMARY if study.source is None else study.source.file.primary
-    known = {PRIMARY: LEFT_FIRST, **METRICS}
+    in_use_here = StudySource(name="", text=text, plugins={}) if (text := in_use().text) else None
+    source = study.source or in_use_here
+    named = source.file.primary if source else PRIMARY
+    known = {PRIMARY: LEFT_FIRST, "collided": COLLISIONS, **METRICS}
     require(known, "measure", named, "as the study's primary one")
     return known[named]
 

@@ -8,7 +8,11 @@ from statsmodels.stats.contingency_tables import StratifiedTable
 from statsmodels.stats.multitest import multipletests
 
 from merge_runner.errors import UsageError
+from merge_runner.registry import Catalogue, using
+from merge_runner.run.plan import make_plan
+from merge_runner.study.file import MEASURES
 from merge_runner_analysis.frames import load
+from merge_runner_analysis.metrics import COLLISIONS, LEFT_FIRST, METRICS
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.stats.effects import compared, effects, primary
 from merge_runner_analysis.study import Study
@@ -89,11 +93,18 @@ def test_a_primary_measure_is_a_family_of_its_own(played):
 
 def test_a_study_names_its_primary_measure(played, tmp_path):
     text = (played.folder / "mine.toml").read_text()
-    (tmp_path / "mine.py").write_text((played.folder / "mine.py").read_text())
+    for name in ("mine.py", "models.toml"):
+        (tmp_path / name).write_text((played.folder / name).read_text())
     file = tmp_path / "mine.toml"
-    for named, expected in (("gap_m", "gap_m"), ("goes_first", "left_first_percent")):
+    expected = {"goes_first": LEFT_FIRST, "collided": COLLISIONS, **METRICS}
+    assert sorted(expected) == sorted(MEASURES)
+    for named in ("gap_m", "goes_first", "collided"):
         file.write_text(f'primary = "{named}"\n' + text)
-        assert primary(Study(played.db, Selection(file=str(file)))).name == expected
+        assert primary(Study(played.db, Selection(file=str(file)))) is expected[named]
+        with using(Catalogue(file.read_text())):  # as in the explorer, which chooses no study
+            assert primary(Study(played.db)) is expected[named]
+    file.write_text('primary = "duration_s"\n' + text)  # the plug-in's own
+    assert make_plan(str(file), trust=True).study.file.primary == "duration_s"
     file.write_text('primary = "mood"\n' + text)
     with pytest.raises(UsageError, match="unknown measure 'mood'; valid: goes_first"):
         primary(Study(played.db, Selection(file=str(file))))
