@@ -333,7 +333,7 @@ def trials_by_cell(study: Study, groups: Sequence[Group], metric: Metric) -> lis
         trials = group.trials
         counted = trials[metric.column].notna().to_numpy()
         if copied:
-            counted &= ~trials["cell"].isin(copied).to_numpy()
+            counted = counted & ~trials["cell"].isin(copied).to_numpy()
         columns = {"condition": "cell", "value": metric.column, "weight": metric.weight_column}
         named = {name: trials[own] for name, own in columns.items() if own in trials}
         frame = pd.DataFrame(named)[counted]

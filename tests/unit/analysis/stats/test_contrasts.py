@@ -12,7 +12,6 @@ from statsmodels.stats.contingency_tables import StratifiedTable
 from statsmodels.stats.multitest import multipletests
 
 from analysis.research.independent.recompute_statistics import means_within
-from merge_runner_analysis.stats import intervals
 from merge_runner_analysis.stats.contrasts import (
     Cells,
     contrast_means,
@@ -23,6 +22,7 @@ from merge_runner_analysis.stats.contrasts import (
     rejected,
     shared_cells,
 )
+from merge_runner_analysis.stats.score_interval import Z
 from merge_runner_analysis.stats.verdicts import holm_levels
 
 
@@ -64,7 +64,7 @@ def test_shares_are_compared_by_the_test_of_mantel_and_haenszel_and_its_score_in
     expected = StratifiedTable(tables).test_null_odds(correction=False).pvalue
     assert found.p == pytest.approx(expected)
     for end in (found.low, found.high):
-        assert abs(end) == 1 or abs(difference_at(cells, end)) == pytest.approx(intervals.Z)
+        assert abs(end) == 1 or abs(difference_at(cells, end)) == pytest.approx(Z)
 
 
 SIZES = st.integers(1, 12)
