@@ -10,7 +10,7 @@ from typing import Any
 from merge_runner_analysis.published import HUMAN, human_counts
 from merge_runner_analysis.tables.model import Table
 from merge_runner_analysis.web.computed import computed_table
-from merge_runner_analysis.web.marks import Cell, band, cells
+from merge_runner_analysis.web.marks import Cell, band, cells, measures_of
 from merge_runner_analysis.web.phrases import ordered
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.scope import Bar, Scope, carried, unmarked
@@ -18,7 +18,6 @@ from merge_runner_analysis.web.site import Site
 from merge_runner_analysis.wording import (
     HUMANS,
     LANGUAGE_MODEL,
-    MEASURES,
     MOCK,
     PROGRAM,
     TABLE,
@@ -68,6 +67,7 @@ def judged(site: Site, bar: Bar, asked: Mapping[str, str]) -> tuple[list[Driver]
         "table": table,
         "headings": KINDS,
         "human": humans_of(table),
+        "measures": measures_of(table.rows if table else ()),
         "imported": site.catalogue.has_humans,
     }
 
@@ -77,15 +77,16 @@ def humans_of(table: Table | None, own: Driver | None = None) -> dict[str, Any]:
 
     Beside a driver they are those that it is compared with, in its conditions.
     """
-    found = by_group(table.rows).get(HUMAN, {}) if table else {}
+    rows = table.rows if table else ()
+    found, measures = by_group(rows).get(HUMAN, {}), measures_of(rows)
     label = str(next(iter(found.values()))["driver"]) if found else HUMAN
     for name, cell in own.cells.items() if own else ():
         beside = {"estimate": cell.values.get("human"), "ci": cell.values.get("human_ci")}
         found[name] = {**found[name], **beside}
     return {
         "about": label.partition("(")[2].rstrip(")") or "990 trials of nine pairs, as published",
-        "cells": cells(found),
-        "bands": {name: band(measure, found.get(name, {})) for name, measure in MEASURES.items()},
+        "cells": cells(found, measures),
+        "bands": {name: band(measure, found.get(name, {})) for name, measure in measures.items()},
     }
 
 
@@ -95,7 +96,7 @@ def drivers_of(site: Site, table: Table | None, scope: Scope) -> list[Driver]:
     facts = {(row["model"], row["variant"]): row for row in counts if row["who"] != "humans"}
     specs = {(row["model"], row["variant"]): row for row in site.catalogue.ask(ASKED)}
     groups = by_group(table.rows) if table else {"/".join(key): {} for key in facts}
-    drivers = []
+    drivers, measures = [], measures_of(table.rows if table else ())
     for group, verdicts in groups.items():
         name, _, prompt = group.rpartition("/")
         of, spec = (rows.get((unmarked(name), prompt)) for rows in (facts, specs))
@@ -111,7 +112,7 @@ def drivers_of(site: Site, table: Table | None, scope: Scope) -> list[Driver]:
                 name,
                 prompt,
                 kind,
-                cells(verdicts),
+                cells(verdicts, measures),
                 sentence(verdicts) if verdicts else "",
                 of,
                 spec["endpoint"] if spec else "",

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from merge_runner_analysis.stats.score_interval import wilson
+from merge_runner_analysis.tables.model import Row
 from merge_runner_analysis.wording import (
     MEASURES,
     OPEN,
@@ -83,11 +85,22 @@ def band(measure: Measure, human: Values) -> Mark:
     return replace(placed, zero=zero)
 
 
-def cells(verdicts: dict[str, Values]) -> dict[str, Cell]:
+def measures_of(rows: Iterable[Row]) -> dict[str, Measure]:
+    """The measures of these verdicts: the axis of a share that goes beyond its end is all of it."""
+    measures = dict(MEASURES)
+    for row in rows:
+        measure, value = measures.get(str(row.values.get("measure"))), row.values.get("estimate")
+        if measure and measure.unit == "% of trials" and isinstance(value, float):
+            if value > measure.ends[1]:
+                measures[measure.name] = replace(measure, ends=(0.0, 100.0))
+    return measures
+
+
+def cells(verdicts: dict[str, Values], measures: Mapping[str, Measure]) -> dict[str, Cell]:
     """The verdicts of a driver and prompt by measure; empty where it is not judged."""
     if "" in verdicts:
         return {}
-    return {name: _cell(MEASURES[name], values) for name, values in verdicts.items()}
+    return {name: _cell(measures[name], values) for name, values in verdicts.items()}
 
 
 def _cell(measure: Measure, values: Values) -> Cell:

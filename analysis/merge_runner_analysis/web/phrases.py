@@ -80,6 +80,21 @@ def plain(value: str) -> str:
     return f"wrong {value}" if kind == "model" and name else PLAIN.get(value, value)
 
 
+def causes_text(causes: Iterable[tuple[str, int]]) -> str:
+    """Causes of errors and how many times each: ``2 replies without a valid plan: ...; ...``."""
+    plans, said = dict[str, int](), []
+    for value, times in causes:
+        if value.startswith("plan: "):
+            plans[plain(value)] = times
+        else:
+            said.append(plain(value) if times == 1 else f"{plain(value)}, {times} times")
+    if plans:
+        count = sum(plans.values())
+        replies = "reply" if count == 1 else "replies"
+        said.insert(0, f"{count} {replies} without a valid plan: {', '.join(plans)}")
+    return "; ".join(said)
+
+
 def clock(time_s: float) -> str:
     """A time in seconds, to a tenth or, where that is not exact, a hundredth."""
     return f"{time_s:.1f}" if abs(time_s - round(time_s, 1)) < 1e-6 else f"{time_s:.2f}"

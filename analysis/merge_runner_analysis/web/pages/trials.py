@@ -9,7 +9,7 @@ from merge_runner_analysis.web.catalogue import PAGE, SORTS, Wanted
 from merge_runner_analysis.web.computed import awaited, computed
 from merge_runner_analysis.web.filters import HEADINGS, filter_of, sort_of
 from merge_runner_analysis.web.listing import FACTOR
-from merge_runner_analysis.web.phrases import plain
+from merge_runner_analysis.web.phrases import causes_text, plain
 from merge_runner_analysis.web.pictures import sparkline, speed_range
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.scope import carried
@@ -73,12 +73,12 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
     )
 
 
-def _errors(site: Site, rows: Sequence[Row]) -> dict[int, list[tuple[str, int]]]:
-    """Why trials failed, and why replies held no plan: causes of each trial, and how many times."""
-    errors: dict[int, list[tuple[str, int]]] = {}
+def _errors(site: Site, rows: Sequence[Row]) -> dict[int, str]:
+    """Why trials failed, and why replies held no plan: of each trial with an error, in words."""
+    causes: dict[int, list[tuple[str, int]]] = {}
     for one in site.catalogue.ask(CAUSES, [row["number"] for row in rows]):
-        errors.setdefault(one["number"], []).append((one["value"], one["times"]))
-    return errors
+        causes.setdefault(one["number"], []).append((one["value"], one["times"]))
+    return {number: causes_text(of) for number, of in causes.items()}
 
 
 def _unknown(site: Site, chosen: Wanted) -> list[tuple[str, str, list[str]]]:
