@@ -90,9 +90,10 @@ def measures_of(rows: Iterable[Row]) -> dict[str, Measure]:
     measures = dict(MEASURES)
     for row in rows:
         measure, value = measures.get(str(row.values.get("measure"))), row.values.get("estimate")
-        if measure and measure.unit == "% of trials" and isinstance(value, float):
-            if value > measure.ends[1]:
-                measures[measure.name] = replace(measure, ends=(0.0, 100.0))
+        if not measure or measure.unit != "% of trials" or not isinstance(value, float):
+            continue
+        if value > measure.ends[1]:
+            measures[measure.name] = replace(measure, ends=(0.0, 100.0))
     return measures
 
 
