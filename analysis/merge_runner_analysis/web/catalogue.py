@@ -68,7 +68,7 @@ round(coalesce(sum(cost_usd), 0) - coalesce(list_sum([reply.usd FOR reply IN eve
 SHOWN = "* EXCLUDE (faults, answers, others, unpriced, of_several)"
 EXPORTED = (
     "trial_id spec_hash source model variant condition projected_headway_m relative_velocity_mps "
-    "rep pair status merged_first end_time_s error scripted stand_in caution outcome validity "
+    "rep pair ego status merged_first end_time_s error scripted stand_in caution outcome validity "
     "time_to_merge_s gap_m rmse_mps joint min_ttc_s account decisions invalid fallbacks attempts "
     "cost_usd"
 )

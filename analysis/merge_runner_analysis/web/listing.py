@@ -91,8 +91,9 @@ SELECT row_number() OVER (ORDER BY trials.trial_id, spec_hash)::INTEGER AS numbe
     CASE WHEN source = 'human' THEN 'humans' WHEN scripted THEN 'stand-ins' ELSE 'drivers' END
         AS who,
     trials.model_left, trials.model_right, if(source = 'human', 'human', driver) AS model, variant,
-    condition, projected_headway_m, relative_velocity_mps, rep, pair, status, merged_first,
-    end_time_s, error, scripted, stand_in, caution,
+    condition, projected_headway_m, relative_velocity_mps, rep, pair, focal,
+    if(focal IS NOT NULL OR trials.model_left <> trials.model_right, ego, NULL) AS ego,
+    status, merged_first, end_time_s, error, scripted, stand_in, caution,
     if(status = 'finished', coalesce(merged_first || ' first', 'nobody first'), status) AS outcome,
     CASE WHEN source = 'human' THEN 'human' WHEN decisions = 0 THEN 'no decision'
         WHEN fallbacks > 0 OR invalid > 0 THEN 'fallbacks'

@@ -67,6 +67,8 @@ def changes_text(variant: Variant, shown: Callable[[str], str]) -> str:
 def block_meaning(name: str) -> str:
     """What a block of a prompt is for."""
     block = BLOCKS.get(name)
+    if block is None and "=" in name:
+        return "words of the study"
     return UNKNOWN if block is None else block.meaning
 
 

@@ -1,5 +1,7 @@
 """Prompts of a study whose words are given to one driver, side by side and pair by pair."""
 
+import re
+
 import pytest
 
 from merge_runner.results.store import query
@@ -42,13 +44,26 @@ def test_what_each_driver_is_told_is_shown_where_the_two_differ(db):
         cards = client.get("/prompts").text.split('<section class="card"')[1:]
     said = {card.partition('"')[2].partition('"')[0]: Page(card).text for card in cards}
     assert "driver is told" not in said["baseline"]
-    told, words = "The other driver is told: Text without a name", "You are late."
+    told, words = "The other driver is told: hurry=yes", "You are late."
     one = said["hurry=yes"]
     assert "The ego is told what the baseline says." in one
     assert f"{told} {words}" in one
     both = said["persona=taxi hurry=yes"]
-    assert "The ego is told: Text without a name You are a taxi driver." in both
+    assert "The ego is told: persona=taxi You are a taxi driver." in both
     assert f"{told} {words}" in both
+
+
+def test_each_trial_says_which_driver_was_told_which_words(db):
+    named = "SELECT trial_id, spec_hash FROM trials WHERE variant = 'persona=taxi hurry=yes'"
+    columns, rows = query(db, named)
+    with client_of(db) as client:
+        listing = client.get("/trials").text
+        trial = client.site.at.trial(dict(zip(columns, rows[0], strict=True)))
+        page = Page(client.get(trial).text).text
+    assert re.search(r'<th scope="col"[^>]*>ego</th>', listing)
+    assert listing.count("<td>left</td>") == 15  # the baseline tells both the same
+    assert "The left driver, the ego, was told persona=taxi: You are a taxi driver." in page
+    assert "The right driver was told hurry=yes: You are late." in page
 
 
 def test_pairs_are_found_although_an_effect_is_planted_with_the_prompt(db):

@@ -20,7 +20,7 @@ from merge_runner_analysis.web.marks import Mark
 from merge_runner_analysis.web.phrases import UNKNOWN, block_meaning, changes_text
 from merge_runner_analysis.web.scope import scope_of, unmarked
 from merge_runner_analysis.web.site import NotThere, Site
-from merge_runner_analysis.web.trial.prompt_parts import Part, parts_of
+from merge_runner_analysis.web.trial.prompt_parts import Part, digests_of, level_of, parts_of
 
 # The blocks of a prompt, as its specs name them; a program has none.
 STORED = """
@@ -39,13 +39,16 @@ WITH asked AS (
     WHERE decision = 0 AND prompt IS NOT NULL
 ), firsts AS (
     SELECT variant, reader, arg_min(side, (condition, side, trial_id)) AS side,
-        arg_min(prompt, (condition, side, trial_id)) AS prompt
+        arg_min(prompt, (condition, side, trial_id)) AS prompt,
+        arg_min(spec_hash, (condition, side, trial_id)) AS spec_hash
     FROM asked GROUP BY ALL
 ), baselines AS (
     SELECT side, arg_min(prompt, (condition, trial_id)) AS baseline
     FROM asked WHERE variant = $1 GROUP BY ALL
 )
-FROM firsts LEFT JOIN baselines USING (side) ORDER BY variant <> $1, variant, reader
+FROM firsts LEFT JOIN baselines USING (side) LEFT JOIN (
+    SELECT spec_hash, coalesce(spec->>'$.prompt_blocks', '{}') AS blocks FROM specs
+) USING (spec_hash) ORDER BY variant <> $1, variant, reader
 """
 # Trials of a variant and of its driver's baseline in equal conditions and repetitions, whose specs
 # differ in nothing but the prompt, and what it plants in the emulator.
@@ -85,6 +88,8 @@ def prompts_page(site: Site, asked: Mapping[str, str]) -> str:
         drivers=drivers,
         ends=ends,
         collisions=COLLISIONS.name,
+        baseline=BASELINE,
+        reworded=any(one.prompt != BASELINE for played in driven.values() for one in played),
         # Those that were played with several prompts, the baseline first.
         kinds={
             name: sorted(prompts, key=lambda one: one.prompt != BASELINE)
@@ -99,7 +104,8 @@ def _told(site: Site) -> dict[str, dict[str, list[Part]]]:
     told: dict[str, dict[str, list[Part]]] = {}
     seen: dict[str, list[list[Part]]] = {}
     for row in site.catalogue.ask(FIRST, BASELINE):
-        variant, parts = row["variant"], parts_of(row["prompt"], row["baseline"])
+        variant, digests = row["variant"], digests_of(json.loads(row["blocks"]), row["side"])
+        parts = parts_of(row["prompt"], row["baseline"], digests)
         said = [part for part in parts if part.changed or row["baseline"] is None]
         if said not in seen.setdefault(variant, []):
             seen[variant].append(said)
@@ -157,12 +163,11 @@ def left_out(site: Site, variant: str) -> str:
     baseline = frozenset(blocks_of(BASELINE))
     # A block that one driver alone is told has its side behind its name; of the baseline's ones
     # that is what the other one is not told.
-    own = frozenset(
-        name.partition("@")[0] for name in names if name.partition("@")[0] not in baseline
-    )
+    own = frozenset(level_of(name.partition("@")[0]) for name in names) - baseline
     own |= baseline & frozenset(names)
-    changes = Variant(removes=baseline - own, adds=own - baseline)
-    return changes_text(changes, _named) or "the whole prompt"
+    # The levels of words are in the variant's name already.
+    changes = Variant(removes=baseline - own, adds=own - baseline - frozenset(variant.split(" ")))
+    return changes_text(changes, _named) or ("the whole prompt" if own == baseline else "")
 
 
 def _named(block: str) -> str:

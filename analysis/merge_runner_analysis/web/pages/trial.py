@@ -22,7 +22,13 @@ from merge_runner_analysis.web.trial.account import TICK_S
 from merge_runner_analysis.web.trial.prompt_parts import parts_of
 from merge_runner_analysis.web.trial.reader import Trial, read_trials
 from merge_runner_analysis.web.trial.replay import VIEW_BOX, account_of, plan_chart, replay_data
-from merge_runner_analysis.web.trial.sentences import facts, judged_text, outcome_text, summary
+from merge_runner_analysis.web.trial.sentences import (
+    facts,
+    judged_text,
+    outcome_text,
+    summary,
+    told,
+)
 
 # What is offered to lay beside a trial, and by what rule.
 HUMAN, REPETITION = "nearest human", "next repetition"
@@ -87,6 +93,7 @@ def _page(site: Site, row: Row, trial: Trial, template: str) -> str:
         row=row,
         outcome=outcome_text(row),
         facts=facts(row),
+        told=told(row, trial),
         judged=judged_text(trial.scenario),
         view_box=VIEW_BOX,
         data=replay_data(row, trial, account) if trial.states else None,
@@ -131,7 +138,11 @@ def decision_panel(
         page=site.at.trial(row, **named),
         clamped=clamped,
         before=before,
-        parts=parts_of(decision["prompt"] or "", before["prompt"] if before else None),
+        parts=parts_of(
+            decision["prompt"] or "",
+            before["prompt"] if before else None,
+            trial.blocks[decision["side"]],
+        ),
         meaning=block_meaning,
         others=others,
         reply=shortened(decision["reply"]) if decision["reply"] else None,

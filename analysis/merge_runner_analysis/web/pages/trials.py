@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from merge_runner.prompts.blocks import decomposed
+from merge_runner.study.crossing import OPPONENT
 from merge_runner_analysis.tables import TABLES
 from merge_runner_analysis.web.catalogue import PAGE, SORTS, Wanted
 from merge_runner_analysis.web.computed import awaited, computed
@@ -62,14 +64,26 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
         invalid=sum(part["invalid"] for part in totals),
         rows=rows,
         errors=_errors(site, rows),
-        prompted=len({row["variant"] for row in rows} - {None}) > 1,
-        leveled=any(row["levels"] for row in rows),
+        # A study's levels of words are among its factors.
+        prompted=len({decomposed(row["variant"])[0] for row in rows if row["variant"]}) > 1,
+        focal=any(row["focal"] for row in rows),
+        factors={row["number"]: text for row in rows if (text := _factors(row))},
         scale=speed_range(rows),
         news=news,
         page=page,
         last_page=last,
         sparkline=sparkline,
         unknown=[] if rows else _unknown(site, chosen),
+    )
+
+
+def _factors(row: Row) -> str:
+    """The levels of a trial's study that its driver does not name already."""
+    levels = [*(row["levels"] or ())]
+    return ", ".join(
+        level
+        for level in levels
+        if level.partition("=")[0] != OPPONENT and level not in row["model"]
     )
 
 

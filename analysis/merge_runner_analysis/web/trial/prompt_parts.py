@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher
 from functools import cache, lru_cache
+from itertools import product
 from typing import Literal
 
-from merge_runner.prompts.blocks import BLOCKS
+from merge_runner.prompts.blocks import BLOCKS, LAST, Block
+from merge_runner.records import Side
 
 Change = Literal["same", "new", "gone"]
 _WORDS = re.compile(r"[^\s\[\](),]+\s*|[\[\](),]\s*|\s+")
@@ -18,9 +21,10 @@ KEPT = 256
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """One block of a prompt: its name, empty where no block of ours begins like it, and its text.
+    """One block of a prompt: its name, empty where it is not known, and its text.
 
-    ``pieces`` are the text in order, with what was in the prompt before and is no more.
+    Words of a study are named by the level that adds them: ``hurry=yes``. ``pieces`` are
+    the text in order, with what was in the prompt before and is no more.
     """
 
     name: str
@@ -32,24 +36,43 @@ class Part:
         return any(change != "same" for change, _ in self.pieces)
 
 
-def parts_of(prompt: str, before: str | None) -> list[Part]:
+def parts_of(
+    prompt: str, before: str | None, digests: Mapping[str, str] | None = None
+) -> list[Part]:
     """The parts of a prompt, each compared with the same block of the one before.
 
-    Those that are only in the one before come last. Without one before, nothing is marked.
+    Those that are only in the one before come last. Without one before, nothing is marked. The
+    ``digests`` of its blocks, as its spec has them, name the words of a study.
     """
+    own = tuple((digests or {}).items())
     if before is None:
-        return [Part(name, (("same", text),)) for name, text in _blocks(prompt)]
-    earlier, now = dict(_blocks(before)), _blocks(prompt)
+        return [Part(name, (("same", text),)) for name, text in _blocks(prompt, own)]
+    earlier, now = dict(_blocks(before, own)), _blocks(prompt, own)
     gone = [(name, "") for name in earlier if name not in dict(now)]
     return [Part(name, _compared(earlier.get(name, ""), text)) for name, text in (*now, *gone)]
 
 
+def digests_of(blocks: Mapping[str, str], side: Side) -> dict[str, str]:
+    """The digests of the blocks that a spec has, without those of the other side's prompt alone."""
+    named = ((name.partition("@"), digest) for name, digest in blocks.items())
+    return {name: digest for (name, _, of), digest in named if of in ("", side)}
+
+
+def words_of(prompt: str, digests: Mapping[str, str]) -> list[tuple[str, str]]:
+    """The words of a study in a prompt: the level or prompt that adds them, and their text."""
+    return [
+        (name, text)
+        for name, text in _blocks(prompt, tuple(digests.items()))
+        if name and name not in BLOCKS
+    ]
+
+
 @lru_cache(KEPT)
-def _blocks(prompt: str) -> list[tuple[str, str]]:
+def _blocks(prompt: str, own: tuple[tuple[str, str], ...]) -> list[tuple[str, str]]:
     """Name and text of each block; what belongs to none that is known here has no name.
 
     Of the blocks whose paragraphs begin like the next ones the one with the longest beginnings is
-    meant.
+    meant. ``own`` are name and digest of all that the prompt has.
     """
     known = [
         (name, _begun(template))
@@ -65,12 +88,37 @@ def _blocks(prompt: str) -> list[tuple[str, str]]:
             if begun[0] and all(map(str.startswith, paragraphs, begun))
         )
         _, name, length = max(alike, default=(0, "", 1))
+        if not name:
+            name, length = _own_block(paragraphs, own)
         text = "\n\n".join(paragraphs[:length])
-        if found and name == found[-1][0] == "":
+        if found and name == found[-1][0]:
             text = f"{found.pop()[1]}\n\n{text}"
         found.append((name, text))
         del paragraphs[:length]
-    return found
+    # Words with values in them are not known by their digest: those that are left are meant.
+    left = {level_of(name) for name, _ in own if name not in BLOCKS} - {name for name, _ in found}
+    return [(name or ", ".join(sorted(left)), text) for name, text in found]
+
+
+def _own_block(paragraphs: Sequence[str], own: Iterable[tuple[str, str]]) -> tuple[str, int]:
+    """The name of the block that comes next, known by the digest of its text, and its length.
+
+    The digest covers what the block stands before, too.
+    """
+    names = {digest: name for name, digest in own}
+    for length in range(len(paragraphs) if names else 0, 0, -1):
+        text = "\n\n".join(paragraphs[:length])
+        roads = ((text, text), (text, None), (None, text))
+        for (merge, straight), place in product(roads, (None, LAST, *names.values())):
+            if name := names.get(Block("", merge, straight, place).digest):
+                return level_of(name), length
+    return "", 1
+
+
+def level_of(block: str) -> str:
+    """The level or prompt that adds a block: ``hurry=yes`` of ``hurry=yes.1``."""
+    name, _, number = block.rpartition(".")
+    return name if number.isdigit() and block not in BLOCKS else block
 
 
 @cache

@@ -15,6 +15,7 @@ from merge_runner.drivers.pace import Pace, pace_of
 from merge_runner.records import SIDES, Side
 from merge_runner.results.database import by_name, names_of
 from merge_runner_analysis.web.reading import Row, records
+from merge_runner_analysis.web.trial.prompt_parts import digests_of
 
 Key = tuple[str, str]
 """The name of a trial, and its spec."""
@@ -42,13 +43,15 @@ class Trial:
 
     ``paces`` say when each driver decided. A decision is a row with the one ``before`` on its side,
     its ``attempts`` and the last ``reply``, what was ``perceived`` where that was imperfect,
-    whether its call was ``lost`` and whether it was ``driven``.
+    whether its call was ``lost`` and whether it was ``driven``. ``blocks`` are the digests of each
+    side's prompt.
     """
 
     scenario: ScenarioConfig
     paces: dict[Side, Pace]
     states: dict[Side, Row]
     decisions: list[Row]
+    blocks: dict[Side, dict[str, str]]
 
     @property
     def end_s(self) -> float:
@@ -117,6 +120,7 @@ def _trial(
         {side: pace_of(scenario, told.get(side, {})) for side in SIDES},
         {row["side"]: row for row in states},
         [made[place] for place in sorted(made)],
+        {side: digests_of(told.get("prompt_blocks") or {}, side) for side in SIDES},
     )
     before: dict[str, Row] = {}
     for row in trial.decisions:

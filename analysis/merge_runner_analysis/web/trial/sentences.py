@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.prompts.blocks import title_of
+from merge_runner.records import SIDES
 from merge_runner_analysis.web.phrases import condition_text
 from merge_runner_analysis.web.reading import Row
+from merge_runner_analysis.web.trial.prompt_parts import words_of
 from merge_runner_analysis.web.trial.reader import Trial, controlled
 from merge_runner_analysis.wording import number
 
@@ -54,6 +56,25 @@ def facts(row: Row) -> list[str]:
         row["caution"] and f"Note: {row['caution']}",
     )
     return [f"{text}." for text in texts if text]
+
+
+def told(row: Row, trial: Trial) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Who was told which words of a study: the drivers, and the levels with their text.
+
+    Empty where neither prompt has any.
+    """
+    words = {
+        side: words_of(decisions[0]["prompt"] or "", trial.blocks[side])
+        for side, decisions in trial.by_side.items()
+    }
+    if len(words) == len(SIDES) and words["left"] == words["right"]:
+        return [("Both drivers were told", words["left"])] if words["left"] else []
+    if not any(words.values()):
+        return []
+    role = {row["focal"]: ", the ego,"}
+    return [
+        (f"The {side} driver{role.get(side, '')} was told", words.get(side, [])) for side in SIDES
+    ]
 
 
 def summary(trial: Trial) -> list[str]:
