@@ -60,7 +60,10 @@ class Group:
     levels: Mapping[str, str] = field(default_factory=dict)
     """By factor the level of its study; model and prompt are the first ones."""
     trials: pd.DataFrame
-    """Rows of a study's trials, of programs the distinct ones; ``way`` is equal in copies.
+    """Rows of a study's trials, of programs the distinct ones.
+
+    ``way`` is equal in trials of programs and of stand-ins that went alike: copies, where the
+    groups differ only in words that nobody reads.
 
     Humans before an import have the published outcomes alone."""
     whole: Group | None = None
@@ -293,7 +296,7 @@ def groups_of(
         # later may be equal until then.
         only_asked = rows["source"].iloc[0] == "seat" and any(map(has_chance, own))
         programs = all(map(programs_alone, own)) and not only_asked
-        group = _distinct(group, programs=programs)
+        group = _distinct(group, programs=programs, scripted=group.scripted and not only_asked)
         groups.append(replace(group, levels=levels_of_group(levels, group)))
     return sorted(groups, key=lambda g: (g.scripted, g.driver, g.setting != BASELINE, g.setting))
 
@@ -320,17 +323,27 @@ def _model_group(rows: pd.DataFrame, first: pd.Series) -> Group:
     return replace(group, label=f"{driver} ({group.said})") if group.said else group
 
 
-def _distinct(group: Group, *, programs: bool) -> Group:
-    """The group without copies, if only programs drive; of a language model they are counted."""
+def _distinct(group: Group, *, programs: bool, scripted: bool) -> Group:
+    """The group without copies, if only programs drive; of a language model they are counted.
+
+    A stand-in reads no words: its trials of several prompts are copies where they went alike, the
+    first of those that did with the first of another's, and so on.
+    """
     rows = group.trials
     ended = rows[rows["trace"].notna()].sort_values(["rep", "ego"], kind="stable")
     again = ended.index[ended.duplicated(["condition", "trace"])]
-    each = rows["trial_id"] + " " + rows["spec_hash"]
-    rows = rows.assign(way=rows["trace"].fillna(each) if programs else each)
+    way = rows["trial_id"] + " " + rows["spec_hash"]
+    if programs:
+        way = rows["trace"].fillna(way)
+    elif scripted:
+        times = ended.groupby(["condition", "trace"]).cumcount().astype(str)
+        way = (ended["trace"] + " " + times).reindex(rows.index).fillna(way)
+    whole = replace(group, trials=rows.assign(way=way))
     if not programs:
-        return replace(group, trials=rows, equal=len(again))
-    whole = replace(group, trials=rows)
-    return replace(whole, trials=rows.drop(index=again), whole=whole) if len(again) else whole
+        return replace(whole, equal=len(again))
+    return (
+        replace(whole, trials=whole.trials.drop(index=again), whole=whole) if len(again) else whole
+    )
 
 
 def _marks(keyed: pd.DataFrame, within: list[str], what: str) -> pd.Series:

@@ -32,7 +32,7 @@ FIGURES = {
         "Each level of each factor by driver, over all of its trials: shares with Wilson "
         "intervals, means with those of Student's t. Dotted: neither driver is favoured. How far "
         "levels are apart, within equal conditions, is in the table effects.",
-        "effects",
+        "levels",
     ),
     "figure2": About(
         "the paper's Figure 2 for the baselines: speeds, who is first, gap and RMSE by condition",

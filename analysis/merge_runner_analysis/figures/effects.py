@@ -10,9 +10,8 @@ from merge_runner.study.crossing import MODEL
 from merge_runner_analysis.figures.style import GREY, LINE_IN, PAGE_IN, Style, style, wrapped
 from merge_runner_analysis.grouping import levels_of
 from merge_runner_analysis.metrics import LEFT_FIRST
-from merge_runner_analysis.stats.effects import Level, levels_by_factor, measured
+from merge_runner_analysis.stats.effects import Level, level_estimate, levels_by_factor, measured
 from merge_runner_analysis.stats.estimate import Estimate
-from merge_runner_analysis.stats.measures import estimate
 from merge_runner_analysis.study import Study
 
 ACROSS = 3  # panels
@@ -30,7 +29,7 @@ def effects_figure(study: Study) -> Figure:
         metric
         for metric in measured(study)
         if metric.estimator != "median"
-        and any(estimate(level.pooled, metric).value is not None for level in every)
+        and any(level_estimate(study, level, metric).value is not None for level in every)
     ]
     drivers = list(dict.fromkeys(driver for levels in lines.values() for driver, _ in levels))
     looks = {driver: style(number) for number, driver in enumerate(drivers)}
@@ -43,7 +42,7 @@ def effects_figure(study: Study) -> Figure:
         for place, levels in enumerate(lines.values()):
             for driver, level in levels:
                 beside = 0.5 * (drivers.index(driver) + 0.5) / len(drivers) - 0.25
-                _draw(axis, place + beside, estimate(level.pooled, metric), looks[driver])
+                _draw(axis, place + beside, level_estimate(study, level, metric), looks[driver])
         if metric is LEFT_FIRST:
             axis.axvline(EVEN, color=GREY, ls=":", lw=0.8)
         _limit(axis, 0.0 if metric.rate else metric.least, 100.0 if metric.unit == "%" else None)

@@ -46,9 +46,17 @@ class Cells:
 
     @property
     def shares(self) -> NDArray[np.float64]:
-        """What each cell weighs, of 1."""
-        weights = self.n * self.m / (self.n + self.m)
+        """What each cell weighs, of 1; a trial that stands in two cells is half a one in each."""
+        n, m = (
+            (1 + of) / 2 * size for of, size in zip(self.varying, (self.n, self.m), strict=True)
+        )
+        weights = n * m / (n + m)
         return np.asarray(weights / weights.sum(), dtype=float)
+
+    @property
+    def rates(self) -> tuple[float, float]:
+        """Both rates, of cells that weigh as in their difference."""
+        return float(self.shares @ (self.a / self.n)), float(self.shares @ (self.b / self.m))
 
     @property
     def difference(self) -> float:
@@ -242,7 +250,8 @@ def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> E
     conditions, as when one group collides more in some, makes no difference. Its error holds where
     groups differ in size and in variance (HC2; MacKinnon and White 1985), and so do its degrees of
     freedom (Bell and McCaffrey 2002, of two variances). In one condition it is the test of Welch
-    (1947). None where the groups share no condition, or a single trial is all of one.
+    (1947). None where the groups share no condition, or a single trial is all of one; without a
+    test where all trials of a condition are equal.
     """
     known = [frame.loc[frame[measure].notna(), ["condition", measure]] for frame in (first, second)]
     shared = {*known[0]["condition"]} & {*known[1]["condition"]}
@@ -267,7 +276,22 @@ def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> E
     freedom = float(len(cells) - len(conditions) - 1)
     if se > ROUNDING:
         freedom = _freedom(cells, belongs, group, left_over, np.array(variances))
+    elif abs(slope) < ROUNDING:
+        return Estimate(0.0, se=0.0, freedom=freedom)
     return tested(slope, se, freedom)
+
+
+def means_within(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> tuple[float, float]:
+    """Both means, of the conditions that both have, which weigh as in their difference."""
+    one, other = (
+        frame.groupby("condition", sort=True)[measure].agg(["mean", "count"])
+        for frame in (first, second)
+    )
+    one, other = one[one.index.isin(other.index)], other[other.index.isin(one.index)]
+    n, m = (of["count"].to_numpy(float) for of in (one, other))
+    shares = n * m / (n + m)
+    shares /= shares.sum()
+    return float(shares @ one["mean"].to_numpy()), float(shares @ other["mean"].to_numpy())
 
 
 def _freedom(

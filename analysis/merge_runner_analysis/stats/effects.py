@@ -7,7 +7,7 @@ in the cells that all four have.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain, combinations, product
@@ -26,6 +26,7 @@ from merge_runner_analysis.stats.contrasts import (
     contrast_rates,
     corrected,
     difference_of_contrasts,
+    means_within,
     shared_cells,
 )
 from merge_runner_analysis.stats.estimate import Estimate
@@ -64,11 +65,6 @@ class Level:
         return f"{self.at}/" * bool(self.at) + f"{self.factor}={self.name}{self.mark}"
 
     @cached_property
-    def cells(self) -> set[Cell]:
-        """The cells of its trials that ended."""
-        return {*self.pooled.ended["cell"]}
-
-    @cached_property
     def copies(self) -> tuple[tuple[str, str], ...]:
         """The trials of its groups that are left out as copies (trial_id, spec_hash)."""
         copies = self.pooled.stored.trials.drop(index=self.pooled.trials.index)
@@ -82,9 +78,9 @@ class Level:
 class Effect:
     """A level against the reference of its factor, in one measure, in the unit of that.
 
-    ``at_level`` and ``at_reference`` are the estimates of all their trials, the ``difference`` is
-    within the shared cells, with its interval, p and detectable; its value is None where nothing is
-    compared. ``n`` and ``n_reference`` are the trials that it rests on, without ``left_out``.
+    ``at_level`` and ``at_reference`` are the estimates within the shared cells, in which the trials
+    count without ``left_out``; their ``difference`` has its interval, p and detectable. Values are
+    None where nothing is compared. Of an interaction the first two have no value but their trials.
     Of an interaction ``across`` are the same two levels at the reference of the other factor.
     ``p_corrected`` is by Holm's method, in the family that ``primary`` tells.
     """
@@ -95,8 +91,6 @@ class Effect:
     at_level: Estimate
     at_reference: Estimate
     difference: Estimate
-    n: int
-    n_reference: int
     left_out: tuple[tuple[str, str], ...] = ()
     across: tuple[Level, Level] | None = None
     primary: bool = False
@@ -206,11 +200,8 @@ def measured(study: Study) -> list[Metric]:
 def _of_levels(study: Study, levels: Sequence[Level]) -> Iterator[Effect]:
     """Each level but the first against that one, measure by measure."""
     reference, *others = levels
-    for metric in measured(study):
-        first = estimate(reference.pooled, metric)
-        for level in others:
-            both = estimate(level.pooled, metric), first
-            yield _effect(study, metric, (level, reference), both)
+    for metric, level in product(measured(study), others):
+        yield _effect(study, metric, (level, reference))
 
 
 def _interactions(study: Study, by: str = "") -> Iterator[Effect]:
@@ -234,7 +225,7 @@ def _interactions(study: Study, by: str = "") -> Iterator[Effect]:
             for metric, level in product(tested, levels):
                 if level.name in same:
                     four = (level, reference, same[level.name], base)
-                    yield _effect(study, metric, four, (Estimate(), Estimate()), turned=turned)
+                    yield _effect(study, metric, four, turned=turned)
 
 
 def _at(study: Study, factor: str, by: str, at: str) -> Iterator[list[Level]]:
@@ -245,12 +236,7 @@ def _at(study: Study, factor: str, by: str, at: str) -> Iterator[list[Level]]:
 
 
 def _effect(
-    study: Study,
-    metric: Metric,
-    levels: Sequence[Level],
-    both: tuple[Estimate, Estimate],
-    *,
-    turned: bool = False,
+    study: Study, metric: Metric, levels: Sequence[Level], *, turned: bool = False
 ) -> Effect:
     """One level less another; of four, less that of the others."""
     frames = trials_by_cell(study, [level.pooled for level in levels], metric)
@@ -263,14 +249,38 @@ def _effect(
     found = _difference(ordered, metric) or Estimate()
     # Where nothing varies it is not known what could have been seen.
     found = replace(found, detectable=found.detectable or None)
+    both = _of_both(frames[0], frames[1], metric) if frames else (Estimate(), Estimate())
+    if len(levels) > 2:
+        both = (replace(both[0], value=None), replace(both[1], value=None))
     return Effect(
         *(levels[0], levels[1], metric, *both),
         difference=found.times(100 if metric.rate else 1),
-        n=frames[0].index.nunique() if frames else 0,
-        n_reference=frames[1].index.nunique() if frames else 0,
         left_out=tuple(sorted(left_out)),
         across=(levels[2], levels[3]) if len(levels) > 2 else None,
     )
+
+
+def _of_both(
+    first: pd.DataFrame, second: pd.DataFrame, metric: Metric
+) -> tuple[Estimate, Estimate]:
+    """What both groups of trials come to, one less the other of which is their difference."""
+    one, other = (_counted(frame, metric) for frame in (first, second))
+    if not one.n:
+        return one, other
+    if metric.estimator == "median":
+        values = float(first["value"].median()), float(second["value"].median())
+    elif metric.rate and (cells := shared_cells(first, second, "value")):
+        values = 100 * cells.rates[0], 100 * cells.rates[1]
+    else:
+        values = means_within(first, second, "value")
+    return replace(one, value=values[0]), replace(other, value=values[1])
+
+
+def _counted(frame: pd.DataFrame, metric: Metric) -> Estimate:
+    """How many trials there are, and in how many it is so; not of those read from both sides."""
+    from_both = "varies" in frame and not frame["varies"].all()
+    k = int(frame["value"].sum()) if metric.rate and not from_both else None
+    return Estimate(n=frame.index.nunique(), k=k)
 
 
 def _difference(frames: Sequence[pd.DataFrame], metric: Metric) -> Estimate | None:
@@ -354,6 +364,41 @@ def one_sided(study: Study) -> bool:
     )
 
 
+def level_estimate(study: Study, level: Level, metric: Metric) -> Estimate:
+    """A metric of all trials of a level, with its 95 % interval.
+
+    Who goes first is read from both sides where equal drivers are told the same: each of these
+    trials counts half for either, and has no variance.
+    """
+    group = level.pooled
+    trials = group.trials
+    same = trials[metric.column].notna() & _told_the_same(trials)
+    if metric is not LEFT_FIRST or not one_sided(study) or not same.any():
+        return estimate(group, metric)
+    own = estimate(replace(group, trials=trials[~same]), metric)
+    n = own.n + int(same.sum())
+    if own.value is None:
+        return Estimate(50.0, n=n)
+    value, low, high = (
+        None if of is None else 50 + (of - 50) * own.n / n for of in (own.value, own.low, own.high)
+    )
+    return Estimate(value, low, high, n)
+
+
+def cells_seen(study: Study, level: Level) -> set[Cell]:
+    """The cells of its trials that ended; where both drivers are told the same, of both sides."""
+    trials = level.pooled.ended
+    seen = {*trials["cell"]}
+    if one_sided(study):
+        same = trials.loc[_told_the_same(trials), "cell"].unique()
+        seen |= {(_image(study, condition), *others) for condition, *others in same}
+    return seen
+
+
+def _told_the_same(trials: pd.DataFrame) -> pd.Series:
+    return trials["focal"].isna() & _of_equals(trials)
+
+
 def _of_equals(trials: pd.DataFrame) -> pd.Series:
     return trials["model_left"] == trials["model_right"]
 
@@ -366,7 +411,7 @@ def _from_both_sides(study: Study, frame: pd.DataFrame, trials: pd.DataFrame) ->
     sum of both does not vary.
     """
     trials = trials.loc[frame.index]
-    same = trials["focal"].isna() & _of_equals(trials)
+    same = _told_the_same(trials)
     sides = _with_side(frame["condition"], trials["ego"])
     left = frame.assign(condition=sides, varies=~same)
     images = {name: _image(study, name) for name in trials["condition"].unique()}
@@ -409,28 +454,32 @@ def copied_cells(study: Study, groups: tuple[Group, ...]) -> set[Cell]:
     ways = [_ways(study, group) for group in groups]
     copied: set[Cell] = set()
     for one, other in combinations(ways, 2):
-        shared = one.keys() & other.keys()
-        heeded = {
-            each[1:]
-            for each in shared
-            if not (one[each] <= other[each] or other[each] <= one[each])
-        }
-        copied |= {each for each in shared if each[1:] not in heeded}
+        for others in one.keys() & other.keys():
+            if _are_copies(one[others], other[others]):
+                copied |= {(name, *others) for name in one[others].keys() & other[others].keys()}
     return copied
 
 
 @remembered
-def _ways(study: Study, group: Group) -> dict[Cell, set[object]]:
-    """The ways in which the trials of each cell went."""
-    ways: dict[Cell, set[object]] = {}
-    for name, way in zip(group.ended["cell"], group.ended["way"], strict=True):
-        ways.setdefault(name, set()).add(way)
+def _ways(study: Study, group: Group) -> dict[Cell, dict[str, set[object]]]:
+    """The ways in which trials went, by the levels of the other factors and by condition."""
+    ways: dict[Cell, dict[str, set[object]]] = {}
+    for (condition, *others), way in zip(group.ended["cell"], group.ended["way"], strict=True):
+        ways.setdefault((*others,), {}).setdefault(condition, set()).add(way)
     return ways
+
+
+def _are_copies(one: Mapping[str, set[object]], other: Mapping[str, set[object]]) -> bool:
+    """Whether in every condition that both have all trials of one are among the other's."""
+    shared = one.keys() & other.keys()
+    return bool(shared) and all(
+        one[name] <= other[name] or other[name] <= one[name] for name in shared
+    )
 
 
 def copied_of_shared(study: Study, *levels: Level) -> tuple[int, int]:
     """How many of the cells that levels share are copied ones, and how many they share."""
-    shared = set.intersection(*({*level.cells} for level in levels))
+    shared = set.intersection(*({*level.pooled.ended["cell"]} for level in levels))
     return len(shared & copied_cells(study, tuple(level.pooled for level in levels))), len(shared)
 
 
@@ -445,7 +494,7 @@ def levels_by_factor(study: Study, by: str = "", at: str = "", least: int = 2) -
     kinds = [[g for g in chosen if g.scripted == scripted] for scripted in (False, True)]
     apart = any(g.scripted for g in study.models) and not all(g.scripted for g in study.models)
     return [
-        _distinct([_level(groups, factor, name, by, apart=apart) for name in levels])
+        _distinct(study, [_level(groups, factor, name, by, apart=apart) for name in levels])
         for groups in kinds
         for factor, levels in levels_of(groups, study.order).items()
         if len(levels) >= least
@@ -493,29 +542,43 @@ def crossing(study: Study, factors: Sequence[str], wanted: Mapping[str, str]) ->
         name = ", ".join(wanted[factor] for factor in factors)
         pooled = _with_cells(groups, {*wanted})
         ids = tuple(group.id for group in groups)
-        found += _distinct([Level(TIMES.join(factors), name, ids, pooled, mark=mark)])
+        found += _distinct(study, [Level(TIMES.join(factors), name, ids, pooled, mark=mark)])
     return found
 
 
-def _distinct(levels: list[Level]) -> list[Level]:
+def _distinct(study: Study, levels: list[Level]) -> list[Level]:
     """The levels, each without copies of trials, and with the cells that share these as one."""
-    names: dict[tuple[str, ...], tuple[str, ...]] = {}
+    names: dict[Cell, Cell] = {}
 
-    def first(cell: tuple[str, ...]) -> tuple[str, ...]:
+    def first(cell: Cell) -> Cell:
         while (before := names.get(cell, cell)) != cell:
             cell = before
         return cell
 
     for level in levels:
-        for _, cells in level.pooled.trials.groupby(["condition", "way"])["cell"]:
+        for cells in _with_copies(study, level.pooled):
             same = sorted({first(cell) for cell in cells})
             names |= dict.fromkeys(same[1:], same[0])
     return [_without_copies(level, first) for level in levels]
 
 
+def _with_copies(study: Study, group: Group) -> Iterator[Iterable[Cell]]:
+    """Cells that have copies of each other's trials.
+
+    Of programs those of a condition in which any trials are equal. A stand-in plays with chance:
+    its trials of two levels that it reads may be equal here and there, which makes them no copies.
+    """
+    if not group.scripted:
+        yield from (cells for _, cells in group.trials.groupby(["condition", "way"])["cell"])
+        return
+    for (own, one), (its, other) in combinations(_ways(study, group).items(), 2):
+        if _are_copies(one, other):
+            yield from (((name, *own), (name, *its)) for name in one.keys() & other.keys())
+
+
 def _without_copies(level: Level, first: Callable[[tuple[str, ...]], tuple[str, ...]]) -> Level:
     every = level.pooled.trials
     every = every.assign(cell=pd.Series([first(cell) for cell in every["cell"]], dtype=object))
-    kept = every.drop_duplicates(["condition", "way"])
+    kept = every.drop_duplicates(["cell", "way"])
     pooled = replace(level.pooled, trials=kept, whole=replace(level.pooled, trials=every))
     return replace(level, groups=tuple(kept["group"].unique()), pooled=pooled)

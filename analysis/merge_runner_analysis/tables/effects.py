@@ -12,9 +12,11 @@ from merge_runner_analysis.stats.effects import (
     DRIVER,
     Effect,
     Level,
+    cells_seen,
     compared,
     copied_of_shared,
     effects,
+    level_estimate,
     levels_by_factor,
     primary,
 )
@@ -39,9 +41,8 @@ FAMILIES = (
     "measure, are one, without those of the model; all others are the other one"
 )
 DETECTABLE = "detectable: found at p < .05, before correction, with power .8"
-SAME_TRIALS = (
-    "programs play no trial at one of both levels that they do not play at the other: no test"
-)
+SAME_TRIALS = "not tested: the same trials at both levels, since no driver reads what differs"
+SAME_VALUE = "the same in every trial, so that there is nothing to test"
 UNTESTED = (
     "no test without cells that all have, spread within cells, or with undecided trials, trials of "
     "several studies or the same ones at two levels"
@@ -58,14 +59,13 @@ def effects_table(study: Study) -> Table:
         (
             *([Column("at", by)] if by else []),
             Column("factor", "factor"),
+            Optional("drivers", "drivers", "text", "scripted: stand-ins"),
             Column("level", "level"),
             Column("reference", "against"),
             Column("measure", "measure"),
-            Optional("estimate", "estimate", "number", "of all trials of the level"),
-            Optional("estimate_reference", "reference", "number", "of all of the reference"),
-            Optional(
-                "difference", "difference", "number", "level less reference, within shared cells"
-            ),
+            Optional("estimate", "estimate", "number", "of the level, within the shared cells"),
+            Optional("estimate_reference", "reference", "number", "of the reference, in the same"),
+            Optional("difference", "difference", "number", "estimate less reference"),
             interval("ci", "of the same test"),
             Optional("p", "p", "p", TEST),
             Optional("p_corrected", "p, corr.", "p", "corrected by Holm"),
@@ -82,8 +82,8 @@ def effects_table(study: Study) -> Table:
 def comparison(study: Study, one: str, other: str) -> Table:
     """A driver with its prompt less another, by their groups' ids: a row per measure.
 
-    ``k`` of ``n`` trials and the value are of all of a driver's, the difference is within the
-    situations of both. Without rows where one of them is not judged.
+    ``k`` of ``n`` trials and the value are of the situations of both, of which the difference is;
+    of all of a driver's trials where nothing is compared. Without rows where one is not judged.
     """
     known = {group.id: group for group in study.models}
     found = compared(study, known[one], known[other]) if {one, other} <= {*known} else []
@@ -111,9 +111,11 @@ def _compared_row(study: Study, one: Effect) -> Row:
         "p_corrected": one.p_corrected,
         "detectable": one.difference.detectable,
     }
-    for of, own in zip(SIDES, (one.at_level, one.at_reference), strict=True):
-        k = own.k if one.metric.rate else None  # that of valid replies counts replies
-        values |= {f"k{of}": k, f"n{of}": own.n, f"value{of}": own.value}
+    sides = (one.level, one.at_level), (one.reference, one.at_reference)
+    for of, (level, own) in zip(SIDES, sides, strict=True):
+        shown = level_estimate(study, level, one.metric) if own.value is None else own
+        k = shown.k if one.metric.rate else None  # that of valid replies counts replies
+        values |= {f"k{of}": k, f"n{of}": shown.n, f"value{of}": shown.value}
     return Row(one.id, one.groups, values, problem(study, one), one.metric.column, (), one.left_out)
 
 
@@ -126,6 +128,7 @@ def _row(study: Study, one: Effect) -> Row:
     values: dict[str, Value] = {
         "at": _place(one.level, one.across),
         "factor": one.factor,
+        "drivers": "scripted" if one.level.posing else None,
         "level": f"{one.level.name}{one.level.mark}",
         "reference": one.reference.name,
         "measure": one.metric.heading,
@@ -134,8 +137,8 @@ def _row(study: Study, one: Effect) -> Row:
         **_difference(one),
         "p_corrected": one.p_corrected,
         "detectable": one.difference.detectable,
-        "n": one.n,
-        "n_reference": one.n_reference,
+        "n": one.at_level.n,
+        "n_reference": one.at_reference.n,
         "primary": "primary" if one.primary else None,
     }
     return Row(one.id, one.groups, values, problem(study, one), one.metric.column, (), one.left_out)
@@ -157,16 +160,19 @@ def problem(study: Study, one: Effect) -> str:
     levels = (one.level, one.reference, *(one.across or ()))
     copies, shared = copied_of_shared(study, *levels)
     said = [note_of(undecided_note(level.pooled, one.metric)) for level in levels]
-    if not (one.at_level.n and one.at_reference.n) and not one.across:
+    column = one.metric.column
+    if not one.across and any(level.pooled.trials[column].isna().all() for level in levels):
         said.append(f"{one.metric.heading}: a level has no trial with this measure")
     elif copies and copies == shared:
         said.append(SAME_TRIALS)
     elif one.difference.value is None:
         said.append(f"{one.metric.heading}: {UNTESTED}")
+    elif one.difference.p is None and not one.difference.se and one.metric.estimator != "median":
+        said.append(SAME_VALUE)
     elif copies:
         said.append(
-            f"the difference leaves out {copies} of {shared} shared cells, those of programs that "
-            "play the same trials at both levels"
+            f"the difference leaves out {copies} of {shared} shared cells, those with the same "
+            "trials at both levels"
         )
     elif one.metric.rate and one.difference.p is not None and one.difference.detectable is None:
         said.append(f"{one.metric.heading}: so few trials can show no difference, however large")
@@ -183,7 +189,7 @@ def _notes(study: Study, by: str) -> Iterator[str]:
     if found:
         yield f"{FAMILIES.format(primary=primary(study).heading)}. {DETECTABLE}"
     yield from _copies(every)
-    yield from (f"{levels[0].factor}{levels[0].mark}: {balance(levels)}" for levels in every)
+    yield from (f"{levels[0].factor}{levels[0].mark}: {balance(study, levels)}" for levels in every)
     yield RULES_NOTE
 
 
@@ -197,8 +203,8 @@ def _copies(found: Sequence[Sequence[Level]]) -> Iterator[str]:
     ]
     if counts:
         yield (
-            f"{', '.join(counts)} trials of programs are equal to others of the level to the last "
-            "state, at another level of another factor: each counts once, in one cell"
+            f"{', '.join(counts)} trials went as others of the level to the last state, at another "
+            "level of a factor that their drivers do not read: each counts once, in one cell"
         )
 
 
@@ -209,9 +215,10 @@ def factors(study: Study) -> Table:
     for one in effects(study, by):
         if not one.across:
             name = f"{one.reference.id}/{one.metric.name}"
-            rows.setdefault(name, _level_row(name, one, one.reference, one.at_reference))
+            if name not in rows:
+                rows[name] = _level_row(study, name, one, one.reference)
         if by or not one.across:
-            row = _level_row(one.id, one, one.level, one.at_level)
+            row = _level_row(study, one.id, one, one.level)
             different = _difference(one) | {"p_holm": one.p_corrected}
             different["difference_ci"] = different.pop("ci")
             note = problem(study, one)
@@ -241,16 +248,17 @@ def factors(study: Study) -> Table:
     )
 
 
-def _level_row(name: str, one: Effect, level: Level, own: Estimate) -> Row:
-    """A level's own value in the measure of an effect."""
+def _level_row(study: Study, name: str, one: Effect, level: Level) -> Row:
+    """A level's own value in the measure of an effect, of all its trials."""
+    own = Estimate() if one.across else level_estimate(study, level, one.metric)
     values: dict[str, Value] = {
         "at": _place(level, one.across),
         "factor": one.factor,
-        "drivers": "mock" if level.posing else None,
+        "drivers": "scripted" if level.posing else None,
         "measure": one.metric.heading,
         "level": level.name,
         "trials": len(level.pooled.ended),
-        "n": one.n if one.across else own.n,
+        "n": one.at_level.n if one.across else own.n,
         "value": own.value,
         "ci": own.bounds(),
     }
@@ -278,8 +286,8 @@ def contrasts(study: Study) -> Table:
             **_difference(one),
             "p_holm": one.p_corrected,
             "detectable": found.detectable,
-            "n": one.n,
-            "n_reference": one.n_reference,
+            "n": one.at_level.n,
+            "n_reference": one.at_reference.n,
             "freedom": None if isinf(found.freedom) else found.freedom,
         }
         name = f"{group.id}/{other.setting}/{one.metric.name}"
@@ -320,9 +328,9 @@ def _same_as_reference(study: Study) -> Iterator[str]:
         yield f"{', '.join(dict.fromkeys(same))}, beside {study.reference}: {SAME_TRIALS}"
 
 
-def balance(levels: list[Level]) -> str:
+def balance(study: Study, levels: list[Level]) -> str:
     """Whether all levels of a factor have the same cells."""
-    found = {level.name: level.cells for level in levels}
+    found = {level.name: cells_seen(study, level) for level in levels}
     every = set().union(*found.values())
     lacking = [
         f"{name} lacks {len(every) - len(cells)} of {len(every)} cells"

@@ -228,12 +228,16 @@ def shown_columns(table: Table) -> list[Column]:
 
 
 def notes_of(table: Table) -> list[str]:
-    """The notes of rows, then of the table; equal notes of rows appear once, with their groups."""
-    groups: dict[str, dict[str, None]] = {}
+    """The notes of rows, then of the table; equal notes of rows appear once, with whose they are.
+
+    They are a group's, or where a row rests on several those of the row without its measure.
+    """
+    owners: dict[str, dict[str, None]] = {}
     for row in table.rows:
         if row.note:
-            groups.setdefault(row.note, {}).update(dict.fromkeys(row.groups))
-    return [*(f"{', '.join(ids)}: {note}" for note, ids in groups.items()), *table.notes]
+            names = row.groups if len(row.groups) < 2 else (row.id.rpartition("/")[0] or row.id,)
+            owners.setdefault(row.note, {}).update(dict.fromkeys(names))
+    return [*(f"{', '.join(names)}: {note}" for note, names in owners.items()), *table.notes]
 
 
 def shown_value(column: Column, value: Value) -> str:

@@ -9,17 +9,20 @@ from collections.abc import Iterator
 from itertools import product
 
 from merge_runner.study.crossing import MODEL, OPPONENT
-from merge_runner_analysis.metrics import COLLISIONS, GAP, RMSE, Metric
+from merge_runner_analysis.metrics import COLLISIONS, GAP, LEFT_FIRST, RMSE, Metric
 from merge_runner_analysis.stats.effects import (
     Level,
     crossing,
+    level_estimate,
     levels_by_factor,
+    one_sided,
     primary,
 )
 from merge_runner_analysis.stats.measures import counts, estimate
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.model import ENDED, Column, Optional, Row, Table, Value, interval
 
+HALVES = "where both drivers are told the same, a trial counts half for each, and k is not given"
 # More crossings than these are no chart.
 MOST_CROSSINGS = 8
 
@@ -44,10 +47,11 @@ def levels(study: Study) -> Table:
             Optional("gap_m", GAP.heading, "number", GAP.meaning, rests_on=GAP.column),
             Optional("rmse_mps", RMSE.heading, "number", RMSE.meaning, rests_on=RMSE.column),
         ),
-        [_row(level, driver, metric) for driver, level in _every(study)],
+        [_row(study, level, driver, metric) for driver, level in _every(study)],
         (
             "all trials of a level, whether or not another level has the same cells: differences "
             "are in the table effects. A crossing leaves out the driver and the opponent",
+            *([HALVES] if metric is LEFT_FIRST and one_sided(study) else []),
         ),
     )  # fmt: skip
 
@@ -98,14 +102,14 @@ def _names(study: Study, factors: tuple[str, ...]) -> list[list[str]]:
     return [[*known] for known in names.values()]
 
 
-def _row(level: Level, driver: str, metric: Metric) -> Row:
-    group, found = level.pooled, estimate(level.pooled, metric)
+def _row(study: Study, level: Level, driver: str, metric: Metric) -> Row:
+    group, found = level.pooled, level_estimate(study, level, metric)
     crashed, ended = counts(group, COLLISIONS)
     values: dict[str, Value] = {
         "factor": level.factor,
         "level": f"{level.name}{level.mark}",
         "driver": driver or None,
-        "k": counts(group, metric)[0] if metric.rate else None,
+        "k": found.k if metric.rate else None,
         "n": found.n,
         "value": found.value,
         "ci": found.bounds(),

@@ -14,6 +14,7 @@ from typing import Any
 
 from merge_runner.study.crossing import MODEL
 from merge_runner_analysis.metrics import COLLISIONS, GAP, LEFT_FIRST, RMSE
+from merge_runner_analysis.tables.effects import SAME_TRIALS
 from merge_runner_analysis.tables.model import Row, Table
 from merge_runner_analysis.web.marks import Mark
 from merge_runner_analysis.wording import (
@@ -75,12 +76,13 @@ class Chart:
 
 @dataclass(frozen=True, slots=True)
 class Side:
-    """The value of a level, and the trials that it counts, each with the cell of its trials."""
+    """The value of a level in the shared situations; counts of all its trials, and their cells."""
 
     text: str
-    cell: tuple[str, str]
     k: int | None = None
     n: int | None = None
+    row: str = ""
+    columns: tuple[str, str] = ("k", "n")
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +114,7 @@ class Answer:
     measure: str
     drivers: list[tuple[str, str]]
     trials: int
+    halves: bool
     charts: list[Chart]
     crossings: str
     changes: list[Change]
@@ -158,6 +161,7 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
         capital(name_of(primary)),
         [*shapes.items()],
         sum(_count(row, "n") for row in _of_one_factor(known)),
+        any(row.values["k"] is None for row in known) and metric == LEFT_FIRST.name,
         [chart for chart in charts if chart],
         unbroken(_interactions(tested, {str(row.values["factor"]) for row in known})),
         _changes(tested, sides, metric),
@@ -181,23 +185,30 @@ def answered(rows: Sequence[Row], sides: Mapping[str, Row] | None = None) -> tup
     if not primary:
         return "", ""
     what = CHANGED.get(metric_of(primary[0]), name_of(primary[0]))
+    posing = all(row.values.get("drivers") for row in primary)
+    rehearsed = "In a rehearsal with a scripted stand-in, " if posing else ""
     if few := [
         row for row in primary if min(_count(row, "n"), _count(row, "n_reference")) < ENOUGH
     ]:
         counts = [f"{_level(row)} {row.values['n']}" for row in few]
-        return f"Too few trials finished to say: {joined(counts)}.", ""
+        return capital(f"{rehearsed}too few trials finished to say: {joined(counts)}."), ""
     sure = [row for row in primary if _shown(row)]
     rest = []
     if sure:
-        first = sure[0].values["factor"]
-        claim = f"{capital(str(first))} changes {what}: {_both(sure[0], sides or {})}."
-        rest.append(f"In like situations that is {_apart(sure[0])}; p {_p(sure[0])}.")
+        first = sure[0]
+        claim = f"{rehearsed}{first.values['factor']} changes {what}: {_both(first, sides or {})}."
+        of, reference = (_estimate(first, name) for name in ("estimate", "estimate_reference"))
+        rest.append(
+            f"In the same situations that is {of} against {reference}: {_apart(first)}, "
+            f"p {_p(first)}."
+        )
     else:
-        claim = f"No change of {what} is shown by {joined(_factors(primary))}."
+        claim = f"{rehearsed}no change of {what} is shown by {joined(_factors(primary))}."
     for row in primary:
         if row not in sure[:1]:
             shown = "changes it, too" if _shown(row) else "is not shown to change it"
             rest.append(f"{capital(_level(row))} {shown}: {_apart(row)}, p {_p(row)}.")
+    rest += [f"{capital(_level(row))} is {row.note}." for row in rows if _copied(row)]
     if not sure:
         rest.append(_seen(primary))
     crossed = [row for row in tested if _crossed(row) and metric_of(row) == metric_of(primary[0])]
@@ -210,13 +221,13 @@ def answered(rows: Sequence[Row], sides: Mapping[str, Row] | None = None) -> tup
         row = min(also, key=lambda row: _number(row, "p"))
         what = CHANGED.get(metric_of(row), name_of(row))
         rest.append(f"{capital(str(row.values['factor']))} changes {what}: {_both(row, {})}.")
-    return claim, " ".join(filter(None, rest))
+    return capital(claim), " ".join(filter(None, rest))
 
 
 def _pieces(claim: str, row: Row) -> list[tuple[str, tuple[str, str] | None]]:
     """The claim of this effect, cut at its counts: that of the level, then of the reference."""
     names = [f"{row.values['factor']}={row.values[name]}" for name in ("level", "reference")]
-    parts = enumerate(re.split(r"(?<=\()(\d+)(?= of \d+\))", claim))
+    parts = enumerate(re.split(r"(?<= in )(\d+)(?= of \d+ trials)", claim))
     return [(text, (names[place // 2], "k") if place % 2 else None) for place, text in parts]
 
 
@@ -256,22 +267,32 @@ def _factors(rows: Iterable[Row]) -> list[str]:
 
 
 def _both(row: Row, sides: Mapping[str, Row]) -> str:
-    """``with hurry=yes the driver goes first in 63.00 % of trials (63 of 100), with ...``."""
-    of, reference = (number(_number(row, name)) for name in ("estimate", "estimate_reference"))
+    """``with hurry=yes the driver goes first in 63 of 98 trials, with hurry=no in 50 of 99``."""
     factor, level, base = (row.values[name] for name in ("factor", "level", "reference"))
-    metric, unit = metric_of(row), unit_of(row)
-    if metric == LEFT_FIRST.name:
-        counts = [
-            f" ({_counted(sides[name])})" if name in sides else ""
-            for name in (f"{factor}={level}", f"{factor}={base}")
+    of, reference = (_estimate(row, name) for name in ("estimate", "estimate_reference"))
+    if metric_of(row) == LEFT_FIRST.name:
+        found = [sides.get(f"{factor}={name}") for name in (level, base)]
+        shares = [
+            _share(side) if side else f"{share} of trials"
+            for side, share in zip(found, (of, reference), strict=True)
         ]
         return (
-            f"with {factor}={level} the driver goes first in {of} % of trials{counts[0]}, with "
-            f"{factor}={base} in {reference} %{counts[1]}"
+            f"with {factor}={level} the driver goes first in {shares[0]}, with {factor}={base} in "
+            f"{shares[1]}"
         )
-    if unit == "points":
-        return f"{name_of(row)} {of} % with {factor}={level}, {reference} % with {factor}={base}"
-    return f"{of} {unit} with {factor}={level}, {reference} {unit} with {factor}={base}"
+    name = f"{name_of(row)} " if unit_of(row) == "points" else ""
+    return f"{name}{of} with {factor}={level}, {reference} with {factor}={base}"
+
+
+def _share(side: Row) -> str:
+    """``63 of 98 trials``, or, where trials count half, ``51.00 % of 98 trials``."""
+    if side.values["k"] is None:
+        return f"{number(_number(side, 'value'))} % of {side.values['n']} trials"
+    return f"{_counted(side)} trials"
+
+
+def _estimate(row: Row, name: str) -> str:
+    return f"{number(_number(row, name))} {unit_of(row).replace('points', '%')}"
 
 
 def _apart(row: Row) -> str:
@@ -329,6 +350,11 @@ def _crossed(row: Row) -> bool:
     return "/interaction/" in row.id
 
 
+def _copied(row: Row) -> bool:
+    """Whether it is a test of the study's own that could not be made, of equal trials."""
+    return bool(row.values.get("primary")) and row.note == SAME_TRIALS
+
+
 def _tested(row: Row) -> bool:
     return row.values.get("p_corrected") is not None
 
@@ -349,11 +375,15 @@ def _changes(rows: Sequence[Row], sides: dict[str, Row], primary: str) -> list[C
 def _change(row: Row, sides: dict[str, Row], end: float, primary: str) -> Change:
     of, base, metric = row.values["level"], row.values["reference"], metric_of(row)
     mark = " [scripted]" if str(of).endswith(" [scripted]") else ""
-    found = [sides.get(f"{row.values['factor']}={name}") for name in (f"{base}{mark}", of)]
-    reference, level = (
-        None if _crossed(row) or one is None else _side(one, metric, primary) for one in found
-    )
     is_own = metric == primary
+    reference, level = (
+        None
+        if _crossed(row)
+        else _side(
+            _estimate(row, name), sides.get(f"{row.values['factor']}={side}"), is_own, metric
+        )
+        for name, side in (("estimate_reference", f"{base}{mark}"), ("estimate", of))
+    )
     said = f"{of} against {base}"
     if is_own and row.values.get("primary"):
         said += ", primary"
@@ -380,18 +410,13 @@ def difference_mark(row: Row, end: float) -> Mark:
     return Mark(shape, at, (ends[0], ends[1]) if ends else None, zero=50.0)
 
 
-def _side(row: Row, metric: str, primary: str) -> Side | None:
-    """One side of an effect, of a row of ``levels``."""
-    values: Any = row.values
-    if metric == primary:
-        unit = unbroken(" %" if metric.endswith("_percent") else "")
-        return Side(number(values["value"], unit=unit), (row.id, "value"), values["k"], values["n"])
-    if metric == COLLISIONS.name:
-        share = 100 * values["crashed"] / values["ended"] if values["ended"] else None
-        text = number(share, unit=unbroken(" %"))
-        return Side(text, (row.id, "crashed"), values["crashed"], values["ended"])
-    value = values.get(metric)
-    return None if value is None else Side(number(value), (row.id, metric))
+def _side(text: str, counts: Row | None, is_own: bool, metric: str) -> Side:
+    """One side of an effect, with its counts by a row of ``levels``."""
+    columns = ("k", "n") if is_own else ("crashed", "ended")
+    if counts is None or not (is_own or metric == COLLISIONS.name):
+        return Side(unbroken(text))
+    values: Any = counts.values
+    return Side(unbroken(text), values[columns[0]], values[columns[1]], counts.id, columns)
 
 
 def _is_level(row: Row) -> bool:

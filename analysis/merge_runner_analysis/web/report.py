@@ -253,7 +253,8 @@ def _repeats(study: Study) -> Iterator[str]:
     """Which drivers have equal trials, at one level of their factors or at several."""
     by_name: dict[str, list[pd.DataFrame]] = {}
     for group in study.played:
-        by_name.setdefault(group.name, []).append(group.trials)
+        if not group.scripted:
+            by_name.setdefault(group.name, []).append(group.trials)
         if group.repeated:
             yield (
                 f"{group.id}: {group.repeated} of {len(group.stored.trials)} trials of programs "

@@ -384,6 +384,9 @@ def _one_cell(pooled: dict[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
     """The trials of each level without copies; cells in which programs do the same are one."""
     same: dict[tuple, set] = {}
     for name, trials in pooled.items():
+        if trials["scripted"].any():
+            same |= _unread(name, trials)
+            continue
         for cell, way in zip(trials["cell"], trials["way"], strict=True):
             same.setdefault((name, cell[0], way), set()).add(cell)
     parts: list[set] = []
@@ -395,6 +398,21 @@ def _one_cell(pooled: dict[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
         name: distinct(trials.assign(cell=trials["cell"].map(named)))
         for name, trials in pooled.items()
     }
+
+
+def _unread(level: str, trials: pd.DataFrame) -> dict[tuple, set]:
+    """The cells of other levels at which a stand-in plays the same trials, in every condition."""
+    ended = trials[trials["status"] != "failed"]
+    ways = ended.groupby("cell")["way"].agg(set).to_dict()
+    others = sorted({cell[1:] for cell in ways})
+    found: dict[tuple, set] = {}
+    for place, own in enumerate(others):
+        for its in others[place + 1 :]:
+            shared = [cell[0] for cell in ways if cell[1:] == own and (cell[0], *its) in ways]
+            pairs = [(ways[name, *own], ways[name, *its]) for name in shared]
+            if shared and all(a <= b or b <= a for a, b in pairs):
+                found |= {(level, name, own, its): {(name, *own), (name, *its)} for name in shared}
+    return found
 
 
 def _with_other_levels(trials: pd.DataFrame, factor: str) -> pd.DataFrame:
@@ -422,6 +440,6 @@ def _level(trials, reference, column, kind, orders) -> dict:
         return row
     found = _compared(trials, reference, column, kind)
     if found:
-        row |= {"difference": found["difference"], "p": found["p"]}
-        row |= {f"difference_{end}": found[end] for end in ("ci_low", "ci_high")}
+        row |= {"difference": found["difference"], "p": found.get("p")}
+        row |= {f"difference_{end}": found.get(end) for end in ("ci_low", "ci_high")}
     return row

@@ -418,6 +418,8 @@ def means_within(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Se
         variance = np.where(group == 1, squared[group == 1].mean(), squared[group == 0].mean())
         form = (projection[0] ** 2 / np.diag(left))[:, None] * ((left * variance) @ left)
         freedom = np.trace(form) ** 2 / (form * form.T).sum()
+    if se <= 1e-12 and abs(b[0]) < 1e-12:
+        return {"difference": 0.0}
     t = stats.t(freedom)
     return {
         "difference": b[0],

@@ -94,10 +94,15 @@ def read(db: str, study: str = "") -> pd.DataFrame:
         row["way"] = (key, trial.status)  # like no other's
         if key in samples and trial.status != "failed":
             row |= _measured(trial, row["ego"], samples[key])
-            if row["programs"]:
+            if row["programs"] or row["scripted"]:
                 row["way"] = (_as_seen(row["ego"], samples[key]), trial.status)
         found.append(row)
     every = _with_cells(pd.DataFrame(found))
+    # Stand-ins sample: of theirs that went alike the first is one, and so is the second.
+    again = every.groupby(["driver", "variant", "cell", "way"]).cumcount()
+    posing = every["scripted"].astype(bool) & ~every["programs"]
+    ways = [(*way, n) for way, n in zip(every["way"], again, strict=True)]
+    every["way"] = every["way"].mask(posing, pd.Series(ways, every.index, dtype=object))
     every.attrs["orders"] = orders
     if study:
         kept = every["studies"].map(lambda names: any(study == name[0] for name in names))

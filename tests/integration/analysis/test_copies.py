@@ -11,7 +11,7 @@ from merge_runner_analysis.study import Study
 from tests.support.studies import changed, write_study, yielding
 from tests.support.tables import by_id, made, notes_with
 
-SAME = "programs play no trial at one of both levels"
+SAME = "not tested: the same trials at both levels"
 PROGRAM = json.dumps({side: {"program": "own", "chance": True} for side in ("left", "right")})
 
 
@@ -56,7 +56,7 @@ def test_a_level_counts_each_trial_of_a_program_once(db, factors):
         # Each prompt is a cell of its own only to the model, but where all are compared.
         sources = explain(Study(db), factors, f"model={model}/left_first_percent:n").sources
         assert sum(len(source.trials) for source in sources) == n
-    (note,) = notes_with(factors, "trials of programs are equal to others")
+    (note,) = notes_with(factors, "went as others of the level to the last state")
     assert "model=one: 44 of 88, model=two: 44 of 88" in note
     assert "model: every level has the same 11 cells" in factors.notes
 
@@ -92,8 +92,7 @@ def test_what_a_prompt_changes_rests_on_who_reads_it(db, factors):
     for column in ("difference", "difference_ci", "p"):
         assert every.values[column] == pytest.approx(alone.values[column])
     assert every.note == (
-        "the difference leaves out 22 of 33 shared cells, those of programs that play the same "
-        "trials at both levels"
+        "the difference leaves out 22 of 33 shared cells, those with the same trials at both levels"
     )
 
 

@@ -21,8 +21,11 @@ CHEAP_COLD = "cheap+sleepy [temperature=0.2]"
 
 
 @pytest.fixture(scope="module")
-def study(played):
-    return Study(played.db)
+def study(played, tmp_path_factory):
+    """The study as if language models had answered, and no stand-in."""
+    db = tmp_path_factory.mktemp("factors") / "t.duckdb"
+    db.write_bytes(played.db.read_bytes())
+    return changed(db, "UPDATE trials SET scripted = false", "UPDATE calls SET scripted = false")
 
 
 @pytest.fixture(scope="module")
@@ -120,12 +123,12 @@ def test_a_levels_row_pools_its_trials_and_is_compared_with_the_first_level(play
     assert levels == ["cheap", "dear", "self", "sleepy", "1.0", "0.2"]
 
 
-def test_a_level_is_compared_with_the_reference_of_the_study(played, rows, tmp_path):
+def test_a_level_is_compared_with_the_reference_of_the_study(played, study, rows, tmp_path):
     text = (played.folder / "mine.toml").read_text()
     (tmp_path / "mine.py").write_text(PLUGIN)
     file = tmp_path / "mine.toml"
     file.write_text('reference = { temperature = 0.2, model = "dear" }\n' + text)
-    chosen = values_of(Study(played.db, Selection(file=str(file))), "factors")
+    chosen = values_of(Study(study.db, Selection(file=str(file))), "factors")
     assert rows["temperature=0.2/gap_m"]["difference"] == pytest.approx(
         -chosen["temperature=1.0/gap_m"]["difference"]
     )
@@ -167,8 +170,8 @@ def test_a_comparison_has_one_corrected_p_wherever_it_is_printed(tmp_path):
     assert notes_with(levels, "prompt: not balanced")
 
 
-def test_factors_are_shown_at_each_level_of_another_one_with_interactions(played):
-    study = Study(played.db, Selection(by="opponent"))
+def test_factors_are_shown_at_each_level_of_another_one_with_interactions(played, study):
+    study = Study(study.db, Selection(by="opponent"))
     table = made(study, "factors")
     rows = {row.id: row.values for row in table.rows}
     at_self, at_sleepy = (rows[f"opponent={n}/temperature=0.2/gap_m"] for n in ("self", "sleepy"))
@@ -208,7 +211,7 @@ def test_an_interaction_is_the_difference_of_the_differences_in_shared_cells(tmp
 
 
 def test_means_are_compared_within_the_cells_that_both_levels_have_and_the_notes_say_which(
-    study, factors, rows
+    played, study, factors, rows
 ):
     (note,) = notes_with(factors, "model: ")
     assert note.startswith(
@@ -216,11 +219,21 @@ def test_means_are_compared_within_the_cells_that_both_levels_have_and_the_notes
     )
     assert notes_with(factors, "temperature: every level has the same")
     cheap, dear = (set(level.pooled.finished["cell"]) for level in levels_by_factor(study)[0])
-    # The same stand-in answers under both names, so that equal cells hold equal trials.
     assert dear < cheap
+    # The same stand-in answers under both names, so that equal cells hold equal trials.
     row = rows["model=dear/gap_m"]
     assert (row["difference"], row["p"]) == (pytest.approx(0, abs=1e-9), pytest.approx(1))
     assert abs(row["value"] - rows["model=cheap/gap_m"]["value"]) > 0.1
+
+
+def test_the_trials_of_a_stand_in_that_reads_no_level_are_not_tested_and_count_once(played):
+    table = made(Study(played.db), "factors")
+    for name in ("model=dear/gap_m", "temperature=0.2/gap_m"):
+        row = by_id(table)[name]
+        assert {row.values.get(of) for of in ("difference", "p", "p_holm")} == {None}
+        assert row.note.startswith("not tested: the same trials at both levels")
+    assert by_id(table)["opponent=self/gap_m"].values["trials"] == 6
+    assert by_id(table)["opponent=sleepy/gap_m"].values["p"] is not None
 
 
 def test_stand_ins_are_never_pooled_with_models(copy):

@@ -4,7 +4,9 @@ import re
 import subprocess
 
 import duckdb
+import pandas as pd
 import pytest
+import statsmodels.formula.api as smf
 from playwright.sync_api import expect
 
 from merge_runner_analysis.study import Study
@@ -25,13 +27,17 @@ opponent = ["self", "projected-order"]
 [texts.persona.taxi]
 add = [{ after = "C3.human", text = "You are a taxi driver." }]
 given_to = "ego"
+emulator = { own_first = 0.2 }
 [texts.hurry.yes]
 add = [{ after = "C3.human", text = "You are late." }]
 given_to = "ego"
 emulator = { own_first = 1.5 }
 """
+# Who goes first as the ego has it; where both are told the same, either is.
 OUTCOMES = """
-SELECT condition, opponent, persona, hurry, merged_first = ego AS first FROM (
+SELECT opponent, persona, hurry, ego, projected_headway_m AS h, relative_velocity_mps AS dv,
+    focal IS NULL AND model_left = model_right AS both, (merged_first = ego)::DOUBLE AS first
+FROM (
     SELECT trial_id, spec_hash, max(value) FILTER (factor = 'opponent') AS opponent,
         max(value) FILTER (factor = 'persona') AS persona,
         max(value) FILTER (factor = 'hurry') AS hurry
@@ -39,6 +45,22 @@ SELECT condition, opponent, persona, hurry, merged_first = ego AS first FROM (
 ) JOIN trials USING (trial_id, spec_hash) JOIN trial_drivers USING (trial_id, spec_hash)
 WHERE merged_first IS NOT NULL
 """
+
+
+def readings(outcomes):
+    """Each trial as its ego has it, and one whose drivers are told the same as both have it."""
+    sign = outcomes["ego"].map({"left": 1, "right": -1})
+    seen = outcomes.assign(h=sign * outcomes["h"], dv=sign * outcomes["dv"])
+    seen["weight"] = 1 - seen["both"] / 2
+    same = seen[seen["both"]]
+    turned = same.assign(h=-same["h"], dv=-same["dv"], ego="right", first=1 - same["first"])
+    return pd.concat([seen, turned])
+
+
+def fitted(rows, factor, others):
+    """By least squares in points, with a level for each situation."""
+    cells = "C(h):C(dv):C(ego):" + ":".join(f"C({name})" for name in others)
+    return smf.wls(f"first ~ C({factor}) + {cells}", rows, weights=rows["weight"]).fit().params
 
 
 @pytest.fixture(scope="module")
@@ -67,36 +89,41 @@ def test_levels_and_effects_have_the_counts_and_shares_of_the_trials(db, outcome
     levels, effects = values_of(study, "levels"), values_of(study, "effects")
     for factor in ("persona", "hurry", "opponent"):
         for level, rows in outcomes.groupby(factor):
-            k, n = int(rows["first"].sum()), len(rows)
+            share = rows["first"].mask(rows["both"], 0.5).mean()
+            k = None if rows["both"].any() else rows["first"].sum()
             own = levels[f"{factor}={level}"]
-            assert (own["k"], own["n"], own["value"]) == (k, n, pytest.approx(100 * k / n))
+            assert (own["k"], own["n"], own["value"]) == (k, len(rows), pytest.approx(100 * share))
     for row in effects.values():
-        reference, level = (
-            levels.get(f"{row['factor']}={row[name]}") for name in ("reference", "level")
-        )
-        if row["measure"] == "goes first (%)" and level:
-            assert row["estimate"] == level["value"]
-            assert row["estimate_reference"] == reference["value"]
+        if row["estimate"] is not None:
+            apart = row["estimate"] - row["estimate_reference"]
+            assert row["difference"] == pytest.approx(apart)
 
 
 def test_the_first_screen_answers_a_study_of_two_factors(page, db, outcomes):
     page.set_viewport_size({"width": 1440, "height": 900})
     page.goto("/")
     answer = page.locator(".answer")
-    expect(answer).to_contain_text("Hurry changes who goes first", timeout=1000 * HANGS_S)
+    said_first = "a scripted stand-in, hurry changes who goes first"
+    expect(answer).to_contain_text(said_first, timeout=1000 * HANGS_S)
     said = answer.inner_text().replace("\N{NO-BREAK SPACE}", " ")
-    for level, rows in outcomes.groupby("hurry"):
-        k, n = int(rows["first"].sum()), len(rows)
-        share = f"{100 * k / n:.2f} %"
-        assert share in said, level
-        assert f"({k} of {n})" in said, level
+    hurried = outcomes[outcomes["hurry"] == "yes"]
+    assert f"in {int(hurried['first'].sum())} of {len(hurried)} trials" in said
     points = page.locator(".levels .point title").all_text_contents()
     for factors in ("persona", "hurry", ["persona", "hurry"]):
         for _, rows in outcomes.groupby(factors):
-            k, n = int(rows["first"].sum()), len(rows)
-            assert any(f"{k} of {n}, {100 * k / n:.2f} [" in text for text in points)
-    text = page.locator("#crossings").inner_text()
-    assert re.search(r"hurry × persona: no interaction is shown, ", text)
+            share = 100 * rows["first"].mask(rows["both"], 0.5).mean()
+            assert any(f"{share:.2f}" in text for text in points)
+    every = readings(outcomes)
+    slope = 100 * fitted(every, "hurry", ("persona", "opponent"))["C(hurry)[T.yes]"]
+    beside = page.locator("main").inner_text().replace("\N{NO-BREAK SPACE}", " ")
+    assert f": +{slope:.2f} points" in beside
+    none, taxi = (
+        fitted(every[every["persona"] == name], "hurry", ("opponent",))["C(hurry)[T.yes]"]
+        for name in ("none", "taxi")
+    )
+    text = page.locator("#crossings").inner_text().replace("\N{NO-BREAK SPACE}", " ")
+    found = re.search(r"hurry × persona: no interaction is shown, (\S+) points", text)
+    assert float(found[1].replace("−", "-")) == pytest.approx(100 * (taxi - none), abs=0.006)
     for part in (answer, page.locator(".levels").last, page.locator("#crossings")):
         box = part.bounding_box()
         assert box["y"] + box["height"] <= 900

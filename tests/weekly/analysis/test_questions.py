@@ -36,7 +36,9 @@ def simulated(study, outcomes):
         status, metric, values = outcomes(group)
         columns = dict.fromkeys((one.column for one in METRICS.values()), pd.NA)
         columns |= {"status": status, metric.column: pd.array(values, dtype="boolean")}
-        groups.append(replace(group, trials=group.trials.assign(**columns), whole=None))
+        columns["way"] = group.trials["trial_id"]  # as of language models
+        trials = group.trials.assign(**columns)
+        groups.append(replace(group, trials=trials, whole=None, posing=""))
     other = copy(study)
     vars(other).pop("_remembered", None)
     other.models, other.groups = groups, [study.human, *groups]

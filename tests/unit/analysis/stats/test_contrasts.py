@@ -11,7 +11,7 @@ from scipy import optimize, stats
 from statsmodels.stats.contingency_tables import StratifiedTable
 from statsmodels.stats.multitest import multipletests
 
-from analysis.research.independent.recompute_statistics import means_within
+from analysis.research.independent.recompute_statistics import means_within as recomputed_means
 from merge_runner_analysis.stats.contrasts import (
     Cells,
     contrast_means,
@@ -19,6 +19,7 @@ from merge_runner_analysis.stats.contrasts import (
     corrected,
     detectable_rate,
     difference_of_contrasts,
+    means_within,
     rejected,
     shared_cells,
 )
@@ -76,6 +77,12 @@ def cells_of(draw):
     sizes = draw(st.lists(st.tuples(SIZES, SIZES), min_size=1, max_size=5))
     counts = [(draw(st.integers(0, n)), n, draw(st.integers(0, m)), m) for n, m in sizes]
     return Cells(*map(np.array, zip(*counts, strict=True)))
+
+
+@given(cells_of())
+def test_two_rates_differ_by_their_difference(cells):
+    one, other = cells.rates
+    assert one - other == pytest.approx(cells.difference)
 
 
 @given(cells_of(), cells_of())
@@ -199,10 +206,12 @@ MIXED = (
 @pytest.mark.parametrize(("one", "other"), [(FIRST, SECOND), SPREAD, MIXED])
 def test_means_are_compared_by_welchs_test_with_a_level_for_each_condition(one, other):
     found = contrast_means(one, other, "gap_m")
-    expected = by_cells(means_within, one, other, "gap_m")
+    expected = by_cells(recomputed_means, one, other, "gap_m")
     assert (found.value, found.low, found.high, found.p, found.detectable) == pytest.approx(
         tuple(expected[k] for k in ("difference", "ci_low", "ci_high", "p", "detectable"))
     )
+    first, second = means_within(one, other, "gap_m")
+    assert first - second == pytest.approx(found.value)
     # Trials without the measure do not count.
     missing = group(N_0_0=[np.nan, np.nan], L_4_8=[np.nan])
     assert contrast_means(pd.concat([one, missing]), pd.concat([missing, other]), "gap_m") == found
@@ -211,10 +220,11 @@ def test_means_are_compared_by_welchs_test_with_a_level_for_each_condition(one, 
         assert (found.p, found.freedom) == pytest.approx((welch.pvalue, welch.df))
 
 
-@pytest.mark.parametrize(("other", "p"), [(3.0, 1), (2.0, 0)])
-def test_where_nothing_varies_a_difference_is_none_or_sure(other, p):
-    found = contrast_means(group(N_0_0=[3.0] * 4), group(N_0_0=[other] * 4), "gap_m")
-    assert (found.value, found.low, found.high, found.p) == (3 - other, 3 - other, 3 - other, p)
+def test_where_nothing_varies_a_difference_is_sure_or_there_is_nothing_to_test():
+    found = contrast_means(group(N_0_0=[3.0] * 4), group(N_0_0=[2.0] * 4), "gap_m")
+    assert (found.value, found.low, found.high, found.p) == (1, 1, 1, 0)
+    found = contrast_means(group(N_0_0=[3.0] * 4), group(N_0_0=[3.0] * 4), "gap_m")
+    assert (found.value, found.bounds(), found.p) == (0, None, None)
 
 
 def test_two_trials_and_groups_that_share_no_condition_cannot_be_compared():
