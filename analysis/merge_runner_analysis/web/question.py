@@ -132,10 +132,8 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
     claim, rest = answered(effects.rows, sides)
     if not claim:
         return None
-    primary = min(
-        (row for row in effects.rows if row.values.get("primary") and _tested(row)),
-        key=lambda row: _number(row, "p"),
-    )
+    asked = [row for row in effects.rows if row.values.get("primary")]
+    primary = min(asked, key=lambda row: _number(row, "p") if _tested(row) else 1.0)
     metric = metric_of(primary)
     own = [row for row in effects.rows if metric_of(row) == metric]
     named = {LEFT_FIRST.name, COLLISIONS.name, GAP.name, RMSE.name}
@@ -182,11 +180,12 @@ def answered(rows: Sequence[Row], sides: Mapping[str, Row] | None = None) -> tup
     primary = sorted(
         (row for row in tested if row.values.get("primary")), key=lambda row: _number(row, "p")
     )
-    if not primary:
-        return "", ""
-    what = CHANGED.get(metric_of(primary[0]), name_of(primary[0]))
-    posing = all(row.values.get("drivers") for row in primary)
+    posing = all(row.values.get("drivers") for row in rows)
     rehearsed = "In a rehearsal with a scripted stand-in, " if posing else ""
+    copied = [f"{_level(row)} is {row.note}" for row in rows if _copied(row)]
+    if not primary:
+        return capital(rehearsed + f"{'; '.join(copied)}.") if copied else "", ""
+    what = CHANGED.get(metric_of(primary[0]), name_of(primary[0]))
     if few := [
         row for row in primary if min(_count(row, "n"), _count(row, "n_reference")) < ENOUGH
     ]:
@@ -208,7 +207,7 @@ def answered(rows: Sequence[Row], sides: Mapping[str, Row] | None = None) -> tup
         if row not in sure[:1]:
             shown = "changes it, too" if _shown(row) else "is not shown to change it"
             rest.append(f"{capital(_level(row))} {shown}: {_apart(row)}, p {_p(row)}.")
-    rest += [f"{capital(_level(row))} is {row.note}." for row in rows if _copied(row)]
+    rest += [f"{capital(said)}." for said in copied]
     if not sure:
         rest.append(_seen(primary))
     crossed = [row for row in tested if _crossed(row) and metric_of(row) == metric_of(primary[0])]

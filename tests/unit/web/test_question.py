@@ -1,11 +1,13 @@
 """The answer to a study's own question, of rows made by hand."""
 
 import re
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from merge_runner_analysis.tables.effects import SAME_TRIALS
 from merge_runner_analysis.tables.model import Column, Row, Table
 from merge_runner_analysis.web.question import answer_of, answered
 
@@ -26,7 +28,15 @@ def effect(factor="hurry", p=0.001, measure=GOES_FIRST, *, difference=13.0, n=40
     return Row(name, (), of | values)
 
 
+def copied(factor):
+    """Levels of which a stand-in plays the same trials."""
+    row = effect(factor, p=None, difference=0.0, n=0, drivers="scripted")
+    values = row.values | dict.fromkeys(("estimate", "estimate_reference", "difference", "ci"))
+    return replace(row, values=values, note=SAME_TRIALS)
+
+
 HURRY = "Hurry changes who goes first: with hurry=yes the driver goes first in 63.00 % of trials, "
+SAME = "In the same situations that is 63.00 % against 50.00 %: +13.00 points [6.00, 20.00], "
 SEEN = "A change of 10.00 points or more would have been seen in four of five studies."
 
 
@@ -37,9 +47,9 @@ SEEN = "A change of 10.00 points or more would have been seen in four of five st
         ([effect(p=None)], "", ""),
         (
             [effect("persona", 0.5, difference=1.0), effect()],
-            f"{HURRY}with hurry=no in 50.00 %.",
-            "In like situations that is +13.00 points [6.00, 20.00]; p = 0.001. Persona=yes is not "
-            "shown to change it: +1.00 points [−6.00, 8.00], p = 0.500.",
+            f"{HURRY}with hurry=no in 50.00 % of trials.",
+            f"{SAME}p = 0.001. Persona=yes is not shown to change it: +1.00 points [−6.00, 8.00], "
+            "p = 0.500.",
         ),
         (
             [effect(p=0.2), effect(measure=GAP, p=0.0001, estimate=3.8, estimate_reference=4.3)],
@@ -50,9 +60,20 @@ SEEN = "A change of 10.00 points or more would have been seen in four of five st
         ),
         (
             [effect(p=0.0001), effect("hurry × persona", 0.01, difference=-8.0)],
-            f"{HURRY}with hurry=no in 50.00 %.",
-            "In like situations that is +13.00 points [6.00, 20.00]; p < 0.001. Hurry and persona "
-            "interact: −8.00 points [−15.00, −1.00], p = 0.010.",
+            f"{HURRY}with hurry=no in 50.00 % of trials.",
+            f"{SAME}p < 0.001. Hurry and persona interact: −8.00 points [−15.00, −1.00], "
+            "p = 0.010.",
+        ),
+        (
+            [effect(drivers="scripted"), copied("persona")],
+            "In a rehearsal with a scripted stand-in, h"
+            f"{HURRY[1:]}with hurry=no in 50.00 % of trials.",
+            f"{SAME}p = 0.001. Persona=yes is {SAME_TRIALS}.",
+        ),
+        (
+            [copied("hurry")],
+            f"In a rehearsal with a scripted stand-in, hurry=yes is {SAME_TRIALS}.",
+            "",
         ),
         ([effect(n=12)], "Too few trials finished to say: hurry=yes 12.", ""),
     ],
@@ -98,7 +119,7 @@ def test_a_side_has_its_count_and_the_chart_the_axis_of_its_data():
     (change,), (crashes,) = answer.changes, answer.others
     assert (change.reference.k, change.level.k, change.level.n) == (50, 63, 100)
     assert (change.mark.shape, crashes.mark.shape) == ("like", "open")
-    assert (crashes.level.k, crashes.level.n, crashes.level.text[:4]) == (3, 103, "2.91")
+    assert (crashes.level.k, crashes.level.n, crashes.level.text[:4]) == (3, 103, "63.0")
     assert answer.trials == 200
     (chart,) = answer.charts
     assert [line.name for line in chart.lines] == ["no", "yes"]
