@@ -63,7 +63,7 @@ def test_a_study_that_is_named_is_shown_by_its_own_trials_alone(db, folder):
     for metric in ("left_first_percent", "collided_percent"):
         row = rows[f"prompt=A1/{metric}"]
         assert [row.values.get(n) for n in ("trials", "difference", "p")] == [8, None, None]
-        assert "programs play no trial at one of both levels" in row.note
+        assert "not tested: the same trials at both levels" in row.note
     assert "memory_s" not in {row.values["factor"] for row in table.rows}
     assert not notes_with(table, "several studies")
     (source,) = explain(study, table, "prompt=baseline/left_first_percent:trials").sources

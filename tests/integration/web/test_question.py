@@ -59,8 +59,9 @@ def readings(outcomes):
 
 def fitted(rows, factor, others):
     """By least squares in points, with a level for each situation."""
-    cells = "C(h):C(dv):C(ego):" + ":".join(f"C({name})" for name in others)
-    return smf.wls(f"first ~ C({factor}) + {cells}", rows, weights=rows["weight"]).fit().params
+    situation = rows[["h", "dv", "ego", *others]].astype(str).agg("/".join, axis=1)
+    rows = rows.assign(cell=situation)
+    return smf.wls(f"first ~ C({factor}) + C(cell)", rows, weights=rows["weight"]).fit().params
 
 
 @pytest.fixture(scope="module")
