@@ -152,7 +152,7 @@ def effects(study: Study, by: str = "") -> list[Effect]:
     ]
 
 
-def compared(study: Study, one: Group, other: Group) -> list[Effect]:
+def driver_effects(study: Study, one: Group, other: Group) -> list[Effect]:
     """One driver with its prompt less another, in every measure, in the conditions of both.
 
     Their p are corrected together by Holm.
@@ -300,30 +300,29 @@ def _difference(frames: Sequence[pd.DataFrame], metric: Metric) -> Estimate | No
 
 
 def _with_corrected(study: Study, found: list[Effect]) -> list[Effect]:
-    """The effects with their corrected p.
+    """The effects with their corrected p, in the study's own family or in that of all others.
 
-    Where nothing varies and nothing differs, as without a single collision, no test is made.
+    Where nothing varies and nothing differs, as without a single collision, p is no part of it.
     """
-    chosen = primary(study)
-    found = [
-        replace(
-            one,
-            primary=one.metric is chosen
-            and not one.across
-            and one.level.factor not in (MODEL, DRIVER),
-            p_corrected=one.difference.p,
-        )
-        for one in found
-    ]
+    asked = [_is_asked(study, one) for one in found]
+    p_of = {place: one.difference.p for place, one in enumerate(found)}
     for own in (True, False):
         family = {
             place: one.difference.p
             for place, one in enumerate(found)
-            if one.primary is own and one.difference.p is not None and _can_differ(one)
+            if asked[place] is own and one.difference.p is not None and _can_differ(one)
         }
-        for place, p in zip(family, corrected([*family.values()]), strict=True):
-            found[place] = replace(found[place], p_corrected=p)
-    return found
+        p_of |= dict(zip(family, corrected([*family.values()]), strict=True))
+    return [
+        replace(one, primary=asked[place], p_corrected=p_of[place])
+        for place, one in enumerate(found)
+    ]
+
+
+def _is_asked(study: Study, one: Effect) -> bool:
+    """Whether it is a main effect on the study's primary measure."""
+    is_main = not one.across and one.level.factor not in (MODEL, DRIVER)
+    return is_main and one.metric is primary(study)
 
 
 def _can_differ(one: Effect) -> bool:

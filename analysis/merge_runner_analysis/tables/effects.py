@@ -13,8 +13,8 @@ from merge_runner_analysis.stats.effects import (
     Effect,
     Level,
     cells_seen,
-    compared,
     copied_of_shared,
+    driver_effects,
     effects,
     level_estimate,
     levels_by_factor,
@@ -48,6 +48,13 @@ UNTESTED = (
     "several studies or the same ones at two levels"
 )
 
+DIFFERENCE = (
+    Optional("difference", "difference", "number", "the first less the second"),
+    interval("ci", "of the same test"),
+    Optional("p", "p", "p", TEST),
+    Optional("p_corrected", "p, corr.", "p", "corrected by Holm"),
+    Optional("detectable", "detectable", "number", "at p < .05 with power .8"),
+)
 SIDES = ("", "_reference")  # of a comparison
 
 
@@ -65,11 +72,7 @@ def effects_table(study: Study) -> Table:
             Column("measure", "measure"),
             Optional("estimate", "estimate", "number", "of the level, within the shared cells"),
             Optional("estimate_reference", "reference", "number", "of the reference, in the same"),
-            Optional("difference", "difference", "number", "estimate less reference"),
-            interval("ci", "of the same test"),
-            Optional("p", "p", "p", TEST),
-            Optional("p_corrected", "p, corr.", "p", "corrected by Holm"),
-            Optional("detectable", "detectable", "number", "at p < .05 with power .8"),
+            *DIFFERENCE,
             Column("n", "n", "count", "trials of the level in the shared cells"),
             Column("n_reference", "n ref.", "count", "trials of the reference in these"),
             Optional("primary", "primary", "text", "the study's own question"),
@@ -86,18 +89,14 @@ def comparison(study: Study, one: str, other: str) -> Table:
     of all of a driver's trials where nothing is compared. Without rows where one is not judged.
     """
     known = {group.id: group for group in study.models}
-    found = compared(study, known[one], known[other]) if {one, other} <= {*known} else []
+    found = driver_effects(study, known[one], known[other]) if {one, other} <= {*known} else []
     return Table(
         "comparison",
         (
             Column("measure", "measure"),
             *(Optional(f"{name}{of}", name, "count") for of in SIDES for name in ("k", "n")),
             *(Optional(f"value{of}", f"value{of}", "number") for of in SIDES),
-            Optional("difference", "difference", "number", "the first less the second"),
-            interval("ci", "of the same test"),
-            Optional("p", "p", "p", TEST),
-            Optional("p_corrected", "p, corr.", "p", "corrected by Holm"),
-            Optional("detectable", "detectable", "number", "at p < .05 with power .8"),
+            *DIFFERENCE,
         ),
         [_compared_row(study, effect) for effect in found if _is_shown(effect)],
         (),
@@ -107,9 +106,7 @@ def comparison(study: Study, one: str, other: str) -> Table:
 def _compared_row(study: Study, one: Effect) -> Row:
     values: dict[str, Value] = {
         "measure": one.metric.heading,
-        **_difference(one),
-        "p_corrected": one.p_corrected,
-        "detectable": one.difference.detectable,
+        **_tested(one),
     }
     sides = (one.level, one.at_level), (one.reference, one.at_reference)
     for of, (level, own) in zip(SIDES, sides, strict=True):
@@ -134,9 +131,7 @@ def _row(study: Study, one: Effect) -> Row:
         "measure": one.metric.heading,
         "estimate": one.at_level.value,
         "estimate_reference": one.at_reference.value,
-        **_difference(one),
-        "p_corrected": one.p_corrected,
-        "detectable": one.difference.detectable,
+        **_tested(one),
         "n": one.at_level.n,
         "n_reference": one.at_reference.n,
         "primary": "primary" if one.primary else None,
@@ -148,6 +143,11 @@ def _place(level: Level, across: tuple[Level, Level] | None) -> str:
     """Where a level stands that is shown by another factor, and of an interaction what with."""
     at = level.at.partition("=")[2]
     return f"{at} - {across[0].at.partition('=')[2]}" if across else at
+
+
+def _tested(one: Effect) -> dict[str, Value]:
+    found = one.difference
+    return {**_difference(one), "p_corrected": one.p_corrected, "detectable": found.detectable}
 
 
 def _difference(one: Effect) -> dict[str, Value]:

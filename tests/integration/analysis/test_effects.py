@@ -14,7 +14,7 @@ from merge_runner.study.file import MEASURES
 from merge_runner_analysis.frames import load
 from merge_runner_analysis.metrics import COLLISIONS, LEFT_FIRST, METRICS
 from merge_runner_analysis.selection import Selection
-from merge_runner_analysis.stats.effects import compared, effects, primary
+from merge_runner_analysis.stats.effects import driver_effects, effects, primary
 from merge_runner_analysis.study import Study
 from tests.support.harness import FAST
 from tests.support.studies import changed, write_study, yielding
@@ -41,7 +41,7 @@ def two(tmp_path_factory):
 
 def test_two_models_differ_by_an_independent_test_with_one_p_on_every_page(two):
     one, other = two.models
-    between = {each.metric.name: each for each in compared(two, other, one)}
+    between = {each.metric.name: each for each in driver_effects(two, other, one)}
     rows = values_of(two, "effects")
     counts = [
         group.ended.groupby("condition")["collided"].agg(["sum", "size"]).astype(int)

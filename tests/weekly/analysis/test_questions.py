@@ -11,7 +11,7 @@ from scipy.stats import binom
 from statsmodels.stats.contingency_tables import StratifiedTable
 
 from merge_runner_analysis.metrics import COLLISIONS, LEFT_FIRST, METRICS
-from merge_runner_analysis.stats.effects import compared, effects
+from merge_runner_analysis.stats.effects import driver_effects, effects
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.web.question import answered
@@ -123,7 +123,7 @@ def test_two_models_are_told_apart_by_their_crashes_and_copies_of_one_are_not(tw
     for _ in range(STUDIES):
         study = simulated(two, outcomes)
         assert [len(group.trials) for group in study.models] == [220, 220]
-        (side_by_side,) = compared(study, *reversed(study.models))
+        (side_by_side,) = driver_effects(study, *reversed(study.models))
         (row,) = [one for one in effects(study) if one.metric is COLLISIONS]
         p = independent_p(study)
         assert side_by_side.difference.p == row.difference.p == pytest.approx(p, rel=1e-9)
