@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
-from typing import NamedTuple
+from functools import cache, lru_cache, partial
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -15,12 +15,14 @@ from scipy.special import expit
 
 from merge_runner.config import validated
 from merge_runner.planted_effect import PlantedEffect, planted_fields
-from merge_runner.prompts.blocks import BASELINE
+from merge_runner.prompts.blocks import BASELINE, composed, decomposed
+from merge_runner.records import Side
+from merge_runner.registry import require
 from merge_runner.run.estimate import typical_prompt
 from merge_runner.run.plan import Plan
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.study.crossing import MODEL, PROMPT, Arm
-from merge_runner.study.file import Effect
+from merge_runner.study.file import Effect, PlantedWords
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.published import HUMAN_GAP_SD_M, human_outcomes, published
 from merge_runner_analysis.stats import regressions
@@ -34,6 +36,7 @@ MULTIPLES = (0.5, 1.0, 2.0, 4.0)
 SEED = 260409609
 NORMAL = stats.norm.ppf((np.arange(99) + 0.5) / 99)  # evenly likely draws
 HUMANS = "humans"
+PLANTED, PLAYED, NAMED, DEFAULTS = "as planted", "as played", "[effect]", "default"
 VERDICTS = "verdicts"  # the table that compares with the humans
 EFFECTS = "effects"  # the table that compares levels of factors
 # By question about one driver: its table, the number of a truth that it is about, and its unit.
@@ -52,13 +55,30 @@ MEASURES = {
     "collisions": ("collided", "points"),
     "gap": ("gap_m", "m"),
 }
+# By the name of a primary measure in a study's file.
+PRIMARY = {
+    "goes_first": "goes first",
+    "collided": "collisions",
+    "gap_m": "gap",
+    "left_first_percent": "goes first",
+    "collided_percent": "collisions",
+    "collided_boxes_percent": "collisions",
+}
+# By measure the keys of an [effect] that change it in any condition.
+CHANGED_BY = {
+    "goes first": ("goes_first", "intercept", "projected_headway", "relative_velocity"),
+    "collisions": ("collided",),
+    "gap": ("gap_m",),
+}
 NOTHING = 1e-6  # an effect that is no more than this is none
+MIRRORED = " mirrored"  # after the name of a condition: as the driver on the right sees it
 COLUMNS = (
     Column("table", "table", noted=True),
     Column("question", "question"),
     Column("arms", "level"),
     Column("against", "against", optional=True),
     Column("truth", "truth"),
+    Column("assumed", "assumed by"),
     Column("effect", "effect", "number"),
     Column("unit", "unit"),
     Column("trials", "n", "count"),
@@ -104,14 +124,12 @@ class Truth:
         logit = np.column_stack([np.ones(len(h)), h, dv]) @ self.logit
         return np.asarray(expit(logit[:, None] + self.noise * NORMAL).mean(axis=1))
 
-    def measures(self, conditions: Sequence[str]) -> dict[str, float]:
-        """What trials of these conditions come to by MEASURES, in the unit of each."""
-        gaps_m = regressions.gap_design(*_numbers(conditions)) @ self.gap
-        return {
-            "goes first": 100 * float(self.first(conditions).mean()),
-            "collisions": 100 * self.collided,
-            "gap": float(gaps_m.mean()),
-        }
+    def mean(self, measure: str, conditions: Sequence[str]) -> float:
+        """What trials of these conditions come to by one of MEASURES, in its unit."""
+        if measure == "gap":
+            return float((regressions.gap_design(*_numbers(conditions)) @ self.gap).mean())
+        share = self.collided if measure == "collisions" else self.first(conditions).mean()
+        return 100 * float(share)
 
     def plus(self, effect: Effect, conditions: Sequence[str]) -> Truth:
         """Return the truth with an effect; of who goes first it is one on the mean over these.
@@ -137,6 +155,7 @@ def human_trials() -> pd.DataFrame:
     return human_outcomes().rename(columns={"collided_boxes": "collided"}).assign(gap_m=np.nan)
 
 
+@cache
 def human() -> Truth:
     """Return the humans as they are published."""
     tables = [published(name) for name in ("paper_who_first", "paper_gap")]
@@ -158,35 +177,67 @@ def played(group: Group) -> Truth | None:
 
 def _numbers(conditions: Iterable[str]) -> tuple[regressions.Array, regressions.Array]:
     """Headways in m and relative velocities in m/s."""
-    found = [CONDITIONS[name] for name in conditions]
-    return (
-        np.array([one.projected_headway_m for one in found]),
-        np.array([one.relative_velocity_mps for one in found]),
-    )
+    signs = np.array([-1 if name.endswith(MIRRORED) else 1 for name in conditions])
+    known = [CONDITIONS[name.removesuffix(MIRRORED)] for name in conditions]
+    headways_m = np.array([each.projected_headway_m for each in known])
+    return signs * headways_m, signs * np.array([each.relative_velocity_mps for each in known])
+
+
+class Trials(NamedTuple):
+    """How trials are drawn: the condition of each, and numbers of its ``Truth`` as arrays.
+
+    ``condition`` is a cell where levels are compared, and ``image`` that from the right side of one
+    that is read from both, else empty.
+    """
+
+    condition: Any
+    image: Any
+    collided: regressions.Array
+    logit: regressions.Array
+    noise: regressions.Array
+    gap_m: regressions.Array
+    gap_sd_m: regressions.Array
+
+    def drawn(self, rng: np.random.Generator) -> pd.DataFrame:
+        """One outcome of each trial."""
+        n = len(self.collided)
+        collided = rng.random(n) < self.collided
+        left = rng.random(n) < expit(self.logit + self.noise * rng.standard_normal(n))
+        gap_m = self.gap_m + self.gap_sd_m * rng.standard_normal(n)
+        return pd.DataFrame(
+            {
+                "condition": self.condition,
+                "collided": collided,
+                "left_first": np.where(collided, np.nan, left),
+                "gap_m": np.where(collided, np.nan, gap_m),
+            }
+        )
+
+
+def _trials_of(truth: Truth, conditions: Sequence[str], repetitions: int) -> Trials:
+    h, dv = _numbers(conditions)
+    n = len(conditions)
+    logit = np.column_stack([np.ones(n), h, dv]) @ truth.logit
+    gap_m = regressions.gap_design(h, dv) @ truth.gap
+    same = (np.full(n, each) for each in (truth.collided, truth.noise, truth.gap_sd_m))
+    collided, noise, gap_sd_m = same
+    names = np.array(list(conditions), dtype=object)
+    empty = np.full(n, "", dtype=object)
+    each = (names, empty, collided, logit, noise, gap_m, gap_sd_m)
+    return Trials(*(np.repeat(column, max(1, repetitions)) for column in each))
 
 
 def simulate(
     truth: Truth, conditions: Sequence[str], repetitions: int, rng: np.random.Generator
 ) -> pd.DataFrame:
     """Return so many trials of each condition, with the columns of ``load_trials``."""
-    names = np.repeat(list(conditions), max(1, repetitions))
-    h, dv = _numbers(names)
-    collided = rng.random(len(names)) < truth.collided
-    logit = np.column_stack([np.ones(len(names)), h, dv]) @ truth.logit
-    left = rng.random(len(names)) < expit(logit + truth.noise * rng.standard_normal(len(names)))
-    scatter_m = truth.gap_sd_m * rng.standard_normal(len(names))
-    gap_m = regressions.gap_design(h, dv) @ truth.gap + scatter_m
-    return pd.DataFrame(
-        {
-            "condition": names,
-            "projected_headway_m": h,
-            "relative_velocity_mps": dv,
-            "status": np.where(collided, "collided", "finished"),
-            "merged_first": np.where(left, "left", "right"),
-            "left_first": np.where(collided, np.nan, left),
-            "gap_m": np.where(collided, np.nan, gap_m),
-            "collided": collided,
-        }
+    trials = _trials_of(truth, conditions, repetitions).drawn(rng)
+    h, dv = (np.repeat(each, max(1, repetitions)) for each in _numbers(conditions))
+    return trials.assign(
+        projected_headway_m=h,
+        relative_velocity_mps=dv,
+        status=np.where(trials["collided"], "collided", "finished"),
+        merged_first=np.where(trials["left_first"] == 1, "left", "right"),
     )
 
 
@@ -203,6 +254,15 @@ def findings(own: pd.DataFrame, other: pd.DataFrame | None) -> dict[str, bool]:
     return {question: value < ALPHA for question, value in p.items()}
 
 
+class Assumed(NamedTuple):
+    """An effect that there is to find: its table, its size with the unit, and who says so."""
+
+    table: str
+    effect: float
+    unit: str
+    by: str = ""
+
+
 @dataclass(frozen=True, slots=True)
 class Case:
     """A driver of this truth and size: by itself, or beside the humans."""
@@ -211,19 +271,22 @@ class Case:
     repetitions: int
     against: str = ""
 
-    def effects(self, conditions: Sequence[str]) -> dict[str, tuple[str, float, str]]:
-        """By question its table, and the effect that there is to find; that of I4 is small."""
+    @property
+    def truth(self) -> str:
+        """How the driver is supposed to drive."""
+        return self.own.name
+
+    def effects(self, conditions: Sequence[str]) -> dict[str, Assumed]:
+        """By question the effect that there is to find; that of I4 is small."""
         other, alone = human(), not self.against
         sizes = {
-            question: (
-                table,
-                getattr(self.own, number) - (0.0 if alone else getattr(other, number)),
-                unit,
+            question: Assumed(
+                table, getattr(self.own, number) - (0.0 if alone else getattr(other, number)), unit
             )
             for question, (table, number, unit) in QUESTIONS.items()
             if (question in TESTED) is alone
         }
-        return {question: each for question, each in sizes.items() if each[1]}
+        return {question: each for question, each in sizes.items() if each.effect}
 
     def trials(self, conditions: Sequence[str]) -> int:
         """How many its driver plays."""
@@ -238,51 +301,126 @@ class Case:
 
 
 @dataclass(frozen=True, slots=True)
-class Contrast:
-    """A level of a factor against its reference: both truths and sizes, by cell."""
+class Played:
+    """The trials of an arm as its ego sees them, and how they are supposed to go.
 
-    cells: tuple[tuple[Truth, int, Truth, int], ...]
-    against: str
+    Of two ``equal`` drivers who are given the same either may be asked about.
+    """
+
+    cell: str
+    side: Side
+    equal: bool
+    conditions: tuple[str, ...]
+    repetitions: int
+    truth: Truth
+
+    def trials(self, multiple: float, *, sides: bool) -> Trials:
+        """So many times its trials, of which cells may have ``sides``."""
+        trials = _trials_of(self.truth, self.conditions, round(multiple * self.repetitions))
+        of_side = f" {self.side}" if sides else ""
+        image = trials.image
+        if sides and self.equal:
+            image = [
+                f"{_image(name, self.conditions)} right{self.cell}" for name in trials.condition
+            ]
+        cells = [name + of_side + self.cell for name in trials.condition]
+        return trials._replace(
+            condition=np.array(cells, dtype=object), image=np.array(image, dtype=object)
+        )
+
+
+@lru_cache(maxsize=8)
+def _level(level: tuple[Played, ...], multiple: float, *, sides: bool) -> Trials:
+    """The trials of a level."""
+    parts = (each.trials(multiple, sides=sides) for each in level)
+    return Trials(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def _from_both_sides(trials: Trials, value: regressions.Array) -> pd.DataFrame:
+    """The ``value`` of each trial by cell, once more where it is read from the right, too.
+
+    So it is of two equal drivers where in other trials one alone has a level: see
+    ``stats.effects``.
+    """
+    twice = trials.image != ""
+    return pd.DataFrame(
+        {
+            "condition": np.concatenate([trials.condition, trials.image[twice]]),
+            "value": np.concatenate([value, 1 - value[twice]]),
+            "varies": np.concatenate([~twice, np.zeros(twice.sum(), bool)]),
+        }
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Contrast:
+    """A level of a factor against its reference, in the cells of both, in one of MEASURES.
+
+    It is ``assumed`` to differ by what the study names, by default, or as it is planted or played.
+    """
+
+    own: tuple[Played, ...]
+    other: tuple[Played, ...]
+    measure: str
+    assumed: str
+    one_sided: bool = False
 
     @property
-    def own(self) -> Truth:
-        """What the first cell's level is supposed to be."""
-        return self.cells[0][0]
+    def truth(self) -> str:
+        """How the level's driver is supposed to drive."""
+        return self.own[0].truth.name
 
-    def effects(self, conditions: Sequence[str]) -> dict[str, tuple[str, float, str]]:
-        """By measure its table, the mean difference that there is to find, and its unit."""
-        apart: dict[str, list[float]] = {measure: [] for measure in MEASURES}
-        for own, _, other, _ in self.cells:
-            one, two = own.measures(conditions), other.measures(conditions)
-            for measure, differences in apart.items():
-                differences.append(one[measure] - two[measure])
-        sizes = {name: float(np.mean(differences)) for name, differences in apart.items()}
-        return {
-            name: (EFFECTS, size, MEASURES[name][1])
-            for name, size in sizes.items()
-            if abs(size) > NOTHING
-        }
+    @property
+    def sides(self) -> bool:
+        """Whether cells have sides: who goes first, where one driver alone has a level."""
+        return self.one_sided and self.measure == "goes first"
+
+    @property
+    def size(self) -> float:
+        """The difference that there is to find, in the unit of the measure, as its test weighs."""
+        means = []
+        for level in (self.own, self.other):
+            trials = _level(level, 1, sides=self.sides)
+            found = self._expected(trials)
+            means.append(_from_both_sides(trials, found).groupby("condition")["value"])
+        (one, n), (two, m) = ((each.mean(), each.size()) for each in means)
+        weights = (n * m / (n + m)).dropna()
+        unit = 1 if self.measure == "gap" else 100
+        return unit * float((one - two).dropna() @ weights / weights.sum())
+
+    def _expected(self, trials: Trials) -> regressions.Array:
+        if self.measure == "gap":
+            return trials.gap_m
+        if self.measure == "collisions":
+            return trials.collided
+        logits = trials.logit[:, None] + trials.noise[:, None] * NORMAL
+        return np.asarray(expit(logits).mean(axis=1))
+
+    def effects(self, conditions: Sequence[str]) -> dict[str, Assumed]:
+        """The effect that there is to find."""
+        unit = MEASURES[self.measure][1]
+        return {self.measure: Assumed(EFFECTS, self.size, unit, self.assumed)}
 
     def trials(self, conditions: Sequence[str]) -> int:
         """How many trials the level has."""
-        return sum(repetitions for _, repetitions, _, _ in self.cells) * len(conditions)
+        return sum(each.repetitions * len(each.conditions) for each in self.own)
 
     def found(
         self, conditions: Sequence[str], multiple: float, rng: np.random.Generator
     ) -> dict[str, bool]:
-        """By measure whether one simulated study of so many times this size shows a difference."""
-        levels: tuple[list[pd.DataFrame], list[pd.DataFrame]] = ([], [])
-        for number, (own, size, other, other_size) in enumerate(self.cells):
-            for frames, truth, n in ((levels[0], own, size), (levels[1], other, other_size)):
-                trials = simulate(truth, conditions, round(multiple * n), rng)
-                frames.append(trials.assign(condition=trials["condition"] + f" {number}"))
-        one, two = map(pd.concat, levels)
-        p = {}
-        for measure, (column, _) in MEASURES.items():
-            cells = shared_cells(one, two, column) if column != "gap_m" else None
-            found = contrast_rates(cells) if cells else contrast_means(one, two, column)
-            p[measure] = 1.0 if found is None or found.p is None else found.p
-        return {measure: value < ALPHA for measure, value in p.items()}
+        """Whether one simulated study of so many times this size shows a difference."""
+        frames = []
+        for level in (self.own, self.other):
+            trials = _level(level, multiple, sides=self.sides)
+            value = trials.drawn(rng)[MEASURES[self.measure][0]].to_numpy(dtype=float)
+            frames.append(_from_both_sides(trials, value))
+        one, two = frames
+        if self.measure == "gap":
+            found = contrast_means(one, two, "value")
+        else:
+            cells = shared_cells(one, two, "value")
+            found = contrast_rates(cells) if cells else None
+        return {self.measure: found is not None and found.p is not None and found.p < ALPHA}
 
 
 def power(
@@ -300,25 +438,25 @@ def chances(
 ) -> Iterator[Row]:
     """Simulate a plan that costs so much; ``groups`` are played ones. Raises UsageError.
 
-    Levels of factors have a row for each measure that they are supposed to change. Where they
-    change none, or how drivers heed their situation, the drivers by themselves have rows.
+    Where factors vary, each level but a factor's reference has a row in the study's primary
+    measure. Where none does, or levels change how drivers heed their situation, the drivers by
+    themselves have rows.
     """
     conditions = plan.conditions
-    cases = list(_cases(plan, groups))
-    labels: dict[Case | Contrast, list[str]] = {}  # equal ones share rows
-    for label, case in cases:
-        labels.setdefault(case, []).append(label)
+    labels: dict[Case | Contrast, list[tuple[str, str]]] = {}  # equal ones share rows
+    for label, against, case in _cases(plan, groups):
+        labels.setdefault(case, []).append((label, against))
     for case, names in labels.items():
-        effects = case.effects(conditions)
-        at = {m: power(case, conditions, m, simulations) for m in MULTIPLES if effects}
-        for question, (table, effect, unit) in effects.items():
+        at = {m: power(case, conditions, m, simulations) for m in MULTIPLES}
+        for question, (table, effect, unit, by) in case.effects(conditions).items():
             enough = next((m for m in MULTIPLES if at[m][question] >= POWER), None)
             trials = case.trials(conditions)
-            key = [table, question, ", ".join(names), case.against, case.own.name]
+            levels, against = (", ".join(dict.fromkeys(each)) for each in zip(*names, strict=True))
+            key = [table, question, levels, against, case.truth]
             size = None if enough is None else round(enough * trials)
             cost = None if enough is None or cost_usd is None else enough * cost_usd
             shares: list[Value] = [100 * at[m][question] for m in MULTIPLES]
-            values = [*key, effect, unit, trials, *shares, size, cost]
+            values = [*key, by, effect, unit, trials, *shares, size, cost]
             yield Row("/".join(key), (), dict(zip([c.name for c in COLUMNS], values, strict=True)))
 
 
@@ -330,72 +468,139 @@ def power_table(title: str, rows: Sequence[Row]) -> Table:
         "times the repetitions that find the effect at p < .05, by the test of its table (effects; "
         "I1 to I4: indicators; humans: verdicts), before any correction; n for 80 %, USD: the "
         "smallest of these sizes with this power",
-        "truth: published humans, the driver as it was played, or what is planted in the emulator, "
-        "with the [effect] that the study names; without one, a level goes first in 15 points "
-        "more, leaves 1 m more than the reference, and collides twice as often",
+        "truth: published humans, the driver as it was played, or what a rehearsal of the emulator "
+        "plants",
+        f"assumed by: {NAMED} of the study, or {PLAYED}; by {DEFAULTS}, where neither says "
+        "anything of the measure, a level goes first in 15 points more, leaves 1 m more, or "
+        "collides twice as often. What words plant in the emulator is never assumed",
+        "effects: a row for each level in the study's primary measure; nothing is assumed of "
+        "interactions",
     )
     return Table("power", COLUMNS, rows, notes, title=title)
 
 
-class Played(NamedTuple):
-    """The trials of an arm, of a pair both ways round, and how they are supposed to go."""
-
-    label: str
-    levels: dict[str, str]
-    repetitions: int
-    truths: list[Truth]
-
-
-def _cases(plan: Plan, groups: Sequence[Group]) -> Iterator[tuple[str, Case | Contrast]]:
-    played = _played(plan, groups)
-    contrasts = list(_contrasts(plan, played))
+def _cases(plan: Plan, groups: Sequence[Group]) -> Iterator[tuple[str, str, Case | Contrast]]:
+    """What is compared, by the names of both."""
+    truths = {arm.label: _truths(plan, arm, groups) for arm in plan.arms}
+    contrasts = list(_contrasts(plan, truths))
     yield from contrasts
-    slopes = {(one.projected_headway, one.relative_velocity) for of in played for one in of.truths}
-    changed = any(case.effects(plan.conditions) for _, case in contrasts)
-    if changed and len(slopes) < 2:
+    drivers: dict[frozenset[tuple[str, str]], tuple[Arm, int]] = {}
+    for arm in plan.arms:  # tables pool a pair both ways round
+        first, repetitions = drivers.get(key := frozenset(_levels(arm).items()), (arm, 0))
+        drivers[key] = first, repetitions + arm.repetitions
+    every = [(arm.label, own, n) for arm, n in drivers.values() for own in truths[arm.label]]
+    slopes = {(own.projected_headway, own.relative_velocity) for _, own, _ in every}
+    if contrasts and len(slopes) < 2:
         return
-    for of in played:
-        for own in of.truths:
-            yield of.label, Case(own, of.repetitions)
-            yield of.label, Case(own, of.repetitions, HUMANS)
+    for label, own, repetitions in every:
+        yield label, "", Case(own, repetitions)
+        yield label, HUMANS, Case(own, repetitions, HUMANS)
 
 
-def _played(plan: Plan, groups: Sequence[Group]) -> list[Played]:
-    """What is played with each choice of levels; tables pool a pair both ways round."""
-    found: dict[frozenset[tuple[str, str]], Played] = {}
-    for arm in plan.arms:
-        levels = {MODEL: arm.model_level, PROMPT: arm.variant, **arm.factors}
-        key = frozenset(levels.items())
-        if key in found:
-            before = found[key].repetitions
-            found[key] = found[key]._replace(repetitions=before + arm.repetitions)
-        else:
-            truths = _truths(plan, arm, groups)
-            found[key] = Played(arm.label, levels, arm.repetitions, truths)
-    return [*found.values()]
+def _contrasts(
+    plan: Plan, truths: Mapping[str, list[Truth]]
+) -> Iterator[tuple[str, str, Contrast]]:
+    """Each level of each factor against its reference, in the cells that both have.
+
+    As in the table of effects mock models are compared with each other, and programs, which read no
+    prompt, are not compared by it.
+    """
+    one_sided = any(arm.focal and not arm.is_mixed for arm in plan.arms)
+    for scripted in (False, True):
+        arms = [arm for arm in plan.arms if arm.is_scripted is scripted]
+        at: dict[frozenset[tuple[str, str]], list[Arm]] = {}
+        for arm in arms:
+            at.setdefault(frozenset(_levels(arm).items()), []).append(arm)
+        for factor in dict.fromkeys(name for arm in arms for name in _levels(arm)):
+            named = dict.fromkeys(_levels(a)[factor] for a in arms if factor in _levels(a))
+            reference, *others = sorted(named, key=partial(_place, plan, factor))
+            for level in others:
+                pairs = []
+                for key, own in at.items():
+                    twins = at.get((key - {(factor, level)}) | {(factor, reference)}, [])
+                    reads = factor != PROMPT or own[0].entries
+                    if (factor, level) in key and twins and reads:
+                        pairs.append((key - {(factor, level)}, own, twins))
+                for contrast in _assumed(plan, truths, factor, pairs, one_sided=one_sided):
+                    yield f"{factor}={level}", f"{factor}={reference}", contrast
 
 
-def _contrasts(plan: Plan, played: Sequence[Played]) -> Iterator[tuple[str, Contrast]]:
-    """Each level of each factor against its reference, in the cells that both have."""
-    at = {frozenset(one.levels.items()): one for one in played}
-    nothing = all(truth == human() for one in played for truth in one.truths)
-    for factor in dict.fromkeys(name for one in played for name in one.levels):
-        named = dict.fromkeys(one.levels[factor] for one in played if factor in one.levels)
-        reference, *others = sorted(named, key=partial(_place, plan, factor))
-        for level in others:
-            pairs = []
-            for one in played:
-                twin = at.get(frozenset({**one.levels, factor: reference}.items()))
-                if one.levels.get(factor) == level and twin:
-                    pairs.append((one, twin))
-            numbers = min((len(one.truths) for pair in pairs for one in pair), default=0)
-            for number in range(numbers):
-                cells = []
-                for one, twin in pairs:
-                    own = one.truths[number]
-                    own = _supposed(plan, own) if nothing else own
-                    cells.append((own, one.repetitions, twin.truths[number], twin.repetitions))
-                yield f"{factor}={level}", Contrast(tuple(cells), f"{factor}={reference}")
+Pair = tuple[frozenset[tuple[str, str]], list[Arm], list[Arm]]
+
+
+def _assumed(
+    plan: Plan,
+    truths: Mapping[str, list[Truth]],
+    factor: str,
+    pairs: Sequence[Pair],
+    *,
+    one_sided: bool,
+) -> Iterator[Contrast]:
+    """The contrast of these pairs of arms by each way in which trials are supposed to go."""
+    every = [arm for _, own, twins in pairs for arm in (*own, *twins)]
+    ways = min((len(truths[arm.label]) for arm in every), default=0)
+    for way in range(ways):
+        levels: tuple[list[Played], list[Played]] = ([], [])
+        for cell, *both in pairs:
+            name = "".join(f" {n}={x}" for n, x in sorted(cell))
+            for level, arms in zip(levels, both, strict=True):
+                for arm in arms:
+                    level.append(_played(plan, arm, name, truths[arm.label][way]))
+        own, other = map(tuple, levels)
+        contrast = Contrast(own, other, _primary(plan), PLAYED, one_sided=one_sided)
+        yield replace(contrast, **_assumption(plan, factor, contrast))
+
+
+def _assumption(plan: Plan, factor: str, contrast: Contrast) -> dict[str, Any]:
+    """Who says how a level differs; where nothing does, the level with what is supposed then."""
+    effect = plan.study.file.effect.get(factor, Effect())
+    if contrast.truth == PLANTED:
+        return {"assumed": PLANTED}
+    if any(getattr(effect, name) for name in CHANGED_BY[contrast.measure]):
+        return {"assumed": NAMED}
+    if contrast.truth != human().name and abs(contrast.size) > NOTHING:
+        return {"assumed": PLAYED}
+    supposed = tuple(
+        replace(each, truth=each.truth.plus(_by_default(contrast, each), each.conditions))
+        for each in contrast.own
+    )
+    return {"assumed": DEFAULTS, "own": supposed}
+
+
+def _by_default(contrast: Contrast, level: Played) -> Effect:
+    if contrast.measure == "collisions":
+        return Effect(collided=min(level.truth.collided, 1 - level.truth.collided))
+    return Effect(goes_first=0.15) if contrast.measure == "goes first" else Effect(gap_m=1.0)
+
+
+def _played(plan: Plan, arm: Arm, cell: str, truth: Truth) -> Played:
+    turned = arm.ego == "right"
+    names = [_image(name, plan.conditions) if turned else name for name in plan.conditions]
+    equal = not arm.is_mixed and arm.focal is None
+    return Played(cell, arm.ego, equal, tuple(names), arm.repetitions, truth)
+
+
+def _image(condition: str, conditions: Sequence[str]) -> str:
+    """A condition as the driver on the right sees it, named as one of these if it can be."""
+    if condition.endswith(MIRRORED):
+        return condition.removesuffix(MIRRORED)
+    own = CONDITIONS[condition]
+    mirrored = (-own.projected_headway_m, -own.relative_velocity_mps)
+    for name in conditions:
+        known = CONDITIONS.get(name)
+        if known and (known.projected_headway_m, known.relative_velocity_mps) == mirrored:
+            return name
+    return condition + MIRRORED
+
+
+def _levels(arm: Arm) -> dict[str, str]:
+    return {MODEL: arm.model_level, PROMPT: arm.variant, **arm.factors}
+
+
+def _primary(plan: Plan) -> str:
+    """The study's primary measure, as MEASURES name it; raises UsageError."""
+    require(PRIMARY, "measure to simulate:", plan.study.file.primary, "by primary in the study")
+    return PRIMARY[plan.study.file.primary]
 
 
 def _place(plan: Plan, factor: str, level: str) -> int:
@@ -404,33 +609,48 @@ def _place(plan: Plan, factor: str, level: str) -> int:
     return listed.index(level) if level in listed else len(listed)
 
 
-def _supposed(plan: Plan, truth: Truth) -> Truth:
-    """What is supposed of a level where nothing is named."""
-    return truth.plus(Effect(goes_first=0.15, gap_m=1.0, collided=truth.collided), plan.conditions)
+def _rehearses(plan: Plan) -> bool:
+    """Whether a study has nothing but parameters that plant an effect in the emulator.
+
+    What its words plant, or what is planted beside an [effect], is no assumption.
+    """
+    file = plan.study.file
+    words = (word for levels in file.texts.values() for word in levels.values())
+    if file.effect or any(word.emulator != PlantedWords() for word in words):
+        return False
+    return any(planted_fields(entry.parameters) for entry in plan.entries.values())
 
 
 def _truths(plan: Plan, arm: Arm, groups: Sequence[Group]) -> list[Truth]:
-    """As planted in the emulator; or as humans and as played, with named effects.
+    """As humans and as played, with named effects; of a rehearsal as planted.
 
-    Where a study plants anything, an arm goes as its ego's request says, as if that were on the
-    left: also one in which nothing is planted.
+    In a rehearsal an arm goes as its ego's request says, also one in which nothing is planted.
     """
-    every = [entry for each in plan.arms for entry in each.entries.values()]
     ego = arm.entries.get(arm.names[0])
-    if ego and any(planted_fields(entry.parameters) for entry in every):
+    if ego and _rehearses(plan):
         fields = planted_fields(ego.parameters)
         planted = validated(PlantedEffect, fields, "what is planted")
         planted = planted.before(typical_prompt(plan, arm))
+        if arm.ego == "right":
+            planted = planted.model_copy(update={"x_left_first": -planted.x_left_first})
         # The script aims at gaps from 1.8 to 6.5 m; in 1 of 33 trials two vehicles collide.
         gap = (4.15 + planted.x_gap_m, 0.0, 0.0, 0.0)
-        return [Truth("as planted", 1.36, 1 / 33, planted.x_noise, *planted.coefficients, *gap)]
+        return [Truth(PLANTED, 1.36, 1 / 33, planted.x_noise, *planted.coefficients, *gap)]
     named = plan.study.file.effect
-    by_setting = {(group.name, group.setting): group for group in reversed(groups)}
-    prompts = (BASELINE,) if PROMPT in named else (arm.variant, BASELINE)
-    known = [by_setting[arm.model, p] for p in prompts if (arm.model, p) in by_setting]
-    truths = [human(), *filter(None, map(played, known[:1]))]
+    prompt, words = decomposed(arm.variant)
+    unnamed = [word for word in words if word.partition("=")[0] not in named]
+    own = composed(BASELINE if PROMPT in named else prompt, unnamed)
+    by_setting = {(g.name, g.setting): g for g in reversed(groups) if not g.scripted}
+    known = [by_setting[arm.model, p] for p in (own, BASELINE) if (arm.model, p) in by_setting]
+    people = human()
+    if (
+        len({each.ego for each in plan.arms}) > 1
+    ):  # both sides are one driver's, and none is favoured
+        people = replace(people, intercept=0.0)
+    truths = [people, *filter(None, map(played, known[:1]))]
+    seen = _played(plan, arm, "", truths[0]).conditions
     for factor, added in named.items():
-        level = arm.variant if factor == PROMPT else arm.factors.get(factor)
+        level = _levels(arm).get(factor)
         if level not in (None, plan.levels[factor][0]):
-            truths = [truth.plus(added, plan.conditions) for truth in truths]
+            truths = [truth.plus(added, seen) for truth in truths]
     return truths

@@ -257,7 +257,7 @@ class Plan(BaseModel):
     @property
     def scripted(self) -> bool:
         """Whether the emulator takes part."""
-        return any(map(_is_scripted, self.arms))
+        return any(arm.is_scripted for arm in self.arms)
 
     @property
     def is_free(self) -> bool:
@@ -320,7 +320,7 @@ class Plan(BaseModel):
                 repetition=repetition,
                 sample_set=self.sample_set,
                 order=0,
-                scripted=_is_scripted(arm),
+                scripted=arm.is_scripted,
                 factors=tuple(arm.factors.items()),
                 words=frozenset(self.study.file.texts),
                 focal=arm.focal,
@@ -392,10 +392,6 @@ def usual_prompts(arm: Arm) -> float:
     """How many prompts a trial of an arm usually takes a language model."""
     most = math.ceil(arm.scenario.timeout_steps / model_pace(arm.scenario).interval_steps)
     return min(_PROMPTS_PER_DRIVER, most)
-
-
-def _is_scripted(arm: Arm) -> bool:
-    return any(entry.provider == "emulator" for entry in arm.entries.values())
 
 
 def make_plan(

@@ -67,6 +67,11 @@ class Arm:
         return self.sides["left"] != self.sides["right"]
 
     @property
+    def is_scripted(self) -> bool:
+        """Whether the emulator takes part."""
+        return any(entry.provider == EMULATOR for entry in self.entries.values())
+
+    @property
     def model_level(self) -> str:
         """The model as results have it, as a factor: of a pair without an opponent, both."""
         ego, other = self.sides[self.ego], self.sides[other_side(self.ego)]

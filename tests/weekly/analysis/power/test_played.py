@@ -18,7 +18,15 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 from merge_runner.study.file import Effect
-from merge_runner_analysis.power import Case, Contrast, human, played, power, simulate
+from merge_runner_analysis.power import (
+    Case,
+    Contrast,
+    Played,
+    human,
+    played,
+    power,
+    simulate,
+)
 from merge_runner_analysis.stats.regressions import gap_ols, who_first_firth
 from merge_runner_analysis.study import Study
 
@@ -72,9 +80,10 @@ def test_the_chance_to_find_nothing_is_that_of_a_false_alarm():
     nothing = 1e-5  # an effect of 0 is no row
     own = replace(human(), relative_velocity=nothing)
     assert chance(Case(own, REPS), "I2") < 0.08  # one side of a two-sided test at 5 %
-    own = replace(own, gap_m=own.gap_m + nothing, collided=own.collided + nothing)
-    found = Contrast(((own, REPS, replace(own, gap_m=own.gap_m - 2 * nothing), REPS),), "first")
-    assert chance(found, "gap") == pytest.approx(0.05, abs=0.06)
+    same = (Played("", "left", False, tuple(HUMAN_CONDITIONS), REPS, own),)
+    for measure in ("gap", "goes first"):
+        found = Contrast(same, same, measure, "default")
+        assert chance(found, measure) == pytest.approx(0.05, abs=0.06)
 
 
 def test_the_gaps_of_a_driver_as_played_scatter_as_those_that_it_left(prepare, tmp_path):
