@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 import pandas as pd
 
 from merge_runner.paths import DEFAULT_DB, command_at
@@ -124,23 +125,23 @@ def _source(
 ) -> Source:
     known = {STORED: group.trials, ENDED: group.ended, FINISHED: group.finished}
     whole = known.get(rests_on, group.trials)
-    rows = whole[[*KEYS, "condition"]]  # a part of all columns takes far longer
+    kept = np.ones(len(whole), dtype=bool)  # to take a part of all columns takes far longer
     if rests_on not in known:
-        rows = rows[whole[rests_on].notna()]
+        kept &= whole[rests_on].notna().to_numpy()
     if conditions:
-        rows = rows[rows["condition"].isin(conditions)]
+        kept &= whole["condition"].isin(conditions).to_numpy()
     if copies:
-        copied = {*copies}
-        kept = [key not in copied for key in rows[KEYS].itertuples(index=False, name=None)]
-        rows = rows.loc[kept]  # an empty mask in brackets would take the columns away
-    trials = tuple(rows["trial_id"])
+        copied, keys = {*copies}, zip(*(whole[name] for name in KEYS), strict=True)
+        kept &= np.array([key not in copied for key in keys], dtype=bool)
+    names = whole["trial_id"].array[kept]
+    trials: tuple[str, ...] = tuple(names)
     numerator: tuple[str, ...] = ()
     if counts:
         values = whole.get(counts)
         if values is None:  # a failure that never occurred has no column
-            values = call_counts(study, group).get(counts, pd.Series(False, rows.index))
-        counted = values.reindex(rows.index).fillna(False).astype(bool)
-        numerator = tuple(rows.loc[counted, "trial_id"])
+            values = call_counts(study, group).get(counts, pd.Series(False, whole.index))
+        counted = values.reindex(whole.index[kept]).fillna(False).astype(bool)
+        numerator = tuple(names[counted.to_numpy()])
     outcomes = group.published_outcomes
     parts = (
         f"{len(trials)} of {len(group.trials)} trials; not finished: {group.left_out}",

@@ -283,15 +283,18 @@ def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> E
 
 def means_within(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> tuple[float, float]:
     """Both means, of the conditions that both have, which weigh as in their difference."""
-    one, other = (
-        frame.groupby("condition", sort=True)[measure].agg(["mean", "count"])
-        for frame in (first, second)
-    )
-    one, other = one[one.index.isin(other.index)], other[other.index.isin(one.index)]
-    n, m = (of["count"].to_numpy(float) for of in (one, other))
+    frames = first.loc[first[measure].notna()], second.loc[second[measure].notna()]
+    cells, conditions = pd.factorize(pd.concat([frame["condition"] for frame in frames]))
+    size, counts, sums = len(frames[0]), [], []
+    for own, frame in zip((cells[:size], cells[size:]), frames, strict=True):
+        values = frame[measure].to_numpy(float)
+        counts.append(np.bincount(own, minlength=len(conditions)))
+        sums.append(np.bincount(own, values, minlength=len(conditions)))
+    shared = (counts[0] > 0) & (counts[1] > 0)
+    (n, m), (one, other) = ([part[shared] for part in parts] for parts in (counts, sums))
     shares = n * m / (n + m)
     shares /= shares.sum()
-    return float(shares @ one["mean"].to_numpy()), float(shares @ other["mean"].to_numpy())
+    return float(shares @ (one / n)), float(shares @ (other / m))
 
 
 def _freedom(
@@ -307,8 +310,8 @@ def _freedom(
     ``variances`` of the second and the first group. Trials of one group and condition are alike, so
     that only these are compared with each other.
     """
-    _, at, size = np.unique(np.column_stack([cells, belongs]), axis=0,
-                            return_index=True, return_counts=True)  # fmt: skip
+    both = 2 * cells + belongs.astype(int)
+    _, at, size = np.unique(both, return_index=True, return_counts=True)
     cell, x, n = cells[at], group[at], size.astype(float)
     variance, each = variances[belongs[at].astype(int)], group[at] ** 2 / left_over[at]
     trials = np.bincount(cells)[cell]

@@ -242,9 +242,10 @@ def _effect(
     frames = trials_by_cell(study, [level.pooled for level in levels], metric)
     left_out = {copy for level in levels for copy in level.copies}
     for level, frame in zip(levels, frames, strict=False):
-        unused = ~level.pooled.trials.index.isin(frame.index)
+        trials = level.pooled.trials
+        unused = ~trials.index.isin(frame.index)
         if unused.any():
-            left_out |= {*level.pooled.trials.loc[unused, KEYS].itertuples(index=False, name=None)}
+            left_out |= {*zip(*(trials[name].array[unused] for name in KEYS), strict=True)}
     ordered = [frames[place] for place in (0, 2, 1, 3)] if turned and frames else frames
     found = _difference(ordered, metric) or Estimate()
     # Where nothing varies it is not known what could have been seen.
@@ -363,6 +364,7 @@ def one_sided(study: Study) -> bool:
     )
 
 
+@remembered
 def level_estimate(study: Study, level: Level, metric: Metric) -> Estimate:
     """A metric of all trials of a level, with its 95 % interval.
 

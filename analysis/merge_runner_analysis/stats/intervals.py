@@ -1,6 +1,7 @@
 """Confidence intervals of proportions, means and differences, and what could have been found.
 
 Every test against Student's t is made here; one with infinite degrees of freedom is a normal one.
+Its functions are those that scipy.stats.t calls, which takes a hundred times as long.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from math import hypot, inf, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize, special, stats
+from scipy import optimize, special
 
 from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.score_interval import wilson
@@ -105,7 +106,7 @@ def interval(
     value: float, se: float, freedom: float = inf, level: float = LEVEL
 ) -> tuple[float, float]:
     """The interval of an estimate with this standard error, by Student's t."""
-    half = float(stats.t.ppf((1 + level) / 2, freedom)) * se
+    half = float(special.stdtrit(freedom, (1 + level) / 2)) * se
     return value - half, value + half
 
 
@@ -122,7 +123,7 @@ def at(found: Estimate, level: float) -> Estimate:
 
 def two_sided_p(statistic: float, freedom: float = inf) -> float:
     """The p-value of a t statistic against no effect, in either direction."""
-    return float(2 * stats.t.sf(abs(statistic), freedom))
+    return float(2 * special.stdtr(freedom, -abs(statistic)))
 
 
 def tested(value: float, se: float, freedom: float) -> Estimate:
@@ -154,4 +155,5 @@ def detectable(se: float, freedom: float = inf) -> float:
 
     It is (t.975 + t.8) standard errors, the usual approximation to the noncentral t.
     """
-    return float(stats.t.ppf((1 + LEVEL) / 2, freedom) + stats.t.ppf(POWER, freedom)) * se
+    quantiles = special.stdtrit(freedom, np.array([(1 + LEVEL) / 2, POWER]))
+    return float(quantiles.sum()) * se

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pandas as pd
 from scipy import stats
 
+from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.metrics import BOXES, JUDGED, Metric
 from merge_runner_analysis.published import citation, published
@@ -36,6 +38,7 @@ def counts(group: Group, metric: Metric) -> tuple[int, int]:
     return int(found.astype(bool).sum()), len(found)
 
 
+@remembered
 def estimate(group: Group, metric: Metric) -> Estimate:
     """The metric of a group with its 95 % interval, rates in percent.
 
@@ -109,12 +112,23 @@ def median(sample: np.ndarray) -> Estimate:
     """A median with its interval of order statistics; fewer than six values have no interval."""
     if not len(sample):
         return NOTHING
-    value = float(np.median(sample))
-    found = stats.quantile_test(sample, q=value, p=0.5).confidence_interval(LEVEL)
-    low, high = (None if np.isnan(end) else float(end) for end in found)
-    return Estimate(value, low, high, len(sample))
+    n, ordered = len(sample), np.sort(sample)
+    low, high = _ranks(n)
+    ends = float(ordered[low]) if low >= 0 else None, float(ordered[high]) if high < n else None
+    return Estimate(float(np.median(sample)), *ends, n)
 
 
+@cache
+def _ranks(n: int) -> tuple[int, int]:
+    """Return the places of the ordered values between which the median is, 95 times in 100.
+
+    They are those of scipy's quantile_test, which makes a distribution anew for every sample.
+    """
+    outside = (1 - LEVEL) / 2
+    return int(stats.binom.ppf(outside, n, 0.5)) - 1, int(stats.binom.isf(outside, n, 0.5))
+
+
+@remembered
 def undecided(group: Group, metric: Metric) -> int:
     """How many trials another collision rule ended, so that they are not known to collide by it."""
     if metric.value not in JUDGED or not known(group, metric):

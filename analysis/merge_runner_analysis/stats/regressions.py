@@ -61,6 +61,7 @@ class Counts:
         first = self.climb(np.zeros((1, self.design.shape[1])))
         return first and self.climb(first.starts())
 
+    @np.errstate(divide="ignore")
     def climb(self, starts: Array, term: int | None = None, value: float = 0.0) -> Fit | None:
         """Return the best fit that is reached from ``starts``, (starts, terms), if one converges.
 
@@ -107,8 +108,8 @@ class Counts:
         )
         return np.asarray(np.abs(found.x) > 1e-4)
 
-    def likelihood(self, b: Array) -> tuple[Array, Array, Array]:
-        """Return the penalised log-likelihoods of ``b`` (starts, terms), weights and information.
+    def likelihood(self, b: Array) -> tuple[Array, Array, Array, Array]:
+        """Return of ``b`` (starts, terms) penalised log-likelihoods, chances, weights, information.
 
         The penalty is half the logarithm of the determinant of the information: Jeffreys' prior.
         Where that is singular the likelihood is minus infinity.
@@ -117,11 +118,10 @@ class Counts:
         p = expit(linear)
         weights = self.n * p * (1 - p)
         information = (self.design.T * weights[:, None]) @ self.design
-        with np.errstate(divide="ignore"):
-            sign, penalty = np.linalg.slogdet(information)
+        sign, penalty = np.linalg.slogdet(information)
         likelihood = linear @ self.chosen - np.logaddexp(0, linear) @ self.n + penalty / 2
         likelihood[(sign <= 0) | (penalty < SINGULAR)] = -inf
-        return likelihood, weights, information
+        return likelihood, p, weights, information
 
     def penalised(self, b: Array) -> Penalised:
         """Return what is known of the penalised log-likelihoods at ``b``, (starts, terms).
@@ -129,9 +129,10 @@ class Counts:
         Firth's score adds to each residual the leverage times (1/2 - p): as if each trial were
         split, and half of its leverage had gone either way (Heinze and Schemper 2002).
         """
-        design, p = self.design, expit(b @ self.design.T)
-        likelihood, weights, information = self.likelihood(b)
-        information[np.isinf(likelihood)] = np.eye(len(design.T))
+        design = self.design
+        likelihood, p, weights, information = self.likelihood(b)
+        if (singular := np.isinf(likelihood)).any():
+            information[singular] = np.eye(len(design.T))
         weighted = design * np.sqrt(weights)[:, :, None]
         hat = weighted @ np.linalg.inv(information) @ weighted.transpose(0, 2, 1)
         leverage = np.diagonal(hat, axis1=1, axis2=2)
@@ -200,13 +201,19 @@ class Fit:
         therefore looked for at the bound. Raises ValueError where none is found.
         """
         followed = self.b[None].copy()
+        # The last two points of the profile: on the line through them is almost the next.
+        path = [self.b - np.linalg.inv(self.information)[term], self.b]
 
         @cache
         def excess(value: float) -> float:
+            before, other = path
+            along = other - before
+            followed[0] = other + along * (value - other[term]) / along[term]
             profile = self.counts.climb(followed, term, value) or self.profile(term, value)
             if profile is None:
                 return np.nan
-            followed[0] = profile.b
+            if profile.b[term] != other[term]:
+                path[:] = other, profile.b
             return float(self.best - profile.best - lost)
 
         bound, farthest = float(self.b[term]), FARTHEST * abs(width)
@@ -222,6 +229,7 @@ class Fit:
             followed = np.concatenate([followed, highest.b[None]])
             excess.cache_clear()
 
+    @np.errstate(divide="ignore")
     def starts(self, term: int | None = None, value: float = 0.0) -> Array:
         """Return from where all maxima are reached, perhaps with a term held: (starts, terms).
 

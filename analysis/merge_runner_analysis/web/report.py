@@ -115,9 +115,13 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
     """The report as one HTML document; ``figures`` maps names to SVG in Base64."""
     # Rows with equal sources share a number.
     numbers: dict[tuple[Source, ...], int] = {}
+    links: dict[tuple[str, str], str] = {}
 
     def number(table: Table, row: Row, _column: Column) -> str:
-        return f"#source-{numbers.setdefault(sources_of(study, table, row), len(numbers) + 1)}"
+        if (place := (table.name, row.id)) not in links:
+            of_sources = numbers.setdefault(sources_of(study, table, row), len(numbers) + 1)
+            links[place] = f"#source-{of_sources}"
+        return links[place]
 
     origin = provenance(study.db)
     finished = next((table for table in tables if table.name == TABLE), None)
