@@ -57,11 +57,9 @@ def with_metrics(connection: duckdb.DuckDBPyConnection, trials: str) -> pd.DataF
     types |= {metric.weight_column: "float" for metric in metrics if metric.weight}
     try:
         return _selected(connection, trials, metrics).astype(types)
-    except duckdb.OutOfMemoryException:
-        # A plug-in's metric may need more than is asked for to read what ours need.
-        connection.execute(f"SET memory_limit = '{SETTINGS['memory_limit']}'")
     except duckdb.Error:
-        pass  # found again below, with the metric's name
+        # A plug-in's metric may be wrong, or need more memory than is asked for to read ours.
+        connection.execute(f"SET memory_limit = '{SETTINGS['memory_limit']}'")
     for metric in metrics:
         try:
             _selected(connection, trials, [metric])

@@ -145,13 +145,21 @@ def export_tables(db: Path, folder: Path) -> None:
             connection.execute(f"CREATE OR REPLACE TEMP VIEW {NAME} AS {wide_trials(factors)}")
             connection.execute(f"COMMENT ON VIEW {NAME} IS {quoted(COMMENT)}")
             tables = described(connection)
+            levels = {
+                (NAME, name): OF_A_FACTOR
+                for factor, _ in factors
+                for name in (factor, f"factor_{factor}")
+            }
             folder.mkdir(parents=True, exist_ok=True)
             meanings = [
                 (table.name, *column)
                 for table in tables
                 for column in [
                     ("", "", table.comment),
-                    *((c.name, c.kind, c.comment or OF_A_FACTOR) for c in table.columns),
+                    *(
+                        (c.name, c.kind, c.comment or levels.get((table.name, c.name), ""))
+                        for c in table.columns
+                    ),
                 ]
             ]
             _write_csv(dictionary, HEADINGS, meanings)
