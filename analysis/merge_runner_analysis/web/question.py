@@ -7,7 +7,7 @@ Nothing here is tested or estimated: sentences, rows and charts are of the finis
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import ceil, floor, log10
 from typing import Any
@@ -104,12 +104,9 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The claim, what else there is to say, charts, and the effects behind them.
+    """The claim, what else there is to say, charts, and the effects behind them."""
 
-    The claim is in pieces, each with the cell of its trials where it is a count.
-    """
-
-    claim: list[tuple[str, tuple[str, str] | None]]
+    claim: str
     rest: str
     measure: str
     drivers: list[tuple[str, str]]
@@ -129,7 +126,7 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
     # Of a driver that is not judged there is a row without values.
     known = [row for row in levels.rows if row.values.get("factor")]
     sides = {row.id: row for row in known}
-    claim, rest = answered(effects.rows, sides)
+    claim, rest = answered(effects.rows)
     if not claim:
         return None
     asked = [row for row in effects.rows if row.values.get("primary")]
@@ -150,11 +147,11 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
     shapes = dict(zip(drawn, SHAPES, strict=False))
     charts = [
         _chart("By factor", [r for r in known if _is_level(r)], shapes, metric),
-        _chart("In combination", [r for r in known if not _is_level(r)], shapes, metric),
+        _chart(_crossing_of(known), [r for r in known if not _is_level(r)], shapes, metric),
     ]
     tested = [row for row in own if _tested(row)]
     return Answer(
-        _pieces(unbroken(claim), primary),
+        unbroken(claim),
         unbroken(rest),
         capital(name_of(primary)),
         [*shapes.items()],
@@ -168,10 +165,8 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
     )
 
 
-def answered(rows: Sequence[Row], sides: Mapping[str, Row] | None = None) -> tuple[str, str]:
+def answered(rows: Sequence[Row]) -> tuple[str, str]:
     """The answer in a sentence, and the rest; empty where no primary test was made.
-
-    ``sides`` are the rows of ``levels``, whose counts the sentence has.
 
     The claim is the surest of the primary tests whose corrected p is below 5 %; where there is
     none it says so, and the rest what could have been seen.
@@ -195,39 +190,30 @@ def answered(rows: Sequence[Row], sides: Mapping[str, Row] | None = None) -> tup
     rest = []
     if sure:
         first = sure[0]
-        claim = f"{rehearsed}{first.values['factor']} changes {what}: {_both(first, sides or {})}."
-        of, reference = (_estimate(first, name) for name in ("estimate", "estimate_reference"))
-        rest.append(
-            f"In the same situations that is {of} against {reference}: {_apart(first)}, "
-            f"p {_p(first)}."
-        )
+        claim = f"{rehearsed}{first.values['factor']} changes {what}: {_both(first)}."
+        rest.append(f"In the same situations, {_apart(first)}, corrected p {_p(first)}.")
     else:
         claim = f"{rehearsed}no change of {what} is shown by {joined(_factors(primary))}."
     for row in primary:
         if row not in sure[:1]:
             shown = "changes it, too" if _shown(row) else "is not shown to change it"
-            rest.append(f"{capital(_level(row))} {shown}: {_apart(row)}, p {_p(row)}.")
+            rest.append(f"{capital(_level(row))} {shown}: {_apart(row)}, corrected p {_p(row)}.")
     rest += [f"{capital(said)}." for said in copied]
     if not sure:
         rest.append(_seen(primary))
     crossed = [row for row in tested if _crossed(row) and metric_of(row) == metric_of(primary[0])]
     rest += [
-        f"{_named(row)} interact: {_apart(row)}, p {_p(row)}." for row in crossed if _shown(row)
+        f"{_named(row)} interact: {_apart(row)}, corrected p {_p(row)}."
+        for row in crossed
+        if _shown(row)
     ]
     also = [row for row in tested if _shown(row) and not _crossed(row) and row not in primary]
     also = [row for row in also if row.values["factor"] != MODEL and metric_of(row) in METRIC_NAMES]
     if not sure and also:
         row = min(also, key=lambda row: _number(row, "p"))
         what = CHANGED.get(metric_of(row), name_of(row))
-        rest.append(f"{capital(str(row.values['factor']))} changes {what}: {_both(row, {})}.")
+        rest.append(f"{capital(str(row.values['factor']))} changes {what}: {_both(row)}.")
     return capital(claim), " ".join(filter(None, rest))
-
-
-def _pieces(claim: str, row: Row) -> list[tuple[str, tuple[str, str] | None]]:
-    """The claim of this effect, cut at its counts: that of the level, then of the reference."""
-    names = [f"{row.values['factor']}={row.values[name]}" for name in ("level", "reference")]
-    parts = enumerate(re.split(r"(?<= in )(\d+)(?= of \d+ trials)", claim))
-    return [(text, (names[place // 2], "k") if place % 2 else None) for place, text in parts]
 
 
 def unbroken(text: str) -> str:
@@ -242,7 +228,7 @@ def _interactions(rows: Sequence[Row], drawn: set[str]) -> str:
     for row in rows:
         if _crossed(row) and crossed >= {*str(row.values["factor"]).split(TIMES)}:
             what = "they interact" if _shown(row) else "no interaction is shown"
-            said.append(f"{row.values['factor']}: {what}, {_apart(row)}, p {_p(row)}.")
+            said.append(f"{row.values['factor']}: {what}, {_apart(row)}, corrected p {_p(row)}.")
     return " ".join(said)
 
 
@@ -265,29 +251,17 @@ def _factors(rows: Iterable[Row]) -> list[str]:
     return list(dict.fromkeys(str(row.values["factor"]) for row in rows))
 
 
-def _both(row: Row, sides: Mapping[str, Row]) -> str:
-    """``with hurry=yes the driver goes first in 63 of 98 trials, with hurry=no in 50 of 99``."""
+def _both(row: Row) -> str:
+    """``with hurry=yes the driver goes first in 63.00 %, with hurry=no in 50.10 %``."""
     factor, level, base = (row.values[name] for name in ("factor", "level", "reference"))
     of, reference = (_estimate(row, name) for name in ("estimate", "estimate_reference"))
     if metric_of(row) == LEFT_FIRST.name:
-        found = [sides.get(f"{factor}={name}") for name in (level, base)]
-        shares = [
-            _share(side) if side else f"{share} of trials"
-            for side, share in zip(found, (of, reference), strict=True)
-        ]
         return (
-            f"with {factor}={level} the driver goes first in {shares[0]}, with {factor}={base} in "
-            f"{shares[1]}"
+            f"with {factor}={level} the driver goes first in {of} of trials, with {factor}={base} "
+            f"in {reference}"
         )
     name = f"{name_of(row)} " if unit_of(row) == "points" else ""
     return f"{name}{of} with {factor}={level}, {reference} with {factor}={base}"
-
-
-def _share(side: Row) -> str:
-    """``63 of 98 trials``, or, where trials count half, ``51.00 % of 98 trials``."""
-    if side.values["k"] is None:
-        return f"{number(_number(side, 'value'))} % of {side.values['n']} trials"
-    return f"{_counted(side)} trials"
 
 
 def _estimate(row: Row, name: str) -> str:
@@ -420,6 +394,12 @@ def _side(text: str, counts: Row | None, is_own: bool, metric: str) -> Side:
 
 def _is_level(row: Row) -> bool:
     return TIMES not in str(row.values["factor"])
+
+
+def _crossing_of(levels: Sequence[Row]) -> str:
+    """``In combination: hurry, persona``."""
+    names = [str(row.values["factor"]) for row in levels if not _is_level(row)]
+    return f"In combination: {', '.join(names[0].split(TIMES))}" if names else ""
 
 
 def _of_one_factor(levels: Sequence[Row]) -> list[Row]:

@@ -107,8 +107,6 @@ def test_the_first_screen_answers_a_study_of_two_factors(page, db, outcomes):
     said_first = "a scripted stand-in, hurry changes who goes first"
     expect(answer).to_contain_text(said_first, timeout=1000 * HANGS_S)
     said = answer.inner_text().replace("\N{NO-BREAK SPACE}", " ")
-    hurried = outcomes[outcomes["hurry"] == "yes"]
-    assert f"in {int(hurried['first'].sum())} of {len(hurried)} trials" in said
     points = page.locator(".levels .point title").all_text_contents()
     for factors in ("persona", "hurry", ["persona", "hurry"]):
         for _, rows in outcomes.groupby(factors):
@@ -117,7 +115,9 @@ def test_the_first_screen_answers_a_study_of_two_factors(page, db, outcomes):
     every = readings(outcomes)
     slope = 100 * fitted(every, "hurry", ("persona", "opponent"))["C(hurry)[T.yes]"]
     beside = page.locator("main").inner_text().replace("\N{NO-BREAK SPACE}", " ")
-    assert f": +{slope:.2f} points" in beside
+    assert f", +{slope:.2f} points" in beside
+    shares = [float(share) for share in re.findall(r"(\d+\.\d\d) %", said)]
+    assert shares[0] - shares[1] == pytest.approx(slope, abs=0.011)
     none, taxi = (
         fitted(every[every["persona"] == name], "hurry", ("opponent",))["C(hurry)[T.yes]"]
         for name in ("none", "taxi")
@@ -129,7 +129,9 @@ def test_the_first_screen_answers_a_study_of_two_factors(page, db, outcomes):
         box = part.bounding_box()
         assert box["y"] + box["height"] <= 900
     assert page.evaluate("document.documentElement.scrollWidth - innerWidth") == 0
-    # A count of the headline leads to exactly its trials.
-    count = answer.get_by_role("link").first.inner_text()
-    answer.get_by_role("link").first.click()
+    # A count leads to exactly its trials.
+    hurried = outcomes[outcomes["hurry"] == "yes"]
+    count = str(int(hurried["first"].sum()))
+    changes = page.locator(".changes").first
+    changes.get_by_role("link", name=count, exact=True).first.click()
     expect(page.locator(".totals")).to_contain_text(f"{count} trials", timeout=1000 * HANGS_S)

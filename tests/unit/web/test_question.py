@@ -36,7 +36,7 @@ def copied(factor):
 
 
 HURRY = "Hurry changes who goes first: with hurry=yes the driver goes first in 63.00 % of trials, "
-SAME = "In the same situations that is 63.00 % against 50.00 %: +13.00 points [6.00, 20.00], "
+SAME = "In the same situations, +13.00 points [6.00, 20.00], corrected "
 SEEN = "A change of 10.00 points or more would have been seen in four of five studies."
 
 
@@ -47,27 +47,26 @@ SEEN = "A change of 10.00 points or more would have been seen in four of five st
         ([effect(p=None)], "", ""),
         (
             [effect("persona", 0.5, difference=1.0), effect()],
-            f"{HURRY}with hurry=no in 50.00 % of trials.",
+            f"{HURRY}with hurry=no in 50.00 %.",
             f"{SAME}p = 0.001. Persona=yes is not shown to change it: +1.00 points [−6.00, 8.00], "
-            "p = 0.500.",
+            "corrected p = 0.500.",
         ),
         (
             [effect(p=0.2), effect(measure=GAP, p=0.0001, estimate=3.8, estimate_reference=4.3)],
             "No change of who goes first is shown by hurry.",
-            "Hurry=yes is not shown to change it: +13.00 points [6.00, 20.00], p = 0.200. "
-            f"{SEEN} Hurry changes gap at the merge point: 3.80 m with hurry=yes, 4.30 m with "
-            "hurry=no.",
+            "Hurry=yes is not shown to change it: +13.00 points [6.00, 20.00], "
+            f"corrected p = 0.200. {SEEN} Hurry changes gap at the merge point: 3.80 m with "
+            "hurry=yes, 4.30 m with hurry=no.",
         ),
         (
             [effect(p=0.0001), effect("hurry × persona", 0.01, difference=-8.0)],
-            f"{HURRY}with hurry=no in 50.00 % of trials.",
+            f"{HURRY}with hurry=no in 50.00 %.",
             f"{SAME}p < 0.001. Hurry and persona interact: −8.00 points [−15.00, −1.00], "
-            "p = 0.010.",
+            "corrected p = 0.010.",
         ),
         (
             [effect(drivers="scripted"), copied("persona")],
-            "In a rehearsal with a scripted stand-in, h"
-            f"{HURRY[1:]}with hurry=no in 50.00 % of trials.",
+            f"In a rehearsal with a scripted stand-in, h{HURRY[1:]}with hurry=no in 50.00 %.",
             f"{SAME}p = 0.001. Persona=yes is {SAME_TRIALS}.",
         ),
         (
