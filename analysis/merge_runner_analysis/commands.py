@@ -258,6 +258,7 @@ def export(
         Path, typer.Argument(metavar="DIR", help="A new folder, or that of an earlier export.")
     ],
     db: DbOption = DEFAULT_DB,
+    study_file: StudyOption = None,
 ) -> None:
     """Write every table as Parquet and CSV, with all columns explained.
 
@@ -265,7 +266,7 @@ def export(
     """
     from merge_runner.results.export import export_tables
 
-    export_tables(db, folder)
+    export_tables(db, folder, cli.runs_of_study(study_file, db))
     print_out(f"wrote every table into {folder}: begin with {folder / 'dictionary.csv'}")
 
 

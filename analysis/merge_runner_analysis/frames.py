@@ -6,7 +6,7 @@ A query that a single table, page or statistic needs stands beside it.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ from merge_runner.results import frames
 from merge_runner.results.database import limit_memory, read_database
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.served_model import other_models, sql_of
-from merge_runner.study.crossing import MODEL, PROMPT
+from merge_runner.study.runs import study_name
 from merge_runner.text_safety import quoted
 from merge_runner_analysis.calls import COUNTED
 from merge_runner_analysis.trials import judged, with_metrics
@@ -217,9 +217,3 @@ def _studies(sweeps: pd.DataFrame, links: pd.DataFrame) -> Studies:
         for factor, levels in order.items():
             known[factor] = list(dict.fromkeys([*known.get(factor, ()), *levels]))
     return Studies(links.assign(study=links["sweep_id"].map(names)), orders)
-
-
-def study_name(name: str, factors: Iterable[str]) -> str:
-    """Return ``mood (opponent, temperature)``: studies of one name but other factors are others."""
-    own = sorted({*factors} - {MODEL, PROMPT})
-    return f"{name} ({', '.join(own)})" if own else name

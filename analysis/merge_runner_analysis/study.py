@@ -18,8 +18,9 @@ from merge_runner.registry import require
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.study.crossing import MODEL, PROMPT, listed_levels
 from merge_runner.study.file import StudySource, read_study
+from merge_runner.study.runs import study_name
 from merge_runner_analysis.cache import present_state, remembered
-from merge_runner_analysis.frames import KEYS, Order, Studies, read, read_frames, study_name
+from merge_runner_analysis.frames import KEYS, Order, Studies, read, read_frames
 from merge_runner_analysis.grouping import (
     Group,
     Reason,

@@ -47,6 +47,7 @@ DASK = "Play on a Dask cluster: local:N, a scheduler's address, or its file."
 BATCH = "Send requests in the provider's batches: cheaper, but it takes hours."
 RECORDING = "Also replay from this file, without importing it; may be repeated."
 CACHE = "Replay from this cache folder, not from the stored replies."
+NOT_BOTH = "--sweep names a run, --study all runs of a study: leave one of them out"
 SWEEP = "A sweep_id, which may be repeated; the newest sweep if none is given."
 Form = Literal["text", "csv", "json"]
 RecordingFile = Annotated[Path, typer.Argument(metavar="FILE", help="A recording (.parquet).")]
@@ -272,14 +273,18 @@ def sql(
         shutil.copyfileobj(spooled, sys.stdout)
 
 
-def digest(db: cli.DbOption = DEFAULT_DB, as_json: cli.JsonOption = False) -> None:
+def digest(
+    db: cli.DbOption = DEFAULT_DB,
+    study: cli.StudyOption = None,
+    as_json: cli.JsonOption = False,
+) -> None:
     """Print one line: a hash of all results, equal for equal results.
 
-    Example: merge-runner digest --db results/merge.duckdb
+    Example: merge-runner digest --study my-study/study.toml
     """
     from merge_runner.results.store import results_digest
 
-    value, trials = results_digest(db)
+    value, trials = results_digest(db, cli.runs_of_study(study, db))
     as_text = f"{value}  {trials} trials"
     print_out(json.dumps({"digest": value, "trials": trials}) if as_json else as_text)
 
@@ -307,11 +312,16 @@ def audit(
     cli.use_study(study, trust=trust)
     skipped: list[str] = []
     if recording is not None:
-        if sweep_id is not None or cache is not None:
-            raise UsageError("--recording is checked by itself: without --sweep and --cache")
+        if any(each is not None for each in (sweep_id, cache, study)):
+            raise UsageError(
+                "--recording is checked by itself: without --sweep, --study and --cache"
+            )
         audits = [audit_recording(recording)]
     else:
-        audits = audit_database(db, sweep_id, cache)
+        if sweep_id is not None and study is not None:
+            raise UsageError(NOT_BOTH)
+        named = [sweep_id] if sweep_id is not None else cli.runs_of_study(study, db)
+        audits = audit_database(db, named, cache)
         told = {"calls.cached"} if cache is not None else set(NOT_REPLAYED)
         skipped = [name for name in NOT_REPLAYED if name in told or "calls" not in name]
     ok = all(found.ok for found in audits)
@@ -361,6 +371,7 @@ def recording_export(
     db: cli.DbOption = DEFAULT_DB,
     cache: cli.CacheOption = DEFAULT_CACHE,
     sweeps: Annotated[list[str] | None, cli.option("ID", SWEEP, "--sweep")] = None,
+    study: cli.StudyOption = None,
 ) -> None:
     """Write what sweeps asked and were answered into one file.
 
@@ -370,7 +381,9 @@ def recording_export(
     from merge_runner.results.recording import carried_plugins, export_recording, provenance_of
     from merge_runner.results.store import recorded_sweeps, sweeps_with_calls
 
-    rows, keys = recorded_sweeps(db, sweeps or ())
+    if sweeps and study is not None:
+        raise UsageError(NOT_BOTH)
+    rows, keys = recorded_sweeps(db, sweeps or cli.runs_of_study(study, db) or ())
     found = " and ".join(row["sweep_id"] for row in rows)
     if not keys:
         others = " or ".join(f"--sweep {sweep_id}" for sweep_id in sweeps_with_calls(db))

@@ -98,8 +98,8 @@ StudyOption = Annotated[
     str | None,
     option(
         "FILE",
-        "A study's file: tables, figures and reports are of its trials alone, its plug-ins run, "
-        "and its prompts, conditions, drivers and metrics are known.",
+        "A study's file: its trials alone. Where a command needs its prompts, conditions, drivers "
+        "or metrics, these are known, and its plug-ins run.",
         "--study",
         **FILES,
     ),
@@ -114,6 +114,16 @@ def use_study(file: str | None, *, trust: bool) -> None:
 
         _, catalogue = load_study(file, trust=trust)
         use(catalogue)
+
+
+def runs_of_study(file: str | None, db: Path) -> list[str] | None:
+    """The ids of the runs of the study of ``--study``, whose code does not run; None without it."""
+    if file is None:
+        return None
+    from merge_runner.study.file import read_study
+    from merge_runner.study.runs import runs_of
+
+    return runs_of(db, read_study(file))
 
 
 def levels(given: Sequence[str], option: str) -> dict[str, list[str]]:

@@ -292,6 +292,19 @@ def merge_small_groups(connection: duckdb.DuckDBPyConnection) -> None:
     connection.execute(f"SET max_vacuum_tasks = {100 * (Path(path).stat().st_size <= most_bytes)}")
 
 
+def of_sweeps(sweep_ids: Iterable[str]) -> str:
+    """What is true, in SQL, of the rows of some sweeps."""
+    return f"sweep_id IN ({', '.join(map(quoted, sweep_ids))})"
+
+
+def only(sweep_ids: Iterable[str] | None) -> str:
+    """What keeps, in SQL, the rows of the trials of some sweeps; None: all are kept."""
+    if sweep_ids is None:
+        return ""
+    wanted = f"FROM sweep_trials WHERE {of_sweeps(sweep_ids)}"
+    return f"SEMI JOIN ({wanted}) USING (trial_id, spec_hash)"
+
+
 def fetched(result: duckdb.DuckDBPyConnection) -> Iterator[tuple[Any, ...]]:
     """The rows of a result, a few at a time; its connection runs no other query until the end."""
     return chain.from_iterable(iter(partial(result.fetchmany, ROWS_AT_ONCE), []))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import chain
@@ -14,7 +14,14 @@ from typing import Any, TextIO
 import duckdb
 
 from merge_runner.errors import StoreError, UsageError
-from merge_runner.results.database import fetched, names_of, read_database, schema_sql
+from merge_runner.results.database import (
+    fetched,
+    names_of,
+    of_sweeps,
+    only,
+    read_database,
+    schema_sql,
+)
 from merge_runner.text_safety import csv_writer, first_line, in_spreadsheet, printable, quoted
 
 Rows = Iterable[tuple[Any, ...]]
@@ -106,16 +113,8 @@ def units() -> str:
     return schema_sql().partition("\n")[0].removeprefix("-- ")
 
 
-def only(sweep_id: str | None) -> str:
-    """What keeps the rows of one sweep's trials; nothing is left out where none is named."""
-    if sweep_id is None:
-        return ""
-    wanted = f"FROM sweep_trials WHERE sweep_id = {quoted(sweep_id)}"
-    return f"SEMI JOIN ({wanted}) USING (trial_id, spec_hash)"
-
-
-def wide_trials(factors: Iterable[tuple[str, str]], sweep_id: str | None = None) -> str:
-    """Return the query of all trials, or of a sweep's, with their FACTORS.
+def wide_trials(factors: Iterable[tuple[str, str]], sweep_ids: Sequence[str] | None = None) -> str:
+    """Return the query of all trials, or of those of some sweeps, with their FACTORS.
 
     A factor that is called like a column of the trials has ``factor_`` before its name.
     """
@@ -126,11 +125,11 @@ def wide_trials(factors: Iterable[tuple[str, str]], sweep_id: str | None = None)
         name = f"factor_{factor}" if factor.lower() in taken else factor
         column = '"' + name.replace('"', '""') + '"'
         levels += f", max(value) FILTER (factor = {quoted(factor)})::{kind} AS {column}"
-    return WIDE.format(levels=levels, only=only(sweep_id))
+    return WIDE.format(levels=levels, only=only(sweep_ids))
 
 
-def export_tables(db: Path, folder: Path) -> None:
-    """Write the folder.
+def export_tables(db: Path, folder: Path, sweep_ids: Sequence[str] | None = None) -> None:
+    """Write the folder: all rows, or those of some sweeps and their trials.
 
     Its dictionary says what each column means and, in a row without a column, each table. Raises
     UsageError where the folder is neither empty nor an earlier export's.
@@ -141,8 +140,9 @@ def export_tables(db: Path, folder: Path) -> None:
         raise UsageError(f"{folder} is there and no earlier export: name another folder")
     try:
         with read_database(db) as connection:
-            factors = connection.execute(FACTORS.format(only="")).fetchall()
-            connection.execute(f"CREATE OR REPLACE TEMP VIEW {NAME} AS {wide_trials(factors)}")
+            factors = connection.execute(FACTORS.format(only=only(sweep_ids))).fetchall()
+            wide = wide_trials(factors, sweep_ids)
+            connection.execute(f"CREATE OR REPLACE TEMP VIEW {NAME} AS {wide}")
             connection.execute(f"COMMENT ON VIEW {NAME} IS {quoted(COMMENT)}")
             tables = described(connection)
             levels = {
@@ -164,7 +164,7 @@ def export_tables(db: Path, folder: Path) -> None:
             ]
             _write_csv(dictionary, HEADINGS, meanings)
             for table in tables:
-                query = f"FROM {table.name}"
+                query = f"FROM {table.name} {_rows_of(sweep_ids, table)}"
                 parquet = quoted((folder / f"{table.name}.parquet").resolve())
                 options = "FORMAT parquet, COMPRESSION zstd"
                 connection.execute(f"COPY ({query}) TO {parquet} ({options})")
@@ -174,6 +174,19 @@ def export_tables(db: Path, folder: Path) -> None:
         raise UsageError(f"{folder} cannot be written: {exc}") from exc
     except duckdb.Error as exc:
         raise StoreError(f"{db} cannot be exported: {first_line(exc)}") from exc
+
+
+def _rows_of(sweep_ids: Sequence[str] | None, table: SchemaTable) -> str:
+    """What keeps the rows of some sweeps, of their trials, or of the specs of these."""
+    names = {column.name for column in table.columns}
+    if sweep_ids is None or not names & {"sweep_id", "spec_hash"}:
+        return ""
+    if "sweep_id" in names:
+        return f"WHERE {of_sweeps(sweep_ids)}"
+    if "trial_id" in names:
+        return only(sweep_ids)
+    own = f"FROM sweep_trials WHERE {of_sweeps(sweep_ids)}"
+    return f"SEMI JOIN ({own}) USING (spec_hash)"
 
 
 def _write_csv(path: Path, names: list[str], rows: Rows) -> None:

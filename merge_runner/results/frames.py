@@ -9,7 +9,8 @@ import duckdb
 import numpy as np
 import pandas as pd
 
-from merge_runner.results.export import FACTORS, only, wide_trials
+from merge_runner.results.database import only
+from merge_runner.results.export import FACTORS, wide_trials
 from merge_runner.results.rows import PLACES
 from merge_runner.results.store import answer
 
@@ -35,13 +36,13 @@ def load(db: Path, sql: str) -> pd.DataFrame:
 def load_of_sweep(db: Path, sweep_id: str, table: str) -> pd.DataFrame:
     """The rows of a table that belong to the trials of a sweep, in the order of their ids."""
     places = ", ".join(("trial_id", *PLACES[table]))
-    return load(db, f"FROM {table} {only(sweep_id)} ORDER BY {places}")
+    return load(db, f"FROM {table} {only([sweep_id])} ORDER BY {places}")
 
 
 def load_trials(db: Path, sweep_id: str) -> pd.DataFrame:
     """The trials of a sweep, with their measures and levels."""
-    factors = load(db, FACTORS.format(only=only(sweep_id)))
-    return load(db, wide_trials(factors.itertuples(index=False, name=None), sweep_id))
+    factors = load(db, FACTORS.format(only=only([sweep_id])))
+    return load(db, wide_trials(factors.itertuples(index=False, name=None), [sweep_id]))
 
 
 def frame(result: duckdb.DuckDBPyConnection) -> pd.DataFrame:

@@ -31,6 +31,7 @@ from merge_runner.results.database import (
     limit_memory,
     merge_small_groups,
     names_of,
+    only,
     read_database,
     schema_sql,
     unreadable_is_usage,
@@ -259,8 +260,8 @@ def answering(
         raise UsageError(f"the query failed: {exc}") from exc
 
 
-def results_digest(path: Path) -> tuple[str, int]:
-    """A hash of all results, and the number of trials in it.
+def results_digest(path: Path, sweep_ids: Sequence[str] | None = None) -> tuple[str, int]:
+    """A hash of all results, or of those of some sweeps, and the number of trials in it.
 
     The hash covers what happened (trials, states, decisions), whatever the order of storage, but
     not when, where or at what price: no clock times, latencies, costs, cache keys or spec hashes.
@@ -269,7 +270,8 @@ def results_digest(path: Path) -> tuple[str, int]:
     with read_database(path) as connection:
         for table, columns in OF_THE_DIGEST.items():
             # A trial's rows lie together in the table, which is too large to be sorted.
-            sql = f"SELECT trial_id, spec_hash, {columns} FROM {table}"  # noqa: S608 # constants
+            chosen = only(sweep_ids)
+            sql = f"SELECT trial_id, spec_hash, {columns} FROM {table} {chosen}"  # noqa: S608
             for key, rows in groupby(fetched(connection.execute(sql)), key=itemgetter(0, 1)):
                 digest = digests.setdefault(key, hashlib.sha256(key[0].encode()))
                 for values in sorted(rows, key=itemgetter(2, 4)):

@@ -75,9 +75,9 @@ ORDER BY started_at DESC, sweep_id DESC
 
 
 def audit_database(
-    path: Path, sweep_id: str | None = None, cache: Path | None = None
+    path: Path, sweep_ids: Sequence[str] | None = None, cache: Path | None = None
 ) -> list[Audit]:
-    """Audit every sweep, oldest first, and then what belongs to none; or one sweep alone.
+    """Audit every sweep, oldest first, and then what belongs to none; or some sweeps alone.
 
     A trial that several sweeps have is audited with the newest of them. The replies are those of
     the folder ``cache``, if it is named, and are compared with the stored ones. Raises UsageError.
@@ -85,14 +85,16 @@ def audit_database(
     opened = nullcontext() if cache is None else closing(ResponseCache(cache, read_only=True))
     with audited_database(path) as connection, opened as recorded:
         sweeps = {row[0]: row for row in connection.execute(SWEEPS).fetchall()}
-        if sweep_id is not None:
+        if sweep_ids is not None:
             oldest_first = dict(reversed(sweeps.items()))
-            sweeps = {sweep_id: require(oldest_first, "sweep", sweep_id, f"in {path}")}
+            for sweep_id in sweep_ids:
+                require(oldest_first, "sweep", sweep_id, f"in {path}")
+            sweeps = {name: row for name, row in sweeps.items() if name in sweep_ids}
         audits = [
             _audit(connection, name, config, recorded, finished=finished)
             for name, config, finished in sweeps.values()
         ]
-        rest = [check_rest(connection, path)] if sweep_id is None else []
+        rest = [check_rest(connection, path)] if sweep_ids is None else []
         return [*reversed(audits), *rest]
 
 

@@ -205,7 +205,7 @@ def test_runs_show_how_they_ended_and_what_the_audit_finds_and_a_scope_changes_n
     assert ("lasted 2.0 h" in text, " 2.0 h " in whole) == (True, True)
     assert "found: outcome: sweep-1" in text
     assert "found: outcome: sweep-1" in whole
-    [run] = audit_database(study, "sweep-1")
+    [run] = audit_database(study, ["sweep-1"])
     assert all(" ".join(note.split()) in text for note in run.notes)
     said = re.search(r"How each ended .*", whole)[0]
     assert said.split(" To go on")[0] in part

@@ -1,0 +1,39 @@
+"""Which runs of a database played the trials of a study."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+
+from merge_runner.errors import UsageError
+from merge_runner.results.database import read_database
+from merge_runner.study.crossing import MODEL, PROMPT
+from merge_runner.study.file import StudySource
+
+NAMED = """
+SELECT sweep_id, name, coalesce('-' || nullif(config->>'$.seat', ''), '') AS seat,
+    coalesce(config->'$.levels', '{}') AS levels
+FROM sweeps ORDER BY started_at, sweep_id
+"""
+
+
+def study_name(name: str, factors: Iterable[str]) -> str:
+    """Return ``mood (opponent, temperature)``: studies of one name but other factors are others."""
+    own = sorted({*factors} - {MODEL, PROMPT})
+    return f"{name} ({', '.join(own)})" if own else name
+
+
+def runs_of(db: Path, study: StudySource) -> list[str]:
+    """Return the ids of a study's runs, oldest first; raises UsageError where there is none."""
+    with read_database(db) as connection:
+        rows = connection.execute(NAMED).fetchall()
+    wanted = study_name(study.name, study.file.factors)
+    played = {
+        sweep_id: study_name(name.removesuffix(seat), json.loads(levels))
+        for sweep_id, name, seat, levels in rows
+    }
+    if wanted not in played.values():
+        held = ", ".join(dict.fromkeys(played.values())) or "none"
+        raise UsageError(f"{db} holds no trial of the study {wanted}; it holds those of: {held}")
+    return [sweep_id for sweep_id, name in played.items() if name == wanted]
