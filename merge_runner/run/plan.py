@@ -429,9 +429,10 @@ def make_plan(
     drivers = chosen_models(file, asked)
     pairs = (dict.fromkeys(both_sides(name).values()) for name in drivers)
     with using(catalogue):
-        metrics = [name for each in Registry.made if each.kind == "metric" for name in each]
-        measures = dict.fromkeys([*MEASURES, *metrics])
-        require(measures, "measure", file.primary, "as the study's primary one")
+        metrics = [item for each in Registry.made if each.kind == "metric" for item in each.items()]
+        tested = [name for name, metric in metrics if metric.estimator != "median"]
+        hint = "as the study's primary one; a median is not tested"
+        require(dict.fromkeys([*MEASURES, *tested]), "measure", file.primary, hint)
         registry = load_models(study.path.parent)
         wanted = _repetitions(study, variants, repetitions)
         names = _conditions(file, conditions)

@@ -44,14 +44,9 @@ MEASURES = (
     "joint_percent",
     "valid_percent",
     "cost_usd",
-    "conflict_resolution_s",
-    "time_to_merge_s",
-    "post_encroachment_s",
-    "min_ttc_s",
-    "max_acceleration_mps2",
 )
 """What ``StudyFile.primary`` may name beside the metrics of plug-ins: what an ``Effect`` may be on,
-and the analysis' own metrics, which the runner does not import."""
+and the analysis' own metrics that are tested, which the runner does not import."""
 ONE_OF_EACH = "give it a block, a text, or merge and straight"
 TEMPLATE = Path(__file__).with_name("template")
 PLUGIN = "plugin.py"
