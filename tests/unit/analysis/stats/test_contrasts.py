@@ -12,6 +12,7 @@ from statsmodels.stats.contingency_tables import StratifiedTable
 from statsmodels.stats.multitest import multipletests
 
 from analysis.research.independent.recompute_statistics import means_within as recomputed_means
+from merge_runner_analysis import wording
 from merge_runner_analysis.stats.contrasts import (
     Cells,
     contrast_means,
@@ -25,6 +26,7 @@ from merge_runner_analysis.stats.contrasts import (
 )
 from merge_runner_analysis.stats.score_interval import Z
 from merge_runner_analysis.stats.verdicts import holm_levels
+from tests.support.harness import PROJECT
 
 
 def trials(strata) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -47,6 +49,22 @@ STRATA = [
     {"a": (16, 110, 28, 110)},
     {"a": (5, 5, 0, 4)},
 ]
+
+
+def test_the_example_of_two_models_has_the_numbers_of_its_test():
+    n = np.full(11, 10)
+    found = contrast_rates(Cells(np.array([2] + [1] * 10), n, np.full(11, 3), n))
+    values = {
+        "k": 12,
+        "n": 110,
+        "k_reference": 33,
+        "n_reference": 110,
+        "difference": 100 * found.value,
+        "ci": (100 * found.low, 100 * found.high),
+        "p_corrected": corrected([found.p, *[1.0] * 6])[0],
+    }
+    claim, _ = wording.apart("o3", "gpt-6-sol", {"collided_percent": values})
+    assert claim in (PROJECT / "docs/how-to/compare-two-models.md").read_text()
 
 
 def difference_at(cells, apart):
