@@ -67,6 +67,10 @@ WhereOption = Annotated[
         "--where",
     ),
 ]
+RunOption = Annotated[
+    str | None,
+    option("NAME", "Only drivers' trials of the runs of this --name, or sweep_id.", "--run"),
+]
 ByOption = Annotated[
     str | None,
     option(
@@ -92,6 +96,7 @@ def tables(
     db: DbOption = DEFAULT_DB,
     models: ModelsOption = None,
     where: WhereOption = None,
+    run: RunOption = None,
     study_file: StudyOption = None,
     trust: TrustOption = False,
     output: Annotated[
@@ -125,7 +130,9 @@ def tables(
     from merge_runner_analysis.tables.formats import render
 
     study = None
-    selection = _selection(models, where, study_file, by, without_fallbacks=without_fallbacks)
+    selection = _selection(
+        models, where, study_file, by, run=run, without_fallbacks=without_fallbacks
+    )
     if against is not None:
         from merge_runner_analysis.study import Study
         from merge_runner_analysis.tables.against import PAPER
@@ -150,6 +157,7 @@ def explain(
     cell: Annotated[str, typer.Argument(metavar="ROW", help="ROW, or ROW:COLUMN.")],
     db: DbOption = DEFAULT_DB,
     where: WhereOption = None,
+    run: RunOption = None,
     study_file: StudyOption = None,
     trust: TrustOption = False,
     by: ByOption = None,
@@ -162,7 +170,7 @@ def explain(
 
     Example: merge-runner explain indicators emulator/baseline:collided_percent
     """
-    study = _study(db, _selection(where=where, file=study_file, by=by), trust=trust)
+    study = _study(db, _selection(where=where, file=study_file, by=by, run=run), trust=trust)
     from merge_runner_analysis.explain import explain as explain_cell
     from merge_runner_analysis.tables import finished_tables
 
@@ -237,6 +245,7 @@ def figures(
     db: DbOption = DEFAULT_DB,
     models: ModelsOption = None,
     where: WhereOption = None,
+    run: RunOption = None,
     study_file: StudyOption = None,
     trust: TrustOption = False,
 ) -> None:
@@ -244,7 +253,7 @@ def figures(
 
     Example: merge-runner figures --out results/figures
     """
-    study = _study(db, _selection(models, where, study_file), trust=trust)
+    study = _study(db, _selection(models, where, study_file, run=run), trust=trust)
     from merge_runner_analysis.figures.gallery import write_figures
 
     _say_what_is_computed(study, "figures")
@@ -281,6 +290,7 @@ def report(
     db: DbOption = DEFAULT_DB,
     models: ModelsOption = None,
     where: WhereOption = None,
+    run: RunOption = None,
     study_file: StudyOption = None,
     trust: TrustOption = False,
 ) -> None:
@@ -289,7 +299,7 @@ def report(
     Example: merge-runner report --study my-study/study.toml
     """
     refuse_another_kind(out, HTML, "page of HTML")
-    study = _study(db, _selection(models, where, study_file), trust=trust)
+    study = _study(db, _selection(models, where, study_file, run=run), trust=trust)
     from merge_runner_analysis.web.report import write_report
 
     _say_what_is_computed(study, "tables and figures")
@@ -324,10 +334,11 @@ def _selection(
     file: str | None = None,
     by: str | None = None,
     *,
+    run: str | None = None,
     without_fallbacks: bool = False,
 ) -> Selection:
     levels = cli.levels(where or (), "--where") or None
-    return Selection(drivers(models), levels, file, by, without_fallbacks)
+    return Selection(drivers(models), levels, file, by, without_fallbacks, run or "")
 
 
 def _study(db: Path, selection: Selection, *, trust: bool) -> Study:

@@ -119,7 +119,7 @@ KEYS = ["trial_id", "spec_hash"]
 # The newest run comes first: the order of its levels counts.
 SWEEPS = """
 SELECT sweep_id, name, coalesce('-' || nullif(config->>'$.seat', ''), '') AS seat,
-    coalesce(config->'$.levels', '{}') AS levels
+    coalesce(config->'$.levels', '{}') AS levels, config->>'$.run_name' AS run_name
 FROM sweeps ORDER BY started_at DESC, sweep_id
 """
 LINKS = "SELECT DISTINCT trial_id, spec_hash, sweep_id FROM sweep_trials"
@@ -162,6 +162,8 @@ class Studies(NamedTuple):
     """A row for each trial and each run that it was played for: its key, sweep_id, study."""
     orders: Mapping[str, Order]
     """By study the levels of each factor, in the order of the study."""
+    called: Mapping[str, str]
+    """By the id of each run what its user calls it; empty without a name."""
 
     def holds(self, study: str, frame: pd.DataFrame) -> pd.Series:
         """Return which rows of a frame are of trials that were played for a study."""
@@ -216,4 +218,5 @@ def _studies(sweeps: pd.DataFrame, links: pd.DataFrame) -> Studies:
         known = orders.setdefault(names[row.sweep_id], {})
         for factor, levels in order.items():
             known[factor] = list(dict.fromkeys([*known.get(factor, ()), *levels]))
-    return Studies(links.assign(study=links["sweep_id"].map(names)), orders)
+    called = sweeps.set_index("sweep_id")["run_name"].fillna("").to_dict()
+    return Studies(links.assign(study=links["sweep_id"].map(names)), orders, called)

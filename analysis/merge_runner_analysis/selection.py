@@ -23,7 +23,7 @@ class Selection:
     without_fallbacks: bool = False
     """No trial in which a decision had no valid plan."""
     sweep: str = ""
-    """Drivers' trials of this run alone, by its id."""
+    """Drivers' trials of this run alone, by its id, or of the runs of this name."""
     condition: str = ""
     """The trials of this condition alone."""
 

@@ -81,8 +81,18 @@ class Study:
         sweep, condition = self.selection.sweep, self.selection.condition
         if sweep:
             links = self.frames.studies.trials
-            trials = trials.merge(links.loc[links["sweep_id"] == sweep, KEYS])
+            runs = self._runs(sweep)
+            trials = trials.merge(links.loc[links["sweep_id"].isin(runs), KEYS].drop_duplicates())
         return trials[trials["condition"] == condition] if condition else trials
+
+    def _runs(self, wanted: str) -> list[str]:
+        """Return the ids of the runs of this id or name; raises UsageError where there is none."""
+        called = self.frames.studies.called
+        named = [sweep_id for sweep_id, name in called.items() if name == wanted]
+        if not named:
+            names = filter(None, called.values())
+            require(dict.fromkeys([*names, *called]), "run", wanted, f"in {self.db}")
+        return named or [wanted]
 
     def _part(self, humans: Group) -> Group:
         condition = self.selection.condition

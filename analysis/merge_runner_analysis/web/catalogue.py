@@ -35,10 +35,10 @@ Wanted = Mapping[str, Any]
 """
 Facets = dict[str, list[tuple[str, int]]]
 Counted = TypeVar("Counted")
-FACETS = ("sweep", "who", "model", "variant", "condition", "outcome", "account", "validity",
+FACETS = ("sweep", "run", "who", "model", "variant", "condition", "outcome", "account", "validity",
           "cause", "tag")  # fmt: skip
 # Facets of which a trial may have several values.
-SEVERAL = ("sweep", "cause", "tag")
+SEVERAL = ("sweep", "run", "cause", "tag")
 TAGGED = """
 INSERT INTO several SELECT number, 'tag', tag, 1 FROM listed JOIN (
     SELECT unnest(?::VARCHAR[]) AS trial_id, unnest(?::VARCHAR[]) AS spec_hash,

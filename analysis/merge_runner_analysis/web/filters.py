@@ -15,6 +15,7 @@ MOST_CHOSEN, LONGEST_VALUE = 30, 1_000
 # What facets are called that have another name in an address.
 HEADINGS = {
     "sweep": "run",
+    "run": "name of run",
     "who": "kind of driver",
     "model": "driver",
     "variant": "prompt",

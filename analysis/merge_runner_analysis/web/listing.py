@@ -146,6 +146,9 @@ SELECT number, '{FACTOR}' || factor AS facet, value, 1 AS times
 FROM trial_levels JOIN numbers USING (trial_id, spec_hash) WHERE factor <> 'prompt'
 UNION ALL SELECT DISTINCT number, 'sweep', sweep_id, 1
 FROM sweep_trials JOIN numbers USING (trial_id, spec_hash)
+UNION ALL SELECT DISTINCT number, 'run', config->>'run_name', 1
+FROM sweep_trials JOIN numbers USING (trial_id, spec_hash) JOIN results.sweeps USING (sweep_id)
+WHERE config->>'run_name' IS NOT NULL
 UNION ALL SELECT number, 'cause', if(failure = '{NO_DECISION}', '{MISSING}', 'plan: ' || failure),
     count(*)
 FROM decisions JOIN numbers USING (trial_id, spec_hash) WHERE failure IS NOT NULL GROUP BY ALL

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 from merge_runner.prompts.blocks import BLOCKS, Variant
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
@@ -34,6 +35,12 @@ PLAIN = {
     "M": "merge first",
     "Y": "yield",
 }
+
+
+def called(study: str, config: Mapping[str, Any]) -> str:
+    """A run of a study by the name that its user gave it, and that of the study."""
+    run_name = config.get("run_name")
+    return f"{run_name} ({study})" if run_name else study
 
 
 def condition_text(headway: float, velocity: float) -> str:

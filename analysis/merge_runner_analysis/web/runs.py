@@ -14,6 +14,7 @@ from merge_runner.config import both_sides, pair_name
 from merge_runner.paths import DEFAULT_DB, command_at
 from merge_runner.run.progress import Standing, read_standing
 from merge_runner_analysis.web.catalogue import Catalogue, Wanted
+from merge_runner_analysis.web.phrases import called
 from merge_runner_analysis.web.reading import Row
 
 # Why a run ended early, by its exit code.
@@ -83,8 +84,7 @@ def run_of(row: Row, config: Row, standing: Standing | None, later: str = "") ->
     unless a ``later`` run already did. One that is ``followed`` may have news: it may have slept,
     and go on.
     """
-    if run_name := config.get("run_name"):
-        row = {**row, "name": f"{run_name} ({row['name']})"}
+    row = {**row, "name": called(row["name"], config)}
     state, last_word = "stopped" if row["exit_code"] else "finished", row["ended_at"]
     if last_word is None:
         state = "lost"

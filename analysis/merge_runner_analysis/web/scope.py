@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ from typing import Any
 from starlette.datastructures import QueryParams
 
 from merge_runner.prompts.blocks import BASELINE, title_of
-from merge_runner_analysis.web.phrases import ordered
+from merge_runner_analysis.web.phrases import called, ordered
 from merge_runner_analysis.web.site import SCOPE, NotThere, Site
 
 # What the analysis adds to the names of drivers that have several tasks, prompts or stand-ins.
@@ -72,10 +73,10 @@ def scope_of(
     own = [row for row in rows if not driver or row["model"] == unmarked(driver)]
     prompts = list(dict.fromkeys(row["variant"] for row in own))
     conditions = ordered({row["condition"] for row in own})
-    sweeps = {
-        row["sweep_id"]: f"{row['name']}, {row['started_at']:%Y-%m-%d %H:%M} UTC"
-        for row in site.catalogue.ask("FROM sweeps ORDER BY started_at DESC")
-    }
+    sweeps = {}
+    for row in site.catalogue.ask("FROM sweeps ORDER BY started_at DESC"):
+        name = called(row["name"], json.loads(row["config"]))
+        sweeps[row["sweep_id"]] = f"{name}, {row['started_at']:%Y-%m-%d %H:%M} UTC"
     usual = "" if any_prompt else next(iter(prompts), BASELINE)
     usual = BASELINE if usual and BASELINE in prompts else usual
     scope = Scope(

@@ -11,14 +11,18 @@ from urllib.parse import parse_qs, urlsplit
 import duckdb
 import pytest
 
+from merge_runner.errors import UsageError
 from merge_runner.results.database import write_database
 from merge_runner.results.store import Store, query, sweep_facts
 from merge_runner.run.progress import remove_standing, write_standing
 from merge_runner.run.stored_replay import audit_database
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner_analysis.selection import Selection
+from merge_runner_analysis.study import Study
 from merge_runner_analysis.web.filters import filter_of
 from merge_runner_analysis.web.pages.sweep import sweep_page
 from merge_runner_analysis.web.runs import list_runs, numbers_of
+from merge_runner_analysis.web.scope import scope_of
 from merge_runner_analysis.web.site import Site
 from tests.support.serving import Page, client_of, held
 from tests.support.standings import progress, runner
@@ -307,6 +311,15 @@ def test_a_shown_command_names_the_database_and_the_study_whose_names_it_needs(s
 def test_a_run_with_a_name_is_called_by_it_in_the_list(study):
     named = """json_merge_patch(config, '{"run_name": "the second"}')"""
     change(study, f"UPDATE sweeps SET config = {named}")
-    (run,) = list_runs(Site(study).catalogue)
+    site = Site(study)
+    (run,) = list_runs(site.catalogue)
     assert run["row"]["name"].startswith("the second (")
-    assert "<h1>Run of the second (" in page_of(Site(study))
+    assert "<h1>Run of the second (" in page_of(site)
+    facets = site.catalogue.facets({})
+    assert facets["run"] == [("the second", sum(n for _, n in facets["sweep"]))]
+    assert site.catalogue.counts({"run": "the second"}) == site.catalogue.counts({"who": "drivers"})
+    assert scope_of(site, {}).sweeps[0][1].startswith("the second (")
+    whole, named = (Study(study, Selection(sweep=name)) for name in ("", "the second"))
+    assert [len(each.trials) for each in named.played] == [len(e.trials) for e in whole.played]
+    with pytest.raises(UsageError, match=r"unknown run 'a third'; valid: the second, sweep-1"):
+        Study(study, Selection(sweep="a third"))
