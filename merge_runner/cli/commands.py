@@ -38,6 +38,7 @@ SAMPLES = "Another number draws a fresh set of samples."
 ORDER = "Another number draws another order of the trials."
 FIRST = "Only the first decision of both sides."
 DRY_RUN = "Only estimate: trials, calls, tokens, cost, time. Nothing is sent."
+SHOW_PROMPTS = "With --dry-run: print each prompt as its drivers read it."
 IN_FLIGHT = "Trials at once, over all workers."
 KEEP_GOING = "Go on with a model that gives no valid decision."
 REPLAY = "From recorded replies alone: no key, no network."
@@ -94,6 +95,7 @@ def sweep(
     first: Annotated[bool, cli.flag("--first", FIRST, **cli.PLAYED)] = False,
     grid: Annotated[str | None, cli.option("GRID", GRID, **cli.PLAYED)] = None,
     dry_run: Annotated[bool, cli.flag("--dry-run", DRY_RUN, **cli.PACE)] = False,
+    show_prompts: Annotated[bool, cli.flag("--show-prompts", SHOW_PROMPTS, **cli.PACE)] = False,
     max_cost_usd: Annotated[
         float | None, cli.option("USD", MAX_COST, "--max-cost", min=0, **cli.PACE)
     ] = None,
@@ -125,6 +127,8 @@ def sweep(
     studies = studies or ["baseline"]
     if not isfinite(max_cost_usd or 0):
         raise UsageError("--max-cost is a number of USD")
+    if show_prompts and not dry_run:
+        raise UsageError("--show-prompts goes with --dry-run")
     if recordings and not replay:
         raise UsageError("--recording goes with a replay; to keep its replies: recording import")
     options = Options(
@@ -180,7 +184,9 @@ def sweep(
         files = [Path(name)] if name.endswith(".parquet") else []
         played = replace(options, recordings=(*files, *options.recordings))
         codes += [
-            _play(plan, played, whole=whole, dry_run=dry_run, yes=yes, as_json=as_json)
+            _estimate(plan, played, show_prompts=show_prompts, as_json=as_json)
+            if dry_run
+            else _play(plan, played, whole=whole, yes=yes, as_json=as_json)
             for plan in plans(name)
         ]
         if codes[-1] not in (0, 1, 4):
@@ -208,26 +214,42 @@ def replay(**options: Any) -> None:  # noqa: ANN401 # those of sweep
     sweep(**{**options, "replay": True})
 
 
-def _play(
-    plan: Plan, options: Options, *, whole: bool, dry_run: bool, yes: bool, as_json: bool
-) -> int:
-    """Play a plan, or print what that would take; return the exit code."""
-    import asyncio
-
+def _say_shutdowns(plan: Plan, options: Options) -> None:
     from merge_runner.llm.models import shutdown_notes
-    from merge_runner.run import progress
-    from merge_runner.run import sweep as running
 
     if not options.replay:
         asked = {plan.registered[name]: entry for name, entry in plan.entries.items()}
         for note in shutdown_notes(asked, datetime.now(UTC).date()):
             say(note)
-    if dry_run:
-        expected = asyncio.run(running.unsent(plan, options, say=say))
-        lines = "\n".join([*progress.estimate_lines(expected), *progress.prompt_lines(plan)])
-        sent = "\nNothing was sent." if expected.trials else ""
-        print_out(json.dumps(asdict(expected)) if as_json else f"{lines}{sent}")
+
+
+def _estimate(plan: Plan, options: Options, *, show_prompts: bool, as_json: bool) -> int:
+    """Print what it would take to play a plan; return the exit code."""
+    import asyncio
+
+    from merge_runner.run import progress
+    from merge_runner.run.sweep import unsent
+
+    _say_shutdowns(plan, options)
+    expected = asyncio.run(unsent(plan, options, say=say))
+    if as_json:
+        prompts = {"prompts": progress.shown_prompts(plan)} if show_prompts else {}
+        print_out(json.dumps(asdict(expected) | prompts, ensure_ascii=False))
         return 0
+    blocks = progress.shown_prompt_lines if show_prompts else progress.prompt_lines
+    sent = ["Nothing was sent."] if expected.trials else []
+    print_out("\n".join([*progress.estimate_lines(expected), *blocks(plan), *sent]))
+    return 0
+
+
+def _play(plan: Plan, options: Options, *, whole: bool, yes: bool, as_json: bool) -> int:
+    """Play a plan; return the exit code."""
+    import asyncio
+
+    from merge_runner.run import progress
+    from merge_runner.run import sweep as running
+
+    _say_shutdowns(plan, options)
 
     def leave(expected: Estimate) -> None:
         lines = "\n".join(progress.estimate_lines(expected))
@@ -460,7 +482,7 @@ def ledger(
     Example: merge-runner ledger --cache cache/responses
     """
     from merge_runner.llm.cache import ResponseCache
-    from merge_runner.llm.ledger import Ledger, scopes
+    from merge_runner.llm.ledger import APART, Ledger, scopes
     from merge_runner.run.progress import as_table
 
     with closing(ResponseCache(cache, read_only=True)) as opened:
@@ -499,7 +521,8 @@ def ledger(
         print_out(json.dumps(rows, ensure_ascii=False))
         return
     reasons = [{"sweep": row["sweep"], **reason} for row in rows for reason in row.pop("reasons")]
-    print_out("\n".join(filter(None, map(as_table, (rows, reasons)))) or "Nothing is spent.")
+    told = "\n".join(filter(None, map(as_table, (rows, reasons))))
+    print_out(f"{told}\n{APART}" if told else "Nothing is spent.")
 
 
 def models(as_json: cli.JsonOption = False) -> None:

@@ -63,7 +63,8 @@ class Estimate:
     They are ``measured`` where tokens are those of earlier answers. Calls that are asked singly
     cost ``singly_usd``; in batches they cost less, and take so many ``rounds`` in place of minutes.
     ``usd_by_model`` has the models of the registry. Of ``planned`` trials some are ``stored``.
-    A cap leaves ``left_usd`` of what it covers; without one that is None.
+    A cap leaves ``left_usd`` of what it covers; without one that is None. ``output_caps`` are the
+    most tokens that a reply of each model may have.
     """
 
     driver: str
@@ -81,6 +82,7 @@ class Estimate:
     stored: int = 0
     usd_by_model: dict[str, float | None] = field(default_factory=dict)
     left_usd: float | None = None
+    output_caps: dict[str, int] = field(default_factory=dict)
 
 
 def estimate(
@@ -101,6 +103,7 @@ def estimate(
     usd = singly_usd = 0.0
     by_model: defaultdict[str, float] = defaultdict(float)
     busy_s: defaultdict[str, float] = defaultdict(float)
+    caps: defaultdict[str, int] = defaultdict(int)
     at_once = min(options.connections, 2 * max(trials, 1))
     for label, arm in plan.by_label().items():
         for name, entry in arm.entries.items():
@@ -108,15 +111,17 @@ def estimate(
             price = cost_usd(entry, usage)
             call_usd = math.nan if price is None else price
             number += asked
+            model = plan.registered[name]
+            caps[model] = max(caps[model], entry.max_output_tokens)
             read += asked * (usage.input_tokens or 0)
             written += asked * (usage.output_tokens or 0)
             singly_usd += asked * call_usd
             asked_usd = asked * call_usd * _price_factor(entry, options.batch)
             usd += asked_usd
-            by_model[plan.registered[name]] += asked_usd
+            by_model[model] += asked_usd
             # An account's limits are those of a model, with whatever parameters it is asked.
             call_s = max(entry.typical_latency_s / at_once, _limited_s(options, entry, usage))
-            busy_s[plan.registered[name]] += asked * call_s
+            busy_s[model] += asked * call_s
     rounds = max((math.ceil(usual_prompts(arm)) for arm in plan.arms), default=0)
     return Estimate(
         plan.driver,
@@ -133,6 +138,7 @@ def estimate(
         planned=plan.trials,
         stored=stored,
         usd_by_model={model: _cents(each) for model, each in by_model.items()},
+        output_caps=dict(caps),
     )
 
 
@@ -165,8 +171,9 @@ def trial_costs(
 def _usage(plan: Plan, arm: Arm, name: str, facts: Mapping[str, Usage | None]) -> Usage:
     """Return the tokens of a call, as measured or as listed in the registry."""
     read = len(typical_prompt(plan, arm).encode()) // 4  # English has about 4 bytes a token
-    typical = Usage(input_tokens=read, output_tokens=arm.entries[name].typical_output_tokens)
-    return facts.get(name) or typical
+    entry = arm.entries[name]
+    written = min(entry.typical_output_tokens, entry.max_output_tokens)
+    return facts.get(name) or Usage(input_tokens=read, output_tokens=written)
 
 
 def _price_factor(entry: ModelEntry, batch: bool) -> float:
@@ -189,11 +196,20 @@ def _limited_s(options: Options, entry: ModelEntry, usage: Usage) -> float:
 
 def typical_prompt(plan: Plan, arm: Arm) -> str:
     """Return an arm's prompt in the middle of an approach, the longest; empty of programs."""
+    return max(prompts_of(plan, arm).values(), key=len, default="")
+
+
+def prompts_of(plan: Plan, arm: Arm) -> dict[str, str]:
+    """Return what the language models of an arm read in the middle of an approach, by prompt.
+
+    The numbers are those of the left driver in the plan's first condition.
+    """
     scenario = arm.scenario
     world = World(scenario, plan.parts.conditions[plan.conditions[0]], TRACK)
     rest = (0.25,) * (scenario.plan_actions - scenario.executed_actions)
-    names = {arm.prompt(side) for side in SIDES if arm.asked[side] in arm.entries}
-    prompts = (plan.parts.prompts[name] for name in sorted(names))
     seen = world.observe("left")
-    texts = (render_prompt(seen, rest, prompt=each, scenario=scenario) for each in prompts)
-    return max(texts, key=len, default="")
+    names = {arm.prompt(side) for side in SIDES if arm.asked[side] in arm.entries}
+    return {
+        name: render_prompt(seen, rest, prompt=plan.parts.prompts[name], scenario=scenario)
+        for name in sorted(names)
+    }

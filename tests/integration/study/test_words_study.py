@@ -116,8 +116,20 @@ async def test_a_run_says_where_several_prompts_gave_the_same_trials(merge_runne
     assert said in told.err + told.out
 
 
-async def test_a_dry_run_shows_of_what_each_prompt_is_composed(merge_runner, tmp_path):
+async def test_a_dry_run_shows_of_what_each_prompt_is_composed_and_each_whole(
+    merge_runner, tmp_path
+):
     (tmp_path / "words.toml").write_text(PLANTED)
     told = await merge_runner("sweep", "words.toml", "--dry-run")
     blocks = "C3.human, persona=taxi.1, hurry=yes.1, C3.distance"
     assert f"prompt  persona=taxi hurry=yes: C0, C1, C2, C3.safety, {blocks}" in told.out
+    one = ("--only", "persona=taxi", "--only", "hurry=yes", "--only", "opponent=self")
+    whole = await merge_runner("sweep", "words.toml", *one, "--dry-run", "--show-prompts")
+    shown = dict(re.findall(r"^prompt  (.*?), read by (.*):$", whole.out, re.MULTILINE))
+    ego = "the left driver of persona=taxi hurry=yes opponent=self; the right driver of "
+    assert shown["persona=taxi hurry=yes"].startswith(ego)
+    assert shown["baseline"].startswith("the right driver of persona=taxi hurry=yes opponent=self")
+    assert whole.out.count("You are a taxi driver.\n") == 1
+    assert whole.out.count("You are late, and in a hurry.\n") == 1
+    told = await merge_runner("sweep", "words.toml", "--show-prompts")
+    assert (told.code, "--show-prompts goes with --dry-run" in told.err) == (2, True)
