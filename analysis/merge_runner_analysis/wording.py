@@ -114,7 +114,6 @@ class Why(Enum):
     UNDECIDED_BOXES = (
         UNDECIDED + '. A study whose [scenario] has collision_rule = "rectangle" decides them'
     )
-    UNPRICED = "cost: of {} of {} trials it is not known, and they are not in the mean"
     # Comparisons with humans.
     OF_HUMANS = "humans: {}"
     NONE_ENDED = "no trial ended: {}"

@@ -190,6 +190,7 @@ class ResponseCache:
         self.folder = folder
         self.locks = ModelLocks(folder)
         self.money = LedgerFile(folder)
+        self.has_recording = overlay is not None
         self._open_overlay, self._with_overlay = overlay, contextlib.ExitStack()
         self._disk = TextDisk(str(folder))
         self._writer = BatchWriter(self._run_each)
@@ -216,6 +217,10 @@ class ResponseCache:
     def get(self, key: str) -> CachedCall | None:
         """Return the entry of a call key; raises RecordingError where it is damaged or made up."""
         return self._overlay.get(key) or self._kept(key)
+
+    def in_recording(self, key: str) -> bool:
+        """Whether the recording holds an entry of a call key."""
+        return key in self._overlay
 
     async def put(self, entry: CachedCall) -> CachedCall:
         """Keep an entry durably; returns what is kept, another one where an import was first."""

@@ -138,7 +138,8 @@ class Call:
 class Meter:
     """Counts of calls, attempts and cost.
 
-    ``calls_shared`` are those of ``calls_cached`` that this run has asked, for another trial.
+    ``calls_shared`` are those of ``calls_cached`` that this run has asked, for another trial, and
+    ``calls_recorded`` those of a recording that was named.
     ``stand_ins`` counts the answers that a scripted stand-in gave in the model's name;
     ``underpriced`` those that cost more than the registry knows, by service tier; ``damaged`` are
     the keys of recorded replies that could not be read.
@@ -147,6 +148,7 @@ class Meter:
     calls_live: int = 0
     calls_cached: int = 0
     calls_shared: int = 0
+    calls_recorded: int = 0
     cost_usd: float = 0.0
     cost_unknown: int = 0
     outcomes: Counter[str] = field(default_factory=Counter)
@@ -155,6 +157,11 @@ class Meter:
     underpriced: Counter[str] = field(default_factory=Counter)
     notes: deque[str] = field(default_factory=deque)
     damaged: list[str] = field(default_factory=list)
+
+    @property
+    def answered(self) -> tuple[int, int, int, int]:
+        """The calls: live, cached, and of these shared and recorded."""
+        return self.calls_live, self.calls_cached, self.calls_shared, self.calls_recorded
 
     def count_attempt(self, attempt: Attempt) -> None:
         """Count one live attempt."""
@@ -342,7 +349,10 @@ class LlmClient:
         last, meter = reply.attempts[-1], self.meter
         meter.calls_cached += reply.cached
         meter.calls_live += not reply.cached
-        meter.calls_shared += reply.cached and reply.request.key in self._answered
+        shared = reply.cached and reply.request.key in self._answered
+        meter.calls_shared += shared
+        if self.cache.has_recording and reply.cached and not shared:
+            meter.calls_recorded += self.cache.in_recording(reply.request.key)
         if last.model_served not in self._own_names:
             meter.mismatches[f"{self.entry.id} -> {last.model_served}"] += 1
         if self.entry.provider != "emulator":

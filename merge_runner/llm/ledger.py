@@ -156,6 +156,14 @@ class Asked:
     honest_usd: float = 0.0
 
 
+APART = (
+    "A ledger and a run's replies may cost different sums: the ledger has all that was paid for a "
+    "sweep, over all its runs and also for replies that no stored trial uses, and sets aside "
+    "attempts of unknown cost; the replies of a run may have been paid by another sweep."
+)
+"""Why two sums differ that are shown side by side."""
+
+
 @dataclass(frozen=True, slots=True)
 class Spending:
     """In USD: what attempts cost, and what is reserved for those whose cost is not known.

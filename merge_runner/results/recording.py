@@ -240,6 +240,10 @@ class Spilled(Mapping[str, CachedCall]):
             raise KeyError(key)
         return CachedCall.from_json(row[0])
 
+    def __contains__(self, key: object) -> bool:
+        row = self._db.execute("SELECT 1 FROM entries WHERE key = ?", [key]).fetchone()
+        return row is not None
+
     def __iter__(self) -> Iterator[str]:
         return (key for (key,) in self._db.execute("SELECT key FROM entries"))
 

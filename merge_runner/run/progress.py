@@ -26,12 +26,12 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, NonNegativeInt
 from merge_runner.audit.checks import Audit
 from merge_runner.drivers.registry import EMULATOR
 from merge_runner.llm.client import Meter
-from merge_runner.llm.ledger import Ledger
+from merge_runner.llm.ledger import APART, Ledger
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, command_at
 from merge_runner.prompts.blocks import decomposed
-from merge_runner.records import ReplayMiss, Status
+from merge_runner.records import SIDES, ReplayMiss, Status
 from merge_runner.results.export import write_table
-from merge_runner.run.estimate import Estimate
+from merge_runner.run.estimate import Estimate, prompts_of
 from merge_runner.run.plan import Options, Plan
 from merge_runner.text_safety import printable, say
 
@@ -206,7 +206,7 @@ class Progress:
             ("trials", trials),
             *(("decided", text) for text in self._decided() if ended + failed < total),
             ("failed", str(failed)),
-            ("calls", _calls(meter.calls_live, meter.calls_cached, meter.calls_shared)),
+            ("calls", _calls(*meter.answered)),
             ("cost", cost),
             *(("waiting", text) for text in batches + [CLOSE_IT] * bool(batches) + self._waits()),
             ("time", f"{elapsed_s:.0f} s{left}"),
@@ -406,6 +406,7 @@ def as_dict(
         },
         "calls": {"live": meter.calls_live, "cached": meter.calls_cached},
         "calls_shared": meter.calls_shared,
+        "calls_recorded": meter.calls_recorded,
         "attempts": meter.outcomes,
         "cost_usd": round(meter.cost_usd, 6),
         "calls_of_unknown_cost": meter.cost_unknown,
@@ -481,15 +482,25 @@ def _outcomes(summary: dict[str, Any]) -> str:
     whole = dict(rows.get(("condition", "all"), {"trials": 0}))
     trials, planned = whole.pop("trials"), summary["trials"]["planned"]
     of = f" of {planned}" if trials < planned else ""
+    stored = summary["trials"]["stored_before"]
+    before = f", {stored} of them stored before this run" if stored else ""
     ways = [
         f"{number} {way}" for way, number in whole.items() if isinstance(number, int) and number
     ]
-    return f"trials: {trials}{of}" + (f" ({', '.join(ways)})" if ways else "")
+    return f"trials: {trials}{of}" + (f" ({', '.join(ways)})" if ways else "") + before
 
 
-def _calls(live: int, cached: int, shared: int) -> str:
-    """How many calls were asked, and how many had an answer: ``shared`` of them by this run."""
-    parts = {"from recordings": cached - shared, "shared with another trial": shared}
+def _calls(live: int, cached: int, shared: int, recorded: int) -> str:
+    """How many calls were asked, and how many had an answer.
+
+    Of these ``shared`` ones got it in this run, and ``recorded`` ones from a recording that was
+    named.
+    """
+    parts = {
+        "from recordings": recorded,
+        "from the cache": cached - shared - recorded,
+        "shared with another trial": shared,
+    }
     had = [f"{number} {how}" for how, number in parts.items() if number]
     return ", ".join([f"{live} asked"] * bool(live or not had) + had)
 
@@ -497,16 +508,20 @@ def _calls(live: int, cached: int, shared: int) -> str:
 def _costs(summary: dict[str, Any]) -> Iterator[str]:
     number = summary["calls_of_unknown_cost"]
     unknown = f" and {number} calls of unknown cost" if number else ""
-    calls = _calls(summary["calls"]["live"], summary["calls"]["cached"], summary["calls_shared"])
-    text = f"calls: {calls}; cost {summary['cost_usd']:.4f} USD{unknown}"
+    made = (*summary["calls"].values(), summary["calls_shared"], summary["calls_recorded"])
+    calls = _calls(*made)
+    spent_usd, aside_usd = summary["sweep_cost_usd"], summary["set_aside_usd"]
+    apart = bool(aside_usd) or round(spent_usd, 4) != round(summary["cost_usd"], 4)
+    alone = " in this run" if apart else ""
+    text = f"calls: {calls}; cost {summary['cost_usd']:.4f} USD{alone}{unknown}"
     if (expected := summary["estimate"]) is not None:
         text += f"; estimated before: {expected['calls']} calls, {_about(expected['cost_usd'])}"
     yield text
-    spent_usd, aside_usd = summary["sweep_cost_usd"], summary["set_aside_usd"]
-    if aside_usd or round(spent_usd, 4) != round(summary["cost_usd"], 4):
+    if apart:
         ledger = command_at("merge-runner ledger", "--cache", summary["cache"], DEFAULT_CACHE)
         why = f", and {aside_usd:.4f} set aside (`{ledger}` says why)"
         yield f"this sweep over all its runs: {spent_usd:.4f} USD{why if aside_usd else ''}"
+        yield APART
     if over_usd := summary["over_the_worst_case_usd"]:
         yield (
             f"WARNING: replies cost {over_usd:.4f} USD more than their worst case "
@@ -557,6 +572,16 @@ def _about(cost_usd: float | None) -> str:
     return "an unknown price" if cost_usd is None else f"about {cost_usd:.2f} USD"
 
 
+def _output_caps(expected: Estimate) -> Iterator[str]:
+    """The most tokens that a reply may have, by which a longer one is cut off."""
+    caps = expected.output_caps
+    if caps:
+        same = len({*caps.values()}) == 1
+        most = [f"{n}{'' if same else f' with {model}'}" for model, n in caps.items()]
+        each = ", ".join(most[:1] if same else most)
+        yield f"        a reply is cut off at {each} output tokens (max_output_tokens)"
+
+
 def _by_model(expected: Estimate) -> Iterator[str]:
     """What each of several models costs."""
     if len(expected.usd_by_model) > 1:
@@ -580,6 +605,24 @@ def prompt_lines(plan: Plan) -> Iterator[str]:
             yield f"prompt  {name}: {', '.join(prompt.blocks)}"
 
 
+def shown_prompts(plan: Plan) -> list[dict[str, Any]]:
+    """The text of each prompt that a language model reads in a plan, and by whom it is read."""
+    readers: dict[tuple[str, str], list[str]] = {}
+    for arm in plan.arms:
+        for name, text in prompts_of(plan, arm).items():
+            sides = [s for s in SIDES if arm.asked[s] in arm.entries and arm.prompt(s) == name]
+            who = "both drivers" if len(sides) == len(SIDES) else f"the {sides[0]} driver"
+            readers.setdefault((name, text), []).append(f"{who} of {arm.label}")
+    return [{"prompt": name, "read_by": who, "text": text} for (name, text), who in readers.items()]
+
+
+def shown_prompt_lines(plan: Plan) -> Iterator[str]:
+    """The same for a reader, with the numbers of one situation."""
+    for each in shown_prompts(plan):
+        who = "; ".join(first_of(each["read_by"], "others", SHOWN))
+        yield f"\nprompt  {each['prompt']}, read by {who}:\n{each['text']}"
+
+
 def estimate_lines(expected: Estimate) -> Iterator[str]:
     """What a run will take, for a reader."""
     measured = ", as measured before" if expected.measured else ""
@@ -595,6 +638,7 @@ def estimate_lines(expected: Estimate) -> Iterator[str]:
     yield f"trials  {expected.trials} that have not ended yet"
     yield f"calls   about {expected.calls} that are not recorded yet"
     yield f"tokens  {tokens}"
+    yield from _output_caps(expected)
     if not expected.rounds:
         yield f"cost    {_about(expected.cost_usd)}"
         yield from _by_model(expected)

@@ -229,6 +229,7 @@ class StoredReplies:
     spec: TrialSpec = field(init=False)
     rows: list[dict[str, Any]] = field(init=False)
     money: None = None  # the ledger of a sealed client keeps nothing
+    has_recording: bool = False
 
     def get(self, key: str) -> CachedCall | None:
         """Return the call with this key, each answer read anew; None where there is none.

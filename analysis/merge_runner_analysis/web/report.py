@@ -15,6 +15,7 @@ from pandas.api.types import is_string_dtype
 
 from merge_runner.drivers.registry import MOCKS
 from merge_runner.errors import UsageError
+from merge_runner.llm.ledger import APART
 from merge_runner.prompts.blocks import BASELINE, title_of
 from merge_runner.records import NO_DECISION
 from merge_runner.results.provenance import program
@@ -153,6 +154,7 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
         command=sql_command(study),
         libraries=", ".join(f"{name} {version(name)}" for name in LIBRARIES),
         origin=origin,
+        sums_apart=APART,
         shown_plainly=_plain,
         readings=published("readings"),
         cited=published("sources"),

@@ -41,9 +41,23 @@ async def test_a_sweep_stores_every_trial_and_its_summary_is_five_lines(merge_ru
     named = await merge_runner(
         "sweep", "--reps", 2, "--conditions", "L_4_0", "--name", "the second"
     )
-    assert named.out.splitlines()[:2] == ["run: the second", "trials: 2 (2 left first)"]
+    assert named.out.splitlines()[:2] == [
+        "run: the second",
+        "trials: 2 (2 left first), 1 of them stored before this run",
+    ]
     runs = "select config->>'run_name' as name from sweeps order by started_at"
     assert (await merge_runner("sql", runs)).out.split(maxsplit=1)[1].strip() == "the second"
+    again = await merge_runner("replay", "--reps", 1, "--conditions", "L_4_0", "--db", "again")
+    assert re.search(r"^calls: \d+ from the cache; cost 0.0000 USD$", again.out, re.MULTILINE)
+
+
+async def test_an_estimate_assumes_no_more_tokens_than_a_reply_may_have(merge_runner, tmp_path):
+    text = 'models = ["gpt-6-sol"]\nrepetitions = 1\n[factors]\nmax_output_tokens = [500]\n'
+    (tmp_path / "short.toml").write_text(text)
+    told = await merge_runner("sweep", "short.toml", "--dry-run")
+    calls = int(re.search(r"calls   about (\d+)", told.out)[1])
+    assert f", {500 * calls} out\n" in told.out
+    assert "a reply is cut off at 500 output tokens (max_output_tokens)\n" in told.out
 
 
 async def test_several_sweeps_are_all_looked_at_and_played_one_after_the_other(merge_runner):

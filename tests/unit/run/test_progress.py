@@ -28,7 +28,8 @@ def rows(shown):
 
 
 def test_every_figure_is_that_of_the_meters():
-    meters = [Meter(calls_live=30, calls_cached=20, calls_shared=8), Meter(calls_live=4)]
+    first = Meter(calls_live=30, calls_cached=20, calls_shared=8, calls_recorded=5)
+    meters = [first, Meter(calls_live=4)]
     meters[0].count_attempt(Attempt(1, "ok", usage=Usage(100, 0, 50), cost_usd=1.5))
     meters[1].count_attempt(Attempt(1, "timeout"))
     meters[1].mismatches["o3 -> gpt-4o"] = 2
@@ -40,7 +41,9 @@ def test_every_figure_is_that_of_the_meters():
     assert fields["trials"] == "3/10 ended (+7 stored before), 5 running"
     assert fields["failed"] == "1"
     assert fields["WARNING"] == "another model answers: o3 -> gpt-4o"
-    assert fields["calls"] == "34 asked, 12 from recordings, 8 shared with another trial"
+    assert fields["calls"] == (
+        "34 asked, 5 from recordings, 7 from the cache, 8 shared with another trial"
+    )
     assert fields["cost"] == "1.50 USD, 4.25 of 20 over all runs"
     # 3 of 10 trials have ended but only 46 of 210 calls are made: the larger share tells.
     spent_s, left_s = times(fields["time"])
@@ -121,6 +124,17 @@ def test_a_dry_run_says_how_many_trials_are_left():
     assert [*estimate_lines(expected(0, planned=110, stored=100))] == [
         "Nothing left to ask: 100 trials are stored, and 10 are played from recorded replies."
     ]
+
+
+def test_an_estimate_says_where_replies_are_cut_off():
+    def cut(**caps):
+        return [each for each in estimate_lines(expected(3, output_caps=caps)) if "cut off" in each]
+
+    assert cut() == []
+    assert cut(o3=500, o4=500) == [
+        "        a reply is cut off at 500 output tokens (max_output_tokens)"
+    ]
+    assert "at 500 with o3, 9 with o4 output tokens" in cut(o3=500, o4=9)[0]
 
 
 def test_an_estimate_says_how_far_a_cap_that_it_exceeds_goes():
