@@ -21,8 +21,9 @@ OF_FIGURE_2 = (
     "Collisions are left out. (A, B) Speed of the left vehicle from the start of control, where it "
     "merges first and second. (C) How often the left vehicle merges first by projected headway, "
     "with Wilson intervals. (D) Mean gap at the merge point and (E) mean RMSE of the speed from "
-    "the initial speed, two values a trial, with intervals of Student's t. Of two different "
-    "drivers, the left vehicle is that of the one named first. Colours and markers tell the "
+    "the initial speed, two values a trial, with intervals of Student's t. Where sides are "
+    "counterbalanced the left vehicle is the ego's, on whichever side it drove: that of the driver "
+    "that is named first, or is told the words. Colours and markers tell the "
     "relative velocities apart, dotted lines are the humans (in C as published until all are "
     "imported); few very wide intervals of D and E are cut at the frame."
 )

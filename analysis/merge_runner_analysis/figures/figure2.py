@@ -48,9 +48,9 @@ WHERE time_s >= 0 AND side = ego GROUP BY ALL ORDER BY ALL
 """
 HUMAN_VELOCITIES_MPS = sorted({c.relative_velocity_mps for c in HUMAN_CONDITIONS.values()})
 HEADINGS = {
-    "left first:\nv left (m/s)": "time (s)",
-    "left second:\nv left (m/s)": "time (s)",
-    "P(left\nmerges first)": "headway (m)",
+    "{left} first:\nv {left} (m/s)": "time (s)",
+    "{left} second:\nv {left} (m/s)": "time (s)",
+    "P({left}\nmerges first)": "headway (m)",
     "gap at\nmerge (m)": "headway (m)",
     "RMSE of\nspeed (m/s)": "headway (m)",
 }
@@ -82,8 +82,10 @@ def figure2(study: Study, chosen: list[Group]) -> Figure:
             if group.setting and groups[0].driver == HUMAN:
                 _draw_humans(axis, groups[0], summary, styles, ":")
     _scale(axes, groups, study)
+    # A group that is mirrored has its ego on the left.
+    left = "ego" if any(group.measured and group.seats[1] for group in groups) else "left"
     for axis, heading, panel in zip(axes[0], HEADINGS, "ABCDE", strict=True):
-        axis.set_title(heading)
+        axis.set_title(heading.format(left=left))
         axis.set_title(panel, loc="left", fontweight="bold")
     for axis, label in zip(axes[-1], HEADINGS.values(), strict=True):
         axis.set_xlabel(label)

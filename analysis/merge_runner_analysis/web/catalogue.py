@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import duckdb
 
 from merge_runner.errors import UsageError
+from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.served_model import Pair
 from merge_runner.text_safety import csv_writer, first_line
@@ -55,7 +56,16 @@ COUNTS = f"""
 count(*) AS trials, count(*) FILTER (status <> 'failed') AS ended,
 count(*) FILTER (status = 'failed') AS failed, count(*) FILTER (status = 'collided') AS collided,
 count(*) FILTER (outcome = 'left first') AS left_first,
-count(*) FILTER (outcome = 'right first') AS right_first, count(*) FILTER (scripted) AS scripted,
+count(*) FILTER (outcome = 'right first') AS right_first,
+{
+    ", ".join(
+        f"count(*) FILTER (outcome = ego || ' first' AND ego = '{side}') AS ego_first_{side}, "
+        f"count(merged_first) FILTER (status = 'finished' AND ego = '{side}') "
+        f"AS ego_merged_{side}"
+        for side in SIDES
+    )
+},
+count(*) FILTER (scripted) AS scripted,
 {", ".join(f"coalesce(sum({name}), 0)::BIGINT AS {name}" for name in SUMMED)},
 round(avg(gap_m), 9) AS gap_m, round(avg(rmse_mps), 9) AS rmse_mps,
 string_agg(DISTINCT stand_in, '; ' ORDER BY stand_in) AS stand_in,

@@ -9,10 +9,11 @@ import pytest
 import statsmodels.formula.api as smf
 from playwright.sync_api import expect
 
+from merge_runner_analysis.figures.figure2 import figure2
 from merge_runner_analysis.study import Study
 from tests.support.gate import HANGS_S
 from tests.support.harness import PROGRAM, environment
-from tests.support.serving import served
+from tests.support.serving import Page, client_of, served
 from tests.support.tables import values_of
 
 STUDY = """
@@ -98,6 +99,28 @@ def test_levels_and_effects_have_the_counts_and_shares_of_the_trials(db, outcome
         if row["estimate"] is not None:
             apart = row["estimate"] - row["estimate_reference"]
             assert row["difference"] == pytest.approx(apart)
+
+
+def test_where_sides_are_counterbalanced_who_goes_first_is_said_of_the_ego(db):
+    counts = """
+    SELECT ego, count(*) FILTER (merged_first = ego) AS k, count(merged_first) AS n
+    FROM trials JOIN trial_drivers USING (trial_id, spec_hash)
+    WHERE condition = 'L_4_8' AND variant = 'hurry=yes' AND model_left = model_right
+    GROUP BY ego ORDER BY ego
+    """
+    with duckdb.connect(str(db), read_only=True) as connection:
+        (left, right) = connection.execute(counts).fetchall()
+    study = Study(db)
+    figure = figure2(study, study.baselines)
+    assert "ego first" in figure.axes[0].get_title()
+    with client_of(db) as client:
+        driver = client.get("/drivers/emulator?variant=hurry%3Dyes&condition=L_4_8").text
+        condition = client.get("/conditions/L_4_8?variant=hurry%3Dyes&model=emulator").text
+    said = Page(driver).text
+    for side, k, n in (left, right):
+        assert f"Ego on the {side} goes first {k} of {n}" in said
+    (_, left_k, left_n), (_, right_k, right_n) = left, right
+    assert f"{left_k + right_k} of {left_n + right_n} " in Page(condition).text
 
 
 def test_the_first_screen_answers_a_study_of_two_factors(page, db, outcomes):

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+from merge_runner.records import SIDES
 from merge_runner_analysis.published import HUMAN
 from merge_runner_analysis.tables.formats import printed
 from merge_runner_analysis.tables.model import Row as TableRow
@@ -91,9 +92,27 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
             if row["account"]
         ],
         conditions=conditions,
+        counted=_counted([cell for _, cells in conditions["rows"] for cell in cells if cell]),
         rates=zip(*shares, strict=True),
         notes=noted([own] if own else []),
     )
+
+
+def _counted(cells: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str]]:
+    """What is counted in each situation: its heading, and the counts of trials and of all of them.
+
+    Where an ego sat on the right, who goes first is also counted for it, on either side.
+    """
+    egos = [side for side in SIDES if any(cell[f"ego_merged_{side}"] for cell in cells)]
+    left = "Left, the ego, goes first" if egos == ["left"] else "Left goes first"
+    return [
+        (left, "left_first", "merged"),
+        *(
+            (f"Ego on the {side} goes first", f"ego_first_{side}", f"ego_merged_{side}")
+            for side in (egos if "right" in egos else ())
+        ),
+        ("Crashes", "collided", "ended"),
+    ]
 
 
 def _apart(site: Site, own: Driver, other: Driver, scope: Scope) -> tuple[Job, Comparison | None]:
