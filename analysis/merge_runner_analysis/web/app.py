@@ -11,7 +11,7 @@ from contextlib import asynccontextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qsl
+from urllib.parse import parse_qsl, quote
 
 import uvicorn
 from starlette.applications import Starlette
@@ -59,6 +59,25 @@ from merge_runner_analysis.web.site import (
 )
 from merge_runner_analysis.web.urls import whole
 
+# Names that a reader may type, of the pages that are called otherwise.
+ALIASES = {
+    "home": "",
+    "study": "",
+    "index": "",
+    "driver": "drivers",
+    "trial": "trials",
+    "condition": "conditions",
+    "run": "sweeps",
+    "runs": "sweeps",
+    "sweep": "sweeps",
+    "prompt": "prompts",
+    "word": "words",
+    "note": "notes",
+    "table": "tables",
+    "figure": "figures",
+    "figures": "tables",
+    "conditions": "",
+}
 LOG = logging.getLogger(__name__)
 FIRST_TIME = (
     "The trials are read for the first time; ten thousand take about two seconds. This page comes "
@@ -111,6 +130,12 @@ def explorer(site: Site) -> Starlette:
     return Starlette(
         routes=[
             *(Route(path, partial(_page, site, render)) for path, render in PAGES.items()),
+            *(Route(f"/{alias}", _redirect) for alias in ALIASES),
+            *(
+                Route(f"/{alias}/{{name:path}}", _redirect)
+                for alias, page in ALIASES.items()
+                if page
+            ),
             Route("/notes", partial(_noted, site), methods=["POST"]),
             Mount("/static", StaticFiles(directory=STATIC)),
         ],
@@ -132,6 +157,13 @@ def _page(site: Site, render: Callable[..., str | Response], asked: Request) -> 
     site.refresh()
     rendered = render(site, *asked.path_params.values(), asked.query_params)
     return HTMLResponse(rendered) if isinstance(rendered, str) else rendered
+
+
+def _redirect(asked: Request) -> Response:
+    """Lead from a name that a reader may type to the page, which keeps the rest of the address."""
+    typed, _, name = asked.scope["path"].removeprefix("/").partition("/")
+    page = "/".join(filter(None, (ALIASES[typed], name)))
+    return RedirectResponse(f"/{quote(page)}" + (f"?{asked.url.query}" if asked.url.query else ""))
 
 
 def _trials_csv(site: Site, asked: Mapping[str, str]) -> Response:

@@ -17,9 +17,10 @@ from merge_runner_analysis.web.catalogue import Catalogue, Wanted
 from merge_runner_analysis.web.phrases import called
 from merge_runner_analysis.web.reading import Row
 
+REFUSED = 2
 # Why a run ended early, by its exit code.
 REASONS = {
-    2: "the service refused the key or the model, or a setting was wrong",
+    REFUSED: "the service refused the key or the model, or a setting was wrong",
     3: "the account's quota or --max-cost was used up",
     4: "a replay makes no calls, and some replies are not recorded",
     130: "it was interrupted (Ctrl-C)",
@@ -28,7 +29,7 @@ REASONS = {
 
 # The same in a list.
 ENDED_AS = {
-    2: "refused: key, model or setting",
+    REFUSED: "refused: key, model or setting",
     3: "cap or quota reached",
     4: "replies not recorded",
     130: "interrupted (Ctrl-C)",
@@ -69,10 +70,19 @@ def numbers_of(catalogue: Catalogue, wanted: Wanted) -> Mapping[str, Row]:
 def standing_of(catalogue: Catalogue) -> list[Row]:
     """The runs that go on, or ended early and nobody went on with them; else the newest one.
 
-    The newest come first. Raises what ``Catalogue.refresh`` does.
+    One that was refused is no news once its models were asked in a later run of its study. The
+    newest come first. Raises what ``Catalogue.refresh`` does.
     """
-    runs = list_runs(catalogue)
-    return [run for run in runs if run["state"] != "finished" and not run["later"]] or runs[:1]
+    runs, answered = list_runs(catalogue), dict[str, set[str]]()
+    news = []
+    for run in runs:
+        of_study = answered.setdefault(run["study"], set())
+        models = {*run["config"].get("model", "").split(",")}
+        if run["state"] == "finished":
+            of_study |= models
+        elif not run["later"] and not (run["row"]["exit_code"] == REFUSED and models <= of_study):
+            news.append(run)
+    return news or runs[:1]
 
 
 def run_of(row: Row, config: Row, standing: Standing | None, later: str = "") -> Row:
@@ -84,6 +94,7 @@ def run_of(row: Row, config: Row, standing: Standing | None, later: str = "") ->
     unless a ``later`` run already did. One that is ``followed`` may have news: it may have slept,
     and go on.
     """
+    study = row["name"]
     row = {**row, "name": called(row["name"], config)}
     state, last_word = "stopped" if row["exit_code"] else "finished", row["ended_at"]
     if last_word is None:
@@ -98,6 +109,7 @@ def run_of(row: Row, config: Row, standing: Standing | None, later: str = "") ->
     part = f", in {row['scripted']} of {row['trials']} trials"
     run = {
         "row": row,
+        "study": study,
         "config": config,
         "sweep_id": row["sweep_id"],
         "driver": ", ".join(pair_name(both_sides(name).values(), endpoints) for name in drivers),

@@ -21,7 +21,7 @@ from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.web.filters import filter_of
 from merge_runner_analysis.web.pages.sweep import sweep_page
-from merge_runner_analysis.web.runs import list_runs, numbers_of
+from merge_runner_analysis.web.runs import list_runs, numbers_of, standing_of
 from merge_runner_analysis.web.scope import scope_of
 from merge_runner_analysis.web.site import Site
 from tests.support.serving import Page, client_of, held
@@ -323,3 +323,42 @@ def test_a_run_with_a_name_is_called_by_it_in_the_list(study):
     assert [len(each.trials) for each in named.played] == [len(e.trials) for e in whole.played]
     with pytest.raises(UsageError, match=r"unknown run 'a third'; valid: the second, sweep-1"):
         Study(study, Selection(sweep="a third"))
+
+
+def test_a_refused_run_is_news_until_its_model_was_asked_in_a_later_run_of_the_study(study):
+    def news():
+        return [run["sweep_id"] for run in standing_of(Site(study).catalogue)]
+
+    later = "started_at + INTERVAL 1 DAY AS started_at, ended_at + INTERVAL 1 DAY AS ended_at"
+    other = """json_merge_patch(config, '{"model": "o4", "sample_set": 1}')"""
+    change(
+        study,
+        "UPDATE sweeps SET exit_code = 2, ended_at = started_at",
+        f"INSERT INTO sweeps SELECT * REPLACE ('sweep-2' AS sweep_id, 0 AS exit_code, {later}, "
+        f"{other} AS config) FROM sweeps",
+    )
+    assert news() == ["sweep-1"]
+    change(
+        study,
+        """UPDATE sweeps SET config = json_merge_patch(config, '{"model": "o4,o3"}')
+        WHERE sweep_id = 'sweep-2'""",
+    )
+    assert news() == ["sweep-2"]
+    change(study, "UPDATE sweeps SET exit_code = 3 WHERE sweep_id = 'sweep-1'")
+    assert news() == ["sweep-1"]
+
+
+@pytest.mark.parametrize(
+    ("typed", "page"),
+    [
+        ("/runs", "/sweeps"),
+        ("/runs/sweep-1?seen=x", "/sweeps/sweep-1?seen=x"),
+        ("/trial/a+b/N_0_0%3F", "/trials/a%2Bb/N_0_0%3F"),
+        ("/driver/o3?variant=A1", "/drivers/o3?variant=A1"),
+        ("/conditions", "/"),
+        ("/figures", "/tables"),
+    ],
+)
+def test_a_page_is_found_by_the_name_that_a_reader_types(written, typed, page):
+    reply = client_of(written).get(typed, follow_redirects=False)
+    assert (reply.status_code, reply.headers["location"]) == (307, page)

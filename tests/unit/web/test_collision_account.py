@@ -43,6 +43,30 @@ def test_of_each_driver_it_says_what_would_have_helped():
     assert right.startswith("The right driver could still have avoided it at 2.0 s")
 
 
+@pytest.mark.parametrize(
+    ("side", "left", "right", "mark", "text"),
+    [
+        (
+            "right", (-0.4, 0.4, -0.4, 0.6, 0.2), (0.4, -0.6, 0.4, 0.6, -0.6, -0.4),
+            "last moment to brake harder", "1.8 s, by braking at 2.5 m/s² in place of 1.5",
+        ),
+        (
+            "left", (0.2, 0.0, -0.4, 0.0, -0.4, -0.2), (-0.2, 0.2, -0.4, -0.6, 0.6, -0.4),
+            "last moment to keep its speed", "1.4 s, by keeping the speed that it had",
+        ),
+        (
+            "left", (0.2, 0.2, 0.0, -0.6, 0.2, -0.6), (-0.2, -0.4, -0.2, 0.6, 0.2, 0.0),
+            "last moment to stop speeding up", "1.2 s, by not speeding up any further",
+        ),
+    ],
+)  # fmt: skip
+def test_what_would_have_helped_is_said_of_how_the_vehicle_drove(side, left, right, mark, text):
+    found = account(*crash("N_0_0", left, right), {"account": "one too little"})
+    assert (side, mark) in [(one.side, one.text) for one in found.marks]
+    said = f"The {side} driver could still have avoided it at {text} from then on."
+    assert said in found.sentences
+
+
 def test_a_change_of_mind_is_marked_once():
     course, decisions = crash(*EXAMPLES["both insisted"])
     for decision in decisions:

@@ -23,6 +23,8 @@ BRAKING, SPEEDING_UP = -1.0, 1.0
 """The hardest actions, as a plan normalises them."""
 # Halved so often, the strongest action is known to 0.01 m/s^2.
 BISECTIONS = 8
+# Below it a vehicle keeps its speed.
+STEADY_MPS2 = 0.05
 # Two clocks agree to this many seconds.
 TICK_S = 1e-6
 
@@ -48,6 +50,11 @@ class Course:
     def change_mps(self, side: Side, sample: int) -> float:
         """How much faster a vehicle is than it was at the start of control."""
         return self.speeds_mps[side][sample] - self.speeds_mps[side][0]
+
+    def driven_mps2(self, side: Side, sample: int) -> float:
+        """The acceleration of a vehicle from a sample, which is not the last one, to the next."""
+        (before_mps, after_mps) = self.speeds_mps[side][sample : sample + 2]
+        return (after_mps - before_mps) / (self.times_s[sample + 1] - self.times_s[sample])
 
     def avoided(self, side: Side, action: float, since: int) -> bool:
         """Whether there is no collision if a side drives one action from a sample on."""
@@ -248,12 +255,30 @@ def _avoidable(course: Course, side: Side, chance: int | None) -> str:
     """Until when a driver could have avoided the collision, and by how much, rounded up."""
     if chance is None:
         return f"By braking alone the {side} driver could never have avoided it."
-    mps2 = course.least_mps2(side, BRAKING, chance)
-    done = f"braking at {ceil(mps2 * 10 - TICK_S) / 10:.1f} m/s²" if mps2 else "not speeding up"
+    done, _ = _braking(course, side, chance)
     return (
         f"The {side} driver could still have avoided it at {course.times_s[chance]:.1f} s, by "
         f"{done} from then on."
     )
+
+
+def _braking(course: Course, side: Side, chance: int) -> tuple[str, str]:
+    """What would have avoided the collision from a sample on, given how the vehicle then drove.
+
+    As it stands in a sentence, rounded up, and as a mark calls it.
+    """
+    least_mps2 = ceil(course.least_mps2(side, BRAKING, chance) * 10 - TICK_S) / 10
+    braked_mps2 = -course.driven_mps2(side, chance)
+    if not least_mps2:
+        if braked_mps2 <= -STEADY_MPS2:
+            return "not speeding up any further", "last moment to stop speeding up"
+        return "keeping the speed that it had", "last moment to keep its speed"
+    if braked_mps2 < STEADY_MPS2:
+        return f"braking at {least_mps2:.1f} m/s²", "last moment to brake"
+    if braked_mps2 >= least_mps2:
+        return f"braking on at {least_mps2:.1f} m/s²", "last moment to brake on"
+    harder = f"braking at {least_mps2:.1f} m/s² in place of {braked_mps2:.1f}"
+    return harder, "last moment to brake harder"
 
 
 def _marks(
@@ -270,4 +295,5 @@ def _marks(
             yield Mark(at_s, side, "invalid", "no valid plan")
     for side, chance in chances.items():
         if chance is not None:
-            yield Mark(course.times_s[chance], side, "last chance", "last moment to brake")
+            _, text = _braking(course, side, chance)
+            yield Mark(course.times_s[chance], side, "last chance", text)
