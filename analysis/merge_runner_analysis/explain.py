@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,9 +16,10 @@ from merge_runner_analysis.frames import KEYS
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.provenance import call_counts
 from merge_runner_analysis.published import HUMAN, citation
+from merge_runner_analysis.stats.verdicts import went_so
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.formats import shown_value
-from merge_runner_analysis.tables.model import ENDED, FINISHED, STORED, Column, Row, Table
+from merge_runner_analysis.tables.model import COUNTED, ENDED, FINISHED, STORED, Column, Row, Table
 
 SEE_NOTES = "see the notes of the table"
 QUERY = (
@@ -102,6 +104,8 @@ def sources_of(
         return (Source(HUMAN, resampled),)
     known = (*study.groups, *study.asked, *study.unjudged, *study.unjudged_asked)
     groups = [group for group in known if group.id in row.groups]
+    if column is not None and column.counts == COUNTED and row.values.get(column.name):
+        return tuple(_counted(group, str(row.values["measure"])) for group in groups)
     rests_on = (column.rests_on if column else "") or row.rests_on
     return tuple(
         _source(
@@ -112,6 +116,16 @@ def sources_of(
         else Source(group.id, f"published, not from traces: {row.note or SEE_NOTES}")
         for group in groups
     )  # fmt: skip
+
+
+def _counted(group: Group, measure: str) -> Source:
+    """The trials that a verdict counts."""
+    went = went_so(group, measure)
+    trials, numerator = (
+        tuple(group.trials.loc[index, "trial_id"]) for index in (went.index, went.index[went])
+    )
+    text = f"{len(trials)} of {len(group.trials)} trials; the value counts {len(numerator)} of them"
+    return Source(group.id, text, _query(group, trials), trials, numerator)
 
 
 @remembered
@@ -152,9 +166,12 @@ def _source(
         else "",
         f"the value counts {len(numerator)} of them" if counts else "",
     )
-    query = QUERY.format(
-        specs=", ".join(map(quoted, sorted(group.trials["spec_hash"].unique()))),
-        trials=", ".join(map(quoted, trials)),
-    )
     text = "; ".join(filter(None, parts))
-    return Source(group.id, text, query if trials else "", trials, numerator)
+    return Source(group.id, text, _query(group, trials), trials, numerator)
+
+
+def _query(group: Group, trials: Sequence[str]) -> str:
+    """The query that lists trials of a group; empty for none."""
+    specs = sorted(group.trials["spec_hash"].unique())
+    named = QUERY.format(specs=", ".join(map(quoted, specs)), trials=", ".join(map(quoted, trials)))
+    return named if trials else ""

@@ -57,6 +57,7 @@ from merge_runner_analysis.stats.measures import (
     mean_of,
     undecided,
     undecided_note,
+    values,
 )
 from merge_runner_analysis.stats.regressions import (
     CONDITION,
@@ -188,24 +189,35 @@ def counted(both: Both) -> dict[str, Counted]:
     """
     played = both.human.outcomes["condition"].isin(both.group.ended["condition"])
     humans = both.human.outcomes[played]
-    crashes = (
-        counts(both.group, COLLISIONS),
-        counts(replace(both.human, published_outcomes=humans), BOXES),
-    )
-    found = {"collisions": crashes} | {
-        name: (_went_first(both.group.trials, name), _went_first(humans, name))
-        for name in ("headway", "velocity")
+    seen = {
+        "collisions": values(replace(both.human, published_outcomes=humans), BOXES).astype(bool),
+        **{name: _went_first(humans, name) for name in ("headway", "velocity")},
     }
-    return {name: Counted(*own, *human) for name, (own, human) in found.items() if own[1]}
+    own = {name: went_so(both.group, name) for name in seen}
+    return {
+        name: Counted(int(of.sum()), len(of), int(seen[name].sum()), len(seen[name]))
+        for name, of in own.items()
+        if len(of)
+    }
 
 
-def _went_first(outcomes: pd.DataFrame, measure: str) -> tuple[int, int]:
-    """In how many trials the one ahead, or side by side the slower one, went first, of how many."""
+def went_so(group: Group, measure: str) -> pd.Series:
+    """Whether each trial of a driver that could go as a measure counts it did, by its index.
+
+    Only those in conditions of humans count.
+    """
+    alike = in_human_conditions(group)
+    if measure == "collisions":
+        return values(alike, COLLISIONS).astype(bool)
+    return _went_first(alike.trials, measure)
+
+
+def _went_first(outcomes: pd.DataFrame, measure: str) -> pd.Series:
+    """Whether the one ahead, or side by side the slower one, went first, where there is one."""
     headway, velocity = (np.sign(outcomes[name]) for name in CONDITION)
     expected = headway if measure == "headway" else -velocity.where(headway == 0, 0)
     first = outcomes["merged_first"].map({"left": 1, "right": -1})
-    there = first.notna() & (expected != 0)
-    return int((first == expected)[there].sum()), int(there.sum())
+    return (first == expected)[first.notna() & (expected != 0)]
 
 
 def in_human_conditions(group: Group) -> Group:

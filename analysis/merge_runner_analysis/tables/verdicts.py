@@ -9,6 +9,7 @@ from collections.abc import Iterator
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.records import SIDES
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner_analysis.drivers import language_models
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.metrics import BOXES
@@ -16,7 +17,15 @@ from merge_runner_analysis.published import HUMAN, HUMAN_TRIALS
 from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.verdicts import Comparison, compared, of_humans
 from merge_runner_analysis.study import Study
-from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Value, interval
+from merge_runner_analysis.tables.model import (
+    COUNTED,
+    Column,
+    Optional,
+    Row,
+    Table,
+    Value,
+    interval,
+)
 from merge_runner_analysis.wording import (
     HUMANS,
     LANGUAGE_MODEL,
@@ -49,7 +58,14 @@ VERDICT_COLUMNS = (
     Optional("detectable", "detectable", "number", "smallest difference found with power .8"),
     Optional("state", "verdict", meaning="what is shown"),
     Optional("rule", "rule", meaning="how the verdict is set", noted=True),
-    Optional("counted", "counted", meaning="trials that went so, of those that could", noted=True),
+    Optional(
+        "counted",
+        "counted",
+        "text",
+        "trials that went so, of those that could",
+        COUNTED,
+        noted=True,
+    ),
     Optional("counted_by", "by", meaning="collision rule that was played", noted=True),
     Optional("human_counted", "humans", meaning="the humans' in its conditions", noted=True),
 )
@@ -134,8 +150,13 @@ def _compared(group: Group, kind: str, found: Comparison, played_rule: str) -> R
         values["counted"] = f"{seen.k} of {seen.n}"
         values["human_counted"] = f"{seen.human_k} of {seen.human_n}"
         values["counted_by"] = played_rule if measure.rests_on == BOXES.column else None
-    note = note_of(*found.remarks)
-    return Row(f"{group.id}/{measure.name}", (group.id,), values, note, measure.rests_on)
+    note, played = note_of(*found.remarks), {*group.trials["condition"]}
+    # Only trials in conditions of humans are compared.
+    conditions = (
+        () if played <= {*HUMAN_CONDITIONS} else tuple(sorted(played & {*HUMAN_CONDITIONS}))
+    )
+    row_id = f"{group.id}/{measure.name}"
+    return Row(row_id, (group.id,), values, note, measure.rests_on, conditions)
 
 
 def _human_rows(study: Study) -> Iterator[Row]:

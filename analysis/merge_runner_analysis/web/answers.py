@@ -24,10 +24,11 @@ from merge_runner_analysis.tables.model import from_text, to_text
 if TYPE_CHECKING:
     from merge_runner_analysis.study import Study
 
+OF = " of"  # behind a column that counts: all of which it counts some
 FOUND = 3  # findings of a run that its page shows
 Request = tuple[str, ...]
 """``table NAME [SWEEP CONDITION]``, ``comparison GROUP GROUP SWEEP CONDITION``,
-``cell TABLE ROW COLUMN``, ``figure NAME FORM``, ``audit``."""
+``cell TABLE ROW COLUMN SWEEP CONDITION``, ``figure NAME FORM``, ``digest``, ``audit``."""
 RUNS = """
 SELECT sweep_id, coalesce(exit_code = 0, false) FROM sweeps
 ORDER BY started_at DESC, sweep_id DESC
@@ -58,11 +59,14 @@ class Numbers:
                 found: dict[str, Any] = {"table": self._table(name, *part)}
             case ["comparison", one, other, *part]:
                 found = {"table": self._comparison(one, other, *part)}
-            case ["cell", table, row, column]:
-                found = self._cell(table, row, column)
+            case ["cell", table, row, column, *part]:
+                found = self._cell(table, row, column, *part)
             case ["figure", name, "svg" | "png" as form]:
                 digest, _ = results_digest(self.db)
                 found = {"file": self._figure(name, form), "digest": digest}
+            case ["digest"]:
+                digest, _ = results_digest(self.db)
+                found = {"digest": digest}
             case ["audit"]:
                 found = {"notes": json.loads(self._kept("audit", self._audit))}
             case _:
@@ -135,15 +139,20 @@ class Numbers:
                 told[run] = [f"found: {one}" for one in audit.findings[:FOUND]] + audit.notes
         return json.dumps(told)
 
-    def _cell(self, name: str, row: str, column: str) -> dict[str, Any]:
+    def _cell(
+        self, name: str, row: str, column: str, sweep: str = "", condition: str = ""
+    ) -> dict[str, Any]:
+        """Return what a cell is and its trials; with OF behind it those that it counts of."""
         from merge_runner_analysis.explain import explain
 
-        table, study = from_text(self._table(name)), self.study
+        table = from_text(self._table(name, sweep, condition))
+        study = self._part(Selection(sweep=sweep, condition=condition))
+        column, of, _ = column.partition(OF)
         try:
             found = explain(study, table, f"{row}:{column}")
         except UsageError as exc:
             return {"absent": str(exc)}
-        counts = any(one.counts for one in table.columns if one.name == column)
+        counts = not of and any(one.counts for one in table.columns if one.name == column)
         specs = {
             group.id: dict(zip(trials["trial_id"], trials["spec_hash"], strict=True))
             for group in (*study.measured, *study.asked, *study.unjudged, *study.unjudged_asked)

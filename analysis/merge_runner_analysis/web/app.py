@@ -190,6 +190,7 @@ PAGES: dict[str, Callable[..., str | Response]] = {
     "/tables/{name}": tables.table_page,
     "/figures/{name}.{suffix}": tables.figure_file,
     "/figures/{name}": tables.figure_page,
+    "/cite": tables.cite_page,
     "/prompts": prompts.prompts_page,
     "/discordant": prompts.discordant_page,
     "/words": words.words_page,

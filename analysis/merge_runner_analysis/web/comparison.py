@@ -101,9 +101,9 @@ def trials_of(own: Driver, scope: Scope) -> TrialsOf:
         if facts.get(field) == count:
             return every | more
         # A finished trial has a gap, and an ended one is in the row of crashes.
-        for cell in own.cells.values() if not (scope.sweep or scope.condition) else ():
+        for cell in own.cells.values():
             if what[:2] != "k " and cell.values["n"] == count and cell.measure.name == "gap":
-                return {"cell": f"verdicts/{cell.values['row']}:n"}
+                return {"cell": f"verdicts/{cell.values['row']}:n", **scope.part}
         return None
 
     return behind

@@ -45,7 +45,8 @@ MOST = 1_000  # trials of drivers; of humans there are at most 990
 # are of all trials, so that a link within a scope leads to the page without it.
 FOLLOWED: dict[str, Collection[str]] = {
     **dict.fromkeys(
-        ("", "sweeps", "conditions", "tables", "figures", "prompts", "notes", "glossary"), ()
+        ("", "sweeps", "conditions", "tables", "figures", "prompts", "notes", "glossary", "cite"),
+        (),
     ),
     "drivers": ("variant",),
     "trials": ("spec", "page", *FACETS),

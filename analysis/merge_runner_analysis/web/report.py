@@ -19,6 +19,7 @@ from merge_runner.llm.ledger import APART
 from merge_runner.prompts.blocks import BASELINE, title_of
 from merge_runner.records import NO_DECISION
 from merge_runner.results.provenance import program
+from merge_runner.results.store import results_digest
 from merge_runner_analysis.cache import finished, keep_finished
 from merge_runner_analysis.explain import Source, sources_of, sql_command
 from merge_runner_analysis.figures import FIGURES
@@ -145,6 +146,7 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
         question=question,
         apart=_apart(study),
         linked=False,
+        part={},
         middle=MIDDLE,
         figures=[(name, FIGURES[name].caption, data) for name, data in figures.items()],
         tables=views,
@@ -159,6 +161,10 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
         readings=published("readings"),
         cited=published("sources"),
         program=program(),
+        version=version("merge-runner"),
+        made_at="",  # equal results give equal reports
+        trials=sum(len(group.trials) for group in study.played),
+        digest=results_digest(study.db)[0],
     )
 
 

@@ -38,6 +38,12 @@ class Scope:
         """The trials of all its drivers, as a filter."""
         return {**self.trials(prompt=self.prompt), "model": self.drivers}
 
+    @property
+    def part(self) -> dict[str, str]:
+        """The run and the condition that tables are of, as addresses of their cells have them."""
+        part = {"of_run": self.sweep, "of_condition": self.condition}
+        return {name: value for name, value in part.items() if value}
+
     def trials(self, driver: str = "", prompt: str = "") -> dict[str, Any]:
         """Its trials of a driver and a prompt, or of all: a filter, and the address of a list."""
         return {"model": unmarked(driver), "variant": prompt,

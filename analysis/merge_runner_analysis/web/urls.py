@@ -7,6 +7,8 @@ from functools import partialmethod
 from typing import Any
 from urllib.parse import quote, urlencode
 
+# What an address says of a cell: which it is, and the run and condition that its table is of.
+CELL = ("cell", "of_run", "of_condition")
 # The page to begin at.
 HOME = "index"
 
@@ -43,12 +45,12 @@ class Links:
     trial = partialmethod(_of_trial, "trials")
     others = partialmethod(_of_trial, "others")
 
-    def cell(self, table: str, row: str, column: str) -> str:
-        """The trials behind a cell.
+    def cell(self, table: str, row: str, column: str, /, **part: str) -> str:
+        """The trials behind a cell, of a table of all trials or of a ``part``: see ``CELL``.
 
         No table's name has a slash and no column's a colon, whatever is in the row's.
         """
-        return self.to("trials", cell=f"{table}/{row}:{column}")
+        return self.to("trials", cell=f"{table}/{row}:{column}", **part)
 
 
 def query_of(state: Mapping[str, Any]) -> str:

@@ -9,11 +9,12 @@ import pytest
 import statsmodels.formula.api as smf
 from playwright.sync_api import expect
 
+from merge_runner.results.store import query, results_digest
 from merge_runner_analysis.figures.figure2 import figure2
 from merge_runner_analysis.study import Study
 from tests.support.gate import HANGS_S
 from tests.support.harness import PROGRAM, environment
-from tests.support.serving import Page, client_of, served
+from tests.support.serving import Page, client_of, listed, served
 from tests.support.tables import values_of
 
 STUDY = """
@@ -121,6 +122,61 @@ def test_where_sides_are_counterbalanced_who_goes_first_is_said_of_the_ego(db):
         assert f"Ego on the {side} goes first {k} of {n}" in said
     (_, left_k, left_n), (_, right_k, right_n) = left, right
     assert f"{left_k + right_k} of {left_n + right_n} " in Page(condition).text
+
+
+AHEAD = "sign(projected_headway_m) = if(merged_first = 'left', 1, -1)"
+SLOWER = "sign(relative_velocity_mps) = if(merged_first = 'left', -1, 1)"
+LIKENESS = f"""
+SELECT count(*) FILTER (status = 'collided'), count(*) FILTER (status <> 'failed'),
+    count(*) FILTER (projected_headway_m <> 0 AND {AHEAD}),
+    count(merged_first) FILTER (projected_headway_m <> 0),
+    count(*) FILTER (projected_headway_m = 0 AND relative_velocity_mps <> 0 AND {SLOWER}),
+    count(merged_first) FILTER (projected_headway_m = 0 AND relative_velocity_mps <> 0)
+FROM trials WHERE variant = 'baseline' AND model_left = model_right
+"""
+
+
+def test_likeness_to_people_is_said_in_counts_that_lead_to_their_trials(db):
+    with duckdb.connect(str(db), read_only=True) as connection:
+        (counts,) = connection.execute(LIKENESS).fetchall()
+    with client_of(db) as client:
+        text = client.get("/").text
+        table = text.partition('<table class="likeness"')[2].partition("</table>")[0]
+        people, row = (Page(part) for part in re.findall(r"<tr.*?</tr>", table, re.DOTALL)[1:3])
+        assert [*map(int, re.findall(r"(\d+) of (\d+)", people.text)[0])] == [28, 990]
+        assert "675 of 704 95.88 %" in people.text
+        assert "158 of 173 91.33 %" in people.text
+        pairs = re.findall(r"(\d+) of (\d+)", row.text)
+        assert [int(count) for pair in pairs for count in pair] == [*counts]
+        links = [(to, int(count)) for to, count in row.to("/trials") if count.isdigit()]
+        assert len(links) >= 4
+        for to, count in links:
+            assert listed(client.get(to).text) == count
+        # Numbers of all prompts are not narrowed by one; which one is compared is said beside it.
+        assert 'name="variant"' not in text
+        assert 'name="model"' not in text
+        assert "Prompt Baseline, beside 990 trials" in Page(text).text
+
+
+def test_counts_of_a_part_of_the_trials_lead_to_just_these(db):
+    with client_of(db) as client:
+        (sweep,) = query(db, "SELECT sweep_id FROM sweeps")[1][0]
+        page = Page(client.get("/", params={"condition": "R_4_8", "sweep": sweep}).text)
+        links = [(to, int(text)) for to, text in page.to("/trials?cell") if text.isdigit()]
+        assert len(links) > 8
+        for to, count in links:
+            listing = client.get(to).text
+            assert listed(listing) == count
+            assert set(re.findall(r"<th[^>]*><a[^>]*>(\w+) · ", listing)) <= {"R_4_8", "L_4_-8"}
+
+
+def test_results_are_cited_from_the_foot_of_every_page(db):
+    with client_of(db) as client:
+        assert Page(client.get("/").text).to("/cite")
+        said = Page(client.get("/cite").text).text
+    digest, trials = results_digest(db)[0], query(db, "SELECT count(*) FROM trials")[1][0][0]
+    assert f"from {trials:,} trials; digest of the results {digest}" in said
+    assert "doi:10.4121/19550377" in said
 
 
 def test_the_first_screen_answers_a_study_of_two_factors(page, db, outcomes):

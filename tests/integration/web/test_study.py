@@ -81,7 +81,7 @@ def test_the_study_says_and_shows_what_the_table_of_verdicts_has(client, verdict
     for said in (
         " ".join(headline({"o3": own, "o4": verdicts["o4/baseline"]})),
         sentence(own),
-        "Not shown: 1 other prompt.",
+        "With other prompts: A1 (-History).",
     ):
         assert said in page.text
     assert sentence(verdicts["o3/A1"]) not in page.text

@@ -7,14 +7,12 @@ from collections.abc import Mapping
 from merge_runner_analysis.web.computed import computed_table
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.judged import by_condition, by_kind, judged, noted
+from merge_runner_analysis.web.people import HEADINGS, likeness_of, people_of
 from merge_runner_analysis.web.question import MIDDLE, Answer, answer_of
 from merge_runner_analysis.web.runs import standing_of
 from merge_runner_analysis.web.scope import DESCRIPTIONS, Bar, scope_of, unmarked
 from merge_runner_analysis.web.site import Site, news_of
-from merge_runner_analysis.wording import (
-    LANGUAGE_MODEL,
-    headline,
-)
+from merge_runner_analysis.wording import LANGUAGE_MODEL, headline
 
 TABLES = ("effects", "levels")  # of what a study's factors change
 
@@ -48,10 +46,16 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         for one in shown
         if one.kind == LANGUAGE_MODEL and one.cells
     }
+    conditions = by_condition(site, scope, shown)
     return site.render(
         "home.html",
         here="index",
         **values,
+        # A study of factors says in counts how like people its drivers are.
+        likeness=[(one, likeness_of(one)) for one in shown] if site.catalogue.factors() else [],
+        likeness_headings=HEADINGS,
+        people=people_of(conditions, values["human"]),
+        part=scope.part,
         standing=standing,
         seen=seen,
         descriptions=[row["description"] for row in site.catalogue.ask(DESCRIPTIONS)],
@@ -60,8 +64,8 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         question=question,
         asking=[job for job in asking if job.content is None],
         middle=MIDDLE,
-        linked=not scope.sweep and not scope.condition,
-        other_prompts=[name for name, _ in bar.prompts if name != scope.prompt],
+        linked=True,
+        titles=dict(bar.prompts),
         notes=noted(shown),
-        conditions=by_condition(site, scope, shown),
+        conditions=conditions,
     )

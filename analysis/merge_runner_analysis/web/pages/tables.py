@@ -74,6 +74,17 @@ def figure_page(site: Site, name: str, _: Mapping[str, str]) -> str:
     )
 
 
+def cite_page(site: Site, _: Mapping[str, str]) -> str:
+    """How the results of a study are cited."""
+    return site.render(
+        "cite.html",
+        here="cite",
+        computed=computed(site, ("digest",)),
+        cited_as="Results",
+        version=metadata.version("merge-runner"),
+    )
+
+
 def table_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     """One table; raises NotThere."""
     found, table = computed_table(site, _known(name, TABLES, "table"))

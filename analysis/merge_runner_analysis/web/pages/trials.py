@@ -16,7 +16,7 @@ from merge_runner_analysis.web.pictures import sparkline, speed_range
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.scope import carried
 from merge_runner_analysis.web.site import NotThere, Site, news_of
-from merge_runner_analysis.web.urls import whole
+from merge_runner_analysis.web.urls import CELL, whole
 
 MOST = 4  # drivers whose sums stand above a list
 # Requests that failed and were repeated are no fault of a trial.
@@ -34,12 +34,12 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
     if "seen" in asked:  # that the trials are no longer those that were seen
         here = site.at.to("trials", **{**asked, "seen": ""})
         return site.render("_news.html", trials=state["trials"], here=here, news=news)
-    chosen, sort, cell = filter_of(asked), sort_of(asked), asked.get("cell", "")
+    chosen, sort, cell = filter_of(asked), sort_of(asked), cell_of(asked)
     wanted, named = chosen, None
     if cell:
         named = computed(site, cell_request(cell))
         if named.content is None:
-            return site.render("behind.html", here="trials", cell=cell, computed=named)
+            return site.render("behind.html", here="trials", cell=cell["cell"], computed=named)
         wanted = {**chosen, "trials": named.content["trials"]}
     totals = site.catalogue.counts(wanted, "model")
     trials = sum(part["trials"] for part in totals)
@@ -53,7 +53,7 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
         chosen=chosen,
         headings=HEADINGS,
         carried=carried(asked),
-        kept={**chosen, "cell": cell},
+        kept={**chosen, **cell},
         cell=cell,
         computed=named,
         sort=sort,
@@ -110,14 +110,20 @@ def export_filter(site: Site, asked: Mapping[str, str]) -> Wanted:
 
     Raises NotThere, StoreError and TooMuch.
     """
-    wanted, cell = filter_of(asked), asked.get("cell", "")
+    wanted, cell = filter_of(asked), cell_of(asked)
     return {**wanted, "trials": awaited(site, cell_request(cell))["trials"]} if cell else wanted
 
 
-def cell_request(cell: str) -> tuple[str, str, str, str]:
+def cell_of(asked: Mapping[str, str]) -> dict[str, str]:
+    """The cell that an address names, with the part of the trials that it is of; empty for none."""
+    return {name: asked[name] for name in CELL if asked.get(name)} if asked.get("cell") else {}
+
+
+def cell_request(cell: Mapping[str, str]) -> tuple[str, ...]:
     """What is asked for a cell, ``TABLE/ROW:COLUMN``; raises NotThere."""
-    table, _, rest = cell.partition("/")
+    table, _, rest = cell["cell"].partition("/")
     row, _, column = rest.rpartition(":")
     if table not in TABLES or not row:
         raise NotThere(f"a cell is named TABLE/ROW:COLUMN; the tables are {', '.join(TABLES)}")
-    return "cell", table, row, column
+    _, *part = CELL
+    return "cell", table, row, column, *(cell.get(name, "") for name in part)
