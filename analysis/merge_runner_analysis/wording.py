@@ -61,6 +61,8 @@ PLAYED_RULES = {
     "rectangle": "people's rule at its steps",
     "shared_lane": "the rule of its scenario",
 }
+# Of levels that nobody reads.
+SAME_TRIALS = "not tested: the same trials at both levels, since no driver reads what differs"
 MISSING, MINUS = "–", "−"
 TIMES = " × "  # between the factors of an interaction
 

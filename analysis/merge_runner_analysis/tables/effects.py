@@ -24,7 +24,7 @@ from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.measures import undecided_note
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Value, interval
-from merge_runner_analysis.wording import note_of
+from merge_runner_analysis.wording import SAME_TRIALS, note_of
 
 TEST = "of the test of Mantel and Haenszel, or of Welch's"
 HOW = (
@@ -41,7 +41,6 @@ FAMILIES = (
     "measure, are one, without those of the model; all others are the other one"
 )
 DETECTABLE = "detectable: found at p < .05, before correction, with power .8"
-SAME_TRIALS = "not tested: the same trials at both levels, since no driver reads what differs"
 SAME_VALUE = "the same in every trial, so that there is nothing to test"
 UNTESTED = (
     "no test without cells that all have, spread within cells, or with undecided trials, trials of "

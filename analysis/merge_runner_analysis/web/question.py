@@ -14,13 +14,13 @@ from typing import Any
 
 from merge_runner.study.crossing import MODEL
 from merge_runner_analysis.metrics import COLLISIONS, GAP, LEFT_FIRST, RMSE
-from merge_runner_analysis.tables.effects import SAME_TRIALS
 from merge_runner_analysis.tables.model import Row, Table
 from merge_runner_analysis.web.marks import Mark
 from merge_runner_analysis.wording import (
     ALPHA,
     ENOUGH,
     METRIC_NAMES,
+    SAME_TRIALS,
     TIMES,
     brackets,
     capital,

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from merge_runner_analysis.tables.effects import SAME_TRIALS
 from merge_runner_analysis.tables.model import Column, Row, Table
 from merge_runner_analysis.web.question import answer_of, answered
+from merge_runner_analysis.wording import SAME_TRIALS
 
 GOES_FIRST, GAP = "goes first (%)", "gap (m)"
 METRICS = {GOES_FIRST: "left_first_percent", "coll. (%)": "collided_percent", GAP: "gap_m"}
