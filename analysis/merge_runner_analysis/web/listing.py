@@ -184,17 +184,23 @@ def list_trials(copy: Copy) -> Listing:
     """List all trials of a copy; raises duckdb.Error where they cannot be read."""
     connection = in_memory(SETTINGS)
     connection.execute(f"ATTACH {copy.file} AS results (READ_ONLY); {BOTH}")
-    collisions = [
-        (row["trial_id"], row["spec_hash"], _collision(row))
-        for row in records(connection, COLLIDED, ())
-    ]
-    connection.execute(JUDGED, columns_of(collisions, 3))
+    connection.execute(JUDGED, columns_of(judged_collisions(connection), 3))
     connection.execute(POSED)
     connection.execute(SAID, columns_of(map(_said, records(connection, DRIVERS, ())), 3))
     others = other_models(connection)
     connection.execute((LISTED + ";" + OF_TRIALS).format(others=sql_of(others)))
     (state,) = records(connection, STATE, ())
     return Listing(connection, others, state)
+
+
+def judged_collisions(
+    connection: duckdb.DuckDBPyConnection,
+) -> list[tuple[str, str, str | None]]:
+    """Each trial that collided, with its spec and how it did."""
+    return [
+        (row["trial_id"], row["spec_hash"], _collision(row))
+        for row in records(connection, COLLIDED, ())
+    ]
 
 
 def columns_of(rows: Iterable[Sequence[object]], number: int) -> list[list[object]]:

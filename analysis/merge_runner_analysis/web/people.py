@@ -10,6 +10,7 @@ from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner_analysis.stats.score_interval import wilson
 from merge_runner_analysis.web.judged import Driver
 from merge_runner_analysis.web.marks import Cell
+from merge_runner_analysis.web.question import unbroken
 from merge_runner_analysis.wording import (
     OPEN,
     SHOWN,
@@ -68,11 +69,11 @@ def _likeness(cell: Cell) -> Likeness:
     row, counted = str(values["row"]), values.get("counted")
     if counted:
         k, n = map(int, str(counted).split(" of "))
-        return Likeness(mark, word, k, n, f"{number(100 * k / n)} %", row)
+        return Likeness(mark, word, k, n, unbroken(f"{number(100 * k / n)} %"), row)
     estimate = values.get("estimate")
     known = cell.measure.name == "gap" and estimate is not None
     text = f"{number(estimate)} m {brackets(values.get('ci'))}".rstrip() if known else ""
-    return Likeness(mark, word, None, None, text, row)
+    return Likeness(mark, word, None, None, unbroken(text), row)
 
 
 def _mark(name: str, values: Values) -> tuple[str, str]:
@@ -119,4 +120,4 @@ def people_of(conditions: Mapping[str, Any], human: Mapping[str, Any]) -> dict[s
         if n:
             ends = brackets([100 * end for end in wilson(k / n, n)])
             shown[name] = f"{k} of {n}, {number(100 * k / n)} % {ends}"
-    return shown
+    return {name: unbroken(text) for name, text in shown.items()}

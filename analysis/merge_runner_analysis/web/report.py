@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from datetime import datetime
 from difflib import unified_diff
@@ -18,13 +19,14 @@ from merge_runner.errors import UsageError
 from merge_runner.llm.ledger import APART
 from merge_runner.prompts.blocks import BASELINE, title_of
 from merge_runner.records import NO_DECISION
+from merge_runner.results.database import read_database
 from merge_runner.results.provenance import program
 from merge_runner.results.store import results_digest
 from merge_runner_analysis.cache import finished, keep_finished
 from merge_runner_analysis.explain import Source, sources_of, sql_command
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.figures.gallery import rendered, write_figures
-from merge_runner_analysis.frames import load
+from merge_runner_analysis.frames import KEYS, load
 from merge_runner_analysis.grouping import levels_of
 from merge_runner_analysis.provenance import Provenance, provenance, tally
 from merge_runner_analysis.published import published
@@ -37,6 +39,8 @@ from merge_runner_analysis.tables.formats import render, table_view
 from merge_runner_analysis.tables.model import Column, Row, Table
 from merge_runner_analysis.tables.verdicts import verdicts
 from merge_runner_analysis.web.comparison import Comparison, comparison_of, no_trials
+from merge_runner_analysis.web.listing import judged_collisions
+from merge_runner_analysis.web.phrases import plain
 from merge_runner_analysis.web.question import MIDDLE, answer_of
 from merge_runner_analysis.web.rendering import STYLE, environment, inlined_texts, policy_of
 from merge_runner_analysis.web.scope import DESCRIPTIONS
@@ -52,6 +56,8 @@ ORDER BY min((condition, decisions.side, trial_id)) DESC
 """
 # At most so many trials are listed for a row: a page with all of them would be unwieldy.
 LISTED = 300
+# Of each alarm so many findings stand open, and these tables of a study with factors.
+FEW, ANSWERING = 3, ("effects", "levels")
 # The share of a group's decisions above which an alarm is raised: a convention.
 MANY_FALLBACKS = 0.05
 # The worst first: what each alarm says of the groups that it names.
@@ -141,6 +147,7 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
         levels=levels,
         prompts=prompts,
         alarms=alarms(study, origin),
+        crashes=crashes(study),
         headline=headline,
         sentences=others,
         question=question,
@@ -153,6 +160,8 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
         notes=_once(views),
         numbers=numbers,
         most=LISTED,
+        few=FEW,
+        answering=ANSWERING,
         command=sql_command(study),
         libraries=", ".join(f"{name} {version(name)}" for name in LIBRARIES),
         origin=origin,
@@ -251,14 +260,29 @@ def _shown(value: object) -> str:
     return str(value)
 
 
-def alarms(study: Study, origin: Provenance) -> dict[str, str]:
-    """What casts doubt on the results of a study by title, the worst first."""
+def alarms(study: Study, origin: Provenance) -> dict[str, tuple[list[str], str]]:
+    """What casts doubt on the results of a study by title, the worst first.
+
+    Of each the findings, one for each group or run, and what they mean.
+    """
     found: dict[str, list[str]] = {title: [] for title in MEANINGS}
     for title, text in _found(study, origin):
         found[title].append(text)
-    return {
-        title: f"{'; '.join(texts)}. {MEANINGS[title]}" for title, texts in found.items() if texts
-    }
+    return {title: (texts, MEANINGS[title]) for title, texts in found.items() if texts}
+
+
+def crashes(study: Study) -> dict[str, dict[str, int]]:
+    """Why the trials of each driver and prompt crashed: how many, by cause, the most first."""
+    with read_database(study.db) as connection:
+        causes = {(name, spec): cause for name, spec, cause in judged_collisions(connection)}
+    counted: dict[str, dict[str, int]] = {}
+    for group in study.played:
+        crashed = group.trials.loc[group.trials["status"] == "collided", KEYS]
+        keys = crashed.itertuples(index=False, name=None)
+        of_group = Counter(plain(cause) for key in keys if (cause := causes.get(key)))
+        if of_group:
+            counted[group.id] = dict(of_group.most_common())
+    return counted
 
 
 def _repeats(study: Study) -> Iterator[str]:

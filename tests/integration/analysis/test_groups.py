@@ -33,7 +33,8 @@ def db(written, tmp_path):
 
 
 def alarms_of(study):
-    return alarms(study, provenance(study.db))
+    found = alarms(study, provenance(study.db)).items()
+    return {title: f"{'; '.join(texts)}. {meaning}" for title, (texts, meaning) in found}
 
 
 def listed(study, table, cell):

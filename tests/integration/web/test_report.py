@@ -82,7 +82,8 @@ def asking(folder, said, *, variant="baseline"):
 
 
 def alarms_of(study):
-    return alarms(study, provenance(study.db))
+    found = alarms(study, provenance(study.db)).items()
+    return {title: f"{'; '.join(texts)}. {meaning}" for title, (texts, meaning) in found}
 
 
 def test_what_went_wrong_stands_at_the_top_before_any_number(page):

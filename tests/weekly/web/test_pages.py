@@ -1,6 +1,7 @@
 """Every page fits its window and keeps nobody out who reads with other eyes."""
 
 import shutil
+import subprocess
 
 import pytest
 from playwright.sync_api import expect
@@ -9,11 +10,13 @@ from merge_runner.results.store import Store
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.web.report import report_html
+from tests.support.harness import PROGRAM, environment
 from tests.support.serving import in_a_thread, served
 from tests.support.studies import played, yielding
 from tests.support.web_fixtures import serious
 
 LONG = ("meta-llama/Llama-3.3-70B-Instruct-Turbo", "instruct at localhost:8123+idm/set1")
+HIGHEST_PX = 15_000  # a report, in a window of 1440
 COMPUTED_MS = 600_000  # on a busy machine
 PAPER_PX = round(190 * 96 / 25.4)  # A4 within its margins
 # A number, a share, a p-value, an interval or a date, of which no part may stand in a line below.
@@ -91,12 +94,24 @@ def test_every_page_fits_its_window_and_axe_finds_nothing_serious(page):
     assert found == []
 
 
+def test_the_report_of_the_tutorials_study_is_at_most_so_high(page, tmp_path):
+    kept = ("--db", tmp_path / "t.duckdb")
+    played = ("sweep", "baseline", *kept, "--cache", tmp_path / "cache", "--quiet")
+    for typed in (played, ("report", *kept, "--out", tmp_path / "report.html")):
+        subprocess.run([PROGRAM, *typed], cwd=tmp_path, env=environment(), check=True)
+    page.set_viewport_size({"width": 1440, "height": 900})
+    page.goto((tmp_path / "report.html").as_uri())
+    assert page.evaluate("document.documentElement.scrollHeight") <= HIGHEST_PX
+    assert page.locator("#crashes").is_visible()
+
+
 def test_a_report_breaks_no_number_and_cuts_no_table_on_a_screen_and_on_paper(page, db, tmp_path):
     study = in_a_thread(Study, db)
     html = in_a_thread(lambda: report_html(study, make_tables(study), {}))
     (tmp_path / "report.html").write_text(html)
     page.goto((tmp_path / "report.html").as_uri())
-    last = page.locator("#verdicts ~ .wide").first.locator("thead th").last
+    page.evaluate("document.querySelectorAll('.folded').forEach((one) => { one.open = true; })")
+    last = page.locator("#verdicts thead th").last
     assert last.text_content() == "verdict"
     for media, width in (("screen", 1440), ("print", PAPER_PX)):
         page.emulate_media(media=media)
