@@ -14,6 +14,7 @@ import typer
 
 from merge_runner import __version__
 from merge_runner.cli import commands
+from merge_runner.cli.help import Program
 from merge_runner.cli.options import flag, print_out
 from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner.text_safety import say
@@ -35,10 +36,9 @@ def common(
         raise typer.Exit
 
 
-app = typer.Typer(
+app = Program(
     name="merge-runner",
     help="Finds out whether a language model drives like a human.",
-    no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
 )

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from merge_runner.cli import options as cli
+from merge_runner.cli.help import Program
 from merge_runner.cli.options import agree, print_out
 from merge_runner.cli.signals import on_signal
 from merge_runner.errors import UsageError, unknown_name
@@ -53,9 +54,7 @@ SWEEP = "A sweep_id, which may be repeated; the newest sweep if none is given."
 Form = Literal["text", "csv", "json"]
 RecordingFile = Annotated[Path, typer.Argument(metavar="FILE", help="A recording (.parquet).")]
 
-recording_app = typer.Typer(
-    help="Portable recordings: one Parquet file that anyone can replay.", no_args_is_help=True
-)
+recording_app = Program(help="Portable recordings: one Parquet file that anyone can replay.")
 
 
 def init(

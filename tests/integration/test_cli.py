@@ -46,17 +46,17 @@ def test_every_help_has_a_short_form_and_cuts_no_line():
         assert run.exit_code == 0, path
         for line in run.output.splitlines()[2:]:  # the usage goes first
             assert len(line) <= 80, (path, line)
-            assert not line.rstrip(" │").endswith(("...", "…")), (path, line)
+            assert not line.endswith(("...", "…")), (path, line)
 
 
 def groups_of(shown):
     """The titles of the groups of a help, each with its first words."""
     groups = {}
     for line in shown.splitlines():
-        if line.startswith("╭─ "):
-            groups[line.strip("╭─╮ ")] = words = []
-        elif line.startswith("│ ") and line[2] not in " *":
-            words.append(line.split()[1])
+        if title := re.fullmatch(r"(\w.*):", line):
+            groups[title[1]] = words = []
+        elif groups and line.startswith("  ") and line[2] != " ":
+            words.append(line.split()[0])
     return groups
 
 
@@ -69,7 +69,7 @@ def test_the_menu_and_the_options_of_a_sweep_are_in_groups():
     assert {"audit", "digest", "ledger"} == {*menu["Check"]}
     options = groups_of(CliRunner().invoke(app, ["sweep", "-h"]).output)
     assert len(options) > 5
-    assert "Options" not in options or options["Options"] == ["--help"]
+    assert "Options" not in options or options["Options"] == ["-h,"]
     assert {"--max-cost", "--dry-run", "--rpm"} <= {*options["Money and pace"]}
 
 
@@ -83,7 +83,7 @@ def test_every_command_has_an_example_that_it_can_read():
 
 
 def test_the_help_of_tables_names_each_of_them():
-    shown = CliRunner().invoke(app, ["tables", "-h"]).output.replace("│", " ")
+    shown = CliRunner().invoke(app, ["tables", "-h"]).output
     assert {*TABLES} <= {*re.findall(r"[\w-]+", " ".join(shown.split()))}
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from merge_runner.cli.help import Program
 from merge_runner.cli.options import DbOption, JsonOption, print_out
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_DB
@@ -18,9 +19,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-human_app = typer.Typer(
-    help="The human recordings, 4TU doi 10.4121/19550377.", no_args_is_help=True
-)
+human_app = Program(help="The human recordings, 4TU doi 10.4121/19550377.")
 PathArgument = Annotated[
     Path,
     typer.Argument(

@@ -1,0 +1,49 @@
+"""The help of commands as plain text in groups.
+
+What Typer draws it with takes twice as long to import as all else that ``--help`` needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+CommandT = TypeVar("CommandT", bound=Callable[..., Any])
+
+
+def _write_groups(command: TyperCommand | TyperGroup, ctx: Any, formatter: Any) -> None:  # noqa: ANN401 # Typer keeps their types to itself
+    """Write arguments, options and commands, each under the title of its group."""
+    groups: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
+    for param in command.get_params(ctx):
+        usual = "Arguments" if param.param_type_name == "argument" else "Options"
+        if record := param.get_help_record(ctx):
+            groups.setdefault(getattr(param, "rich_help_panel", None) or usual, []).append(record)
+    for name, each in getattr(command, "commands", {}).items():
+        says = (each.help or "").partition("\n\n")[0]
+        groups.setdefault(each.rich_help_panel or "Commands", []).append((name, says))
+    for title, rows in groups.items():
+        if rows:
+            with formatter.section(title):
+                formatter.write_dl(rows)
+
+
+class _Command(TyperCommand):
+    format_options = _write_groups
+
+
+class _Group(TyperGroup):
+    format_options = _write_groups
+
+
+class Program(typer.Typer):
+    """Commands whose help is plain text."""
+
+    def __init__(self, **settings: Any) -> None:  # noqa: ANN401 # as Typer's
+        super().__init__(cls=_Group, rich_markup_mode=None, no_args_is_help=True, **settings)
+
+    def command(self, name: str | None = None, **settings: Any) -> Callable[[CommandT], CommandT]:  # noqa: ANN401 # as Typer's
+        """Add a command, as Typer does."""
+        return super().command(name, cls=_Command, **settings)
