@@ -76,6 +76,13 @@ round(coalesce(sum(cost_usd), 0) - coalesce(list_sum([reply.usd FOR reply IN eve
     + coalesce(list_sum([reply.usd FOR reply IN once]), 0), 9) AS cost_usd
 """
 SHOWN = "* EXCLUDE (faults, answers, others, unpriced, of_several)"
+# Only a page of the list draws speeds, which take the longest to read.
+UNDRAWN = SHOWN.replace(")", ", left_mps, right_mps, left_range_mps, right_range_mps)")
+# Requests that failed and were repeated are no fault of a trial.
+CAUSES = """
+SELECT number, list((value, times) ORDER BY value) AS causes FROM several
+WHERE facet = 'cause' AND value NOT LIKE 'attempt: %' GROUP BY number
+"""
 EXPORTED = (
     "trial_id spec_hash source model variant condition projected_headway_m relative_velocity_mps "
     "rep pair ego status merged_first end_time_s error scripted stand_in caution outcome validity "
@@ -107,6 +114,11 @@ def where_of(wanted: Wanted, leave_out: str = "") -> tuple[str, list[Any]]:
             parts.append(f"{name} = ?" if isinstance(value, str) else f"list_contains(?, {name})")
         values.append(value)
     return " AND ".join(parts), values
+
+
+def _order_of(sort: str) -> str:
+    direction = "DESC" if sort.startswith("-") else "ASC"
+    return f"{SORTS[sort.removeprefix('-')]} {direction} NULLS LAST, trial_id, spec_hash"
 
 
 @dataclass(slots=True)
@@ -230,26 +242,29 @@ class Catalogue:
             found: Counted = self._counted[name]
             return found
 
-    def every(self, wanted: Wanted, sort: str = "trial", page: int = 0) -> list[Row]:
-        """All trials of a filter, or those of a page from 1; ``-gap`` sorts the largest gap first.
-
-        What has no value comes last.
-        """
+    def every(self, wanted: Wanted, sort: str = "trial") -> list[Row]:
+        """All trials of a filter; ``-gap`` sorts the largest gap first, what has none last."""
         where, values = where_of(wanted)
-        direction = "DESC" if sort.startswith("-") else "ASC"
-        order = f"{SORTS[sort.removeprefix('-')]} {direction} NULLS LAST, trial_id, spec_hash"
-        limit = f"LIMIT {PAGE} OFFSET {PAGE * (page - 1)}" if page else ""
-        # Only the trials of a page are read with their speeds, which take the longest.
         return self.ask(
-            f"SELECT {SHOWN} FROM listed SEMI JOIN (SELECT number FROM listed WHERE {where} "  # noqa: S608 # constants
-            f"ORDER BY {order} {limit}) USING (number) ORDER BY {order}",
+            f"SELECT {UNDRAWN} FROM listed WHERE {where} ORDER BY {_order_of(sort)}",  # noqa: S608 # constants
             *values,
         )
+
+    def page(self, wanted: Wanted, sort: str, number: int) -> list[Row]:
+        """The trials of a page from 1, with their speeds and the ``causes`` of their errors."""
+        where, values = where_of(wanted)
+        order = _order_of(sort)
+        sql = (
+            f"SELECT {SHOWN} FROM listed SEMI JOIN (SELECT number FROM listed WHERE {where} "  # noqa: S608 # constants
+            f"ORDER BY {order} LIMIT {PAGE} OFFSET {PAGE * (number - 1)}) USING (number) "
+            f"LEFT JOIN ({CAUSES}) USING (number) ORDER BY {order}"
+        )
+        return self._once((sort, number, wanted), lambda: self.ask(sql, *values))
 
     def find(self, trial_id: str, spec_hash: str = "") -> Row | None:
         """One trial; where its name stands for several, the one of that spec, or any."""
         found = self.ask(
-            f"SELECT {SHOWN} FROM listed WHERE trial_id = ? AND spec_hash LIKE ? "  # noqa: S608 # constants
+            f"SELECT {UNDRAWN} FROM listed WHERE trial_id = ? AND spec_hash LIKE ? "  # noqa: S608 # constants
             "ORDER BY spec_hash LIMIT 1",
             *(trial_id, spec_hash or "%"),
         )

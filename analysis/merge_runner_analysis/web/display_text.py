@@ -30,6 +30,8 @@ def with_minus(text: str) -> str:
 
 def visible(text: str) -> str:
     """A text with every character that does not show as its code point: ``[U+202E]``."""
+    if text.isascii() and text.isprintable():  # most texts, in a tenth of the time
+        return text
     return _ODD.sub(lambda odd: odd[0] if _shows(odd[0]) else f"[U+{ord(odd[0]):04X}]", text)
 
 

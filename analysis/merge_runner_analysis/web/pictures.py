@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from math import ceil, floor
 
 from merge_runner.records import SIDES
@@ -60,8 +61,15 @@ def sparkline(row: Row, speeds: tuple[int, int]) -> dict[str, str] | None:
 
 def _spark_points(values: Sequence[float], speeds: tuple[int, int]) -> str:
     low, high = speeds  # of all, so that none lies beyond
-    across, down = SPARK_WIDTH / max(len(values) - 1, 1), SPARK_HEIGHT / (high - low)
-    return " ".join([f"{i * across:.0f},{(high - v) * down:.1f}" for i, v in enumerate(values)])
+    down = SPARK_HEIGHT / (high - low)
+    return _spark_pattern(len(values)) % tuple([(high - value) * down for value in values])
+
+
+@lru_cache(64)
+def _spark_pattern(points: int) -> str:
+    """So many points with their places across, to be filled with those down."""
+    across = SPARK_WIDTH / max(points - 1, 1)
+    return " ".join(f"{i * across:.0f},%.1f" for i in range(points))
 
 
 def step_points(values: Sequence[float], width: float, height: float, steps: int) -> str:

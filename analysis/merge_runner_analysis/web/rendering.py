@@ -6,7 +6,7 @@ import base64
 import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jinja2
 from jinja2.bccache import Bucket
@@ -20,7 +20,21 @@ from merge_runner_analysis.wording import MINUS, number, p_value
 TEMPLATES, STATIC = (Path(__file__).with_name(name) for name in ("templates", "static"))
 STYLE = "style.css"
 # What all templates call, without a word of where it is.
+METHODS = frozenset(dir(dict))
 MACROS = ("scope", "words", "computed", "mark", "conditions", "trust", "notes", "table")
+
+
+class Environment(jinja2.Environment):
+    """Templates that look up ``row.name`` of a dict as its item at once.
+
+    Jinja tries the attribute first, and the exception that follows takes longer than the item.
+    """
+
+    def getattr(self, obj: Any, attribute: str) -> Any:  # noqa: ANN401 # as Jinja's
+        """Return an attribute or, where there is none, an item."""
+        if type(obj) is dict and attribute in obj and attribute not in METHODS:
+            return obj[attribute]
+        return super().getattr(obj, attribute)
 
 
 class Compiled(jinja2.BytecodeCache):
@@ -46,7 +60,7 @@ def environment(
     Without a server, a page says its ``policy`` itself: what it may load. ``inlined`` has, by name,
     the styles and scripts of one that holds them.
     """
-    made = jinja2.Environment(
+    made = Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES),
         autoescape=True,
         auto_reload=False,

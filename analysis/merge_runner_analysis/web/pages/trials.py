@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from merge_runner.prompts.blocks import decomposed
 from merge_runner.study.crossing import OPPONENT
@@ -19,11 +19,6 @@ from merge_runner_analysis.web.site import NotThere, Site, news_of
 from merge_runner_analysis.web.urls import CELL, whole
 
 MOST = 4  # drivers whose sums stand above a list
-# Requests that failed and were repeated are no fault of a trial.
-CAUSES = """
-SELECT number, value, times FROM several
-WHERE facet = 'cause' AND value NOT LIKE 'attempt: %' AND list_contains(?, number) ORDER BY ALL
-"""
 
 
 def trials_page(site: Site, asked: Mapping[str, str]) -> str:
@@ -45,7 +40,7 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
     trials = sum(part["trials"] for part in totals)
     last = max(1, -(-trials // PAGE))
     page = min(whole(asked.get("page", "")) or 1, last)
-    rows = site.catalogue.every(wanted, sort, page)
+    rows = site.catalogue.page(wanted, sort, page)
     return site.render(
         "trials.html",
         here="trials",
@@ -63,7 +58,7 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
         asked=sum(part["asked"] for part in totals),
         invalid=sum(part["invalid"] for part in totals),
         rows=rows,
-        errors=_errors(site, rows),
+        errors={row["number"]: causes_text(row["causes"]) for row in rows if row["causes"]},
         # A study's levels of words are among its factors.
         prompted=len({decomposed(row["variant"])[0] for row in rows if row["variant"]}) > 1,
         focal=any(row["focal"] for row in rows),
@@ -85,14 +80,6 @@ def _factors(row: Row) -> str:
         for level in levels
         if level.partition("=")[0] != OPPONENT and level not in row["model"]
     )
-
-
-def _errors(site: Site, rows: Sequence[Row]) -> dict[int, str]:
-    """Why trials failed, and why replies held no plan: of each trial with an error, in words."""
-    causes: dict[int, list[tuple[str, int]]] = {}
-    for one in site.catalogue.ask(CAUSES, [row["number"] for row in rows]):
-        causes.setdefault(one["number"], []).append((one["value"], one["times"]))
-    return {number: causes_text(of) for number, of in causes.items()}
 
 
 def _unknown(site: Site, chosen: Wanted) -> list[tuple[str, str, list[str]]]:
