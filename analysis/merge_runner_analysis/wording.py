@@ -64,6 +64,7 @@ PLAYED_RULES = {
 # Of levels that nobody reads.
 SAME_TRIALS = "not tested: the same trials at both levels, since no driver reads what differs"
 MISSING, MINUS = "–", "−"
+SAME_TRIALS = "not tested: the same trials at both levels, since no driver reads what differs"
 TIMES = " × "  # between the factors of an interaction
 
 Values = Mapping[str, Any]
