@@ -141,7 +141,12 @@ def serving(argv: Sequence[str], *, half: int | None = None) -> Iterator[str]:
     with tempfile.TemporaryFile() as errors:
         with started_on(half):
             process = subprocess.Popen(
-                argv, cwd=PROJECT, stdout=subprocess.PIPE, stderr=errors, text=True
+                argv,
+                cwd=PROJECT,
+                env=_usual_environment(),
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                text=True,
             )
         with process:
             assert process.stdout is not None

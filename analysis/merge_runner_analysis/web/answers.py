@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import duckdb
 
-from merge_runner.audit.checks import audited_database, check_sweep
 from merge_runner.errors import UsageError
 from merge_runner.results.database import read_database
 from merge_runner.results.store import results_digest
@@ -132,6 +131,8 @@ class Numbers:
 
     def _audit(self) -> str:
         """Return what the audit of each run found and notes, by its id; nothing is replayed."""
+        from merge_runner.audit.checks import audited_database, check_sweep
+
         told = {}
         with audited_database(self.db) as connection:
             for run, ended in connection.execute(RUNS).fetchall():
