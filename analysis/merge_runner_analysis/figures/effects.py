@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from merge_runner.study.crossing import MODEL
-from merge_runner_analysis.figures.style import GREY, LINE_IN, PAGE_IN, Style, style, wrapped
+from merge_runner_analysis.figures.style import (
+    GREY,
+    LINE_IN,
+    PAGE_IN,
+    X_LABELS_IN,
+    Points,
+    Style,
+    place_panels,
+    style,
+    wrapped,
+)
 from merge_runner_analysis.grouping import levels_of
 from merge_runner_analysis.metrics import LEFT_FIRST
 from merge_runner_analysis.stats.effects import Level, level_estimate, levels_by_factor, measured
-from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.study import Study
 
 ACROSS = 3  # panels
 LABEL, LEGEND = 24, 48  # characters of a line
 LINES_IN = 2.2 * LINE_IN  # from one level to the next
+AROUND_IN, BETWEEN_IN = (0.15, 0.05), (0.36, X_LABELS_IN + 0.03)
 MARK = 0.03  # of an axis: the width of a mark
 EVEN = 50.0  # percent: neither driver is favoured
 
@@ -35,14 +46,20 @@ def effects_figure(study: Study) -> Figure:
     looks = {driver: style(number) for number, driver in enumerate(drivers)}
     across, down = min(ACROSS, len(metrics)) or 1, -(-len(metrics) // ACROSS) or 1
     height_in = down * (LINES_IN * len(lines) + 0.6) + LINE_IN * 2 * len(drivers)
-    figure = Figure(figsize=(PAGE_IN, max(height_in, 1.5)), layout="constrained")
-    axes = figure.subplots(down, across, sharey=True, squeeze=False).flatten()
+    figure = Figure(figsize=(PAGE_IN, max(height_in, 1.5)))
+    panels = figure.subplots(down, across, sharey=True, squeeze=False)
+    axes = panels.flatten()
     for axis, metric in zip(axes, metrics, strict=False):
         axis.set_xlabel(metric.heading)
-        for place, levels in enumerate(lines.values()):
-            for driver, level in levels:
-                beside = 0.5 * (drivers.index(driver) + 0.5) / len(drivers) - 0.25
-                _draw(axis, place + beside, level_estimate(study, level, metric), looks[driver])
+        for number, (driver, look) in enumerate(looks.items()):
+            beside = 0.5 * (number + 0.5) / len(drivers) - 0.25
+            found = [
+                (place + beside, level_estimate(study, level, metric))
+                for place, levels in enumerate(lines.values())
+                for name, level in levels
+                if name == driver
+            ]
+            _draw(axis, found, look)
         if metric is LEFT_FIRST:
             axis.axvline(EVEN, color=GREY, ls=":", lw=0.8)
         _limit(axis, 0.0 if metric.rate else metric.least, 100.0 if metric.unit == "%" else None)
@@ -57,7 +74,8 @@ def effects_figure(study: Study) -> Figure:
         for driver, look in looks.items()
     ]
     if handles:
-        figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False)
+        figure.legend(handles=handles, loc="lower center", ncols=2, frameon=False)
+    place_panels(figure, panels, axes[0].get_yticklabels(), AROUND_IN, BETWEEN_IN)
     return figure
 
 
@@ -100,10 +118,13 @@ def _limit(axis: Axes, least: float | None, most: float | None) -> None:
     )
 
 
-def _draw(axis: Axes, place: float, own: Estimate, look: Style) -> None:
-    """A dot with its interval."""
-    if own.value is None:
-        return
-    low, high = own.bounds() or (own.value, own.value)
-    errors = [[own.value - low], [high - own.value]]
-    axis.errorbar([own.value], [place], xerr=errors, elinewidth=0.7, capsize=1.5, mew=0.8, **look)
+def _draw(axis: Axes, points: Points, look: Style) -> None:
+    """Dots with their intervals."""
+    rows = [
+        (place, own.value, *(own.bounds() or (own.value, own.value)))
+        for place, own in points
+        if own.value is not None
+    ]
+    y, x, low, high = np.array(rows, dtype=float).reshape(-1, 4).T
+    errors = np.vstack([x - low, high - x])
+    axis.errorbar(x, y, xerr=errors, elinewidth=0.7, capsize=1.5, mew=0.8, **look | {"ls": ""})

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -23,9 +24,11 @@ from merge_runner_analysis.figures.style import (
     Points,
     Style,
     draw_points,
+    place_panels,
     style,
     wrapped,
 )
+from merge_runner_analysis.frames import KEYS
 from merge_runner_analysis.grouping import Group, of_trials
 from merge_runner_analysis.published import HUMAN, published
 from merge_runner_analysis.stats.estimate import Estimate
@@ -38,6 +41,8 @@ Styles = dict[float, Style]  # of relative velocities in m/s
 LABEL = 21  # characters of a line of a row's name
 # A row is so high, of few rows each higher; and what is above and below all rows.
 ROW_IN, FEW_ROWS_IN, HIGHEST_ROW_IN, AROUND_IN = 0.62, 4.4, 1.1, 0.86
+# The labels of the speeds on the left of panels A, the headings above, and between two panels.
+SPEEDS_IN, HEADINGS_IN, BETWEEN_IN = 0.32, 0.36, (0.34, 0.15)
 # One row a finished trial: the ego's speeds.
 EGO_SPEEDS = """
 SELECT trial_id, spec_hash, list(time_s ORDER BY step) AS time_s,
@@ -71,7 +76,7 @@ def figure2(study: Study, chosen: list[Group]) -> Figure:
     rows = max(len(names), 1)
     lines = max((name.count("\n") + 1 for name in names), default=1)
     row_in = max(ROW_IN, min(HIGHEST_ROW_IN, FEW_ROWS_IN / rows), LINE_IN * lines + 0.2)
-    figure = Figure(figsize=(PAGE_IN, AROUND_IN + rows * row_in), layout="constrained")
+    figure = Figure(figsize=(PAGE_IN, AROUND_IN + rows * row_in))
     axes = figure.subplots(rows, len(HEADINGS), sharex="col", sharey="col", squeeze=False)
     for row, group, name in zip(axes, groups, names, strict=False):
         row[0].set_ylabel(name, rotation=0, ha="right", va="center", multialignment="right")
@@ -100,10 +105,20 @@ def figure2(study: Study, chosen: list[Group]) -> Figure:
         for dashes, label in humans.items()
         if dashes == ":" or not study.human.measured
     ]
-    figure.legend(
-        handles=handles, loc="outside lower center", ncols=min(len(handles), 6), frameon=False
-    )
+    figure.legend(handles=handles, loc="lower center", ncols=min(len(handles), 6), frameon=False)
+    names_of_rows = [row[0].yaxis.label for row in axes]
+    place_panels(figure, axes, names_of_rows, (SPEEDS_IN, HEADINGS_IN), BETWEEN_IN)
+    for panel in axes[0]:
+        _fix_ticks(panel.xaxis, panel.yaxis)
     return figure
+
+
+def _fix_ticks(*axes: Axis) -> None:
+    """Choose the ticks of a column, which all rows share, once and not again in each row."""
+    for axis in axes:
+        low, high = axis.get_view_interval()
+        seen = [tick for tick in axis.get_majorticklocs() if low <= tick <= high]
+        axis.set_ticks(seen, axis.get_major_formatter().format_ticks(seen))
 
 
 def left_first(merged_first: pd.Series) -> Estimate:
@@ -162,11 +177,12 @@ def left_traces(study: Study, group: Group, first: str) -> dict[float, list[Arra
     """
     if not group.measured:
         return {}
+    trials = group.finished[group.finished["merged_first"] == first]
+    velocities = trials.set_index(KEYS)["relative_velocity_mps"].to_dict()
     found: dict[float, list[Array]] = {}
-    for velocity, trials in group.finished.groupby("relative_velocity_mps"):
-        rows = of_trials(study.read(EGO_SPEEDS), trials[trials["merged_first"] == first])
-        traces = zip(rows["time_s"], rows["velocity_mps"], strict=True)
-        found[float(velocity)] = [np.column_stack(trace) for trace in traces]
+    for row in of_trials(study.read(EGO_SPEEDS), trials).itertuples():
+        velocity = float(velocities[row.trial_id, row.spec_hash])
+        found.setdefault(velocity, []).append(np.column_stack([row.time_s, row.velocity_mps]))
     return found
 
 

@@ -72,7 +72,8 @@ OWN = (
 
 def drawn(study, name="figure2"):
     """The panels of Figure 2, by row, and its legend."""
-    figure = MAKERS[name](study)
+    with mpl.rc_context(SETTINGS):
+        figure = MAKERS[name](study)
     rows = [figure.axes[i : i + 5] for i in range(0, len(figure.axes), 5)]
     return rows, figure.legends[0].legend_handles
 
@@ -216,6 +217,6 @@ def test_levels_are_drawn_as_the_table_of_effects_has_them(tmp_path):
     lines = [text.get_text() for text in first.get_yticklabels()]
     assert lines == ["prompt: baseline", "prompt: A1"]
     rows = values_of(study, "factors")
-    drawn_m = {round(float(line.get_xdata()[0]), 6) for line in panels["gap (m)"].lines}
+    drawn_m = {round(float(x), 6) for line in panels["gap (m)"].lines for x in line.get_xdata()}
     assert round(rows["prompt=A1/gap_m"]["value"], 6) in drawn_m
     assert panels["joint (%)"].get_xlim()[1] < 103
