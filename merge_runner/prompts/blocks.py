@@ -140,12 +140,17 @@ class Block:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of both templates, and of where it stands unless that is its place in the paper.
+        """Its ``digest_of``: its meaning is for readers alone."""
+        return digest_of(self.merge, self.straight, self.before)
 
-        Its meaning is for readers alone.
-        """
-        place = "" if self.before is None else f"\0{self.before}"
-        return hashlib.sha256(f"{self.merge}\0{self.straight}{place}".encode()).hexdigest()
+
+def digest_of(merge: str | None, straight: str | None, before: str | None) -> str:
+    """SHA-256 of a block's templates, and of where it stands if that is not its place in the paper.
+
+    They may be any text here.
+    """
+    place = "" if before is None else f"\0{before}"
+    return hashlib.sha256(f"{merge}\0{straight}{place}".encode()).hexdigest()
 
 
 @dataclass(frozen=True, slots=True)

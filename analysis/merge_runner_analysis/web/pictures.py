@@ -74,9 +74,14 @@ def _spark_pattern(points: int) -> str:
 
 def step_points(values: Sequence[float], width: float, height: float, steps: int) -> str:
     """Points of a step line from -1 to 1, ``steps`` across the width."""
-    across = [f"{width * min(i, steps) / steps:.1f}" for i in range(len(values) + 1)]
+    across = _steps_across(len(values), width, steps)
     down = [f"{height - height * (min(max(v, -1), 1) + 1) / 2:.1f}" for v in values]
     return " ".join([f"{across[i]},{y} {across[i + 1]},{y}" for i, y in enumerate(down)])
+
+
+@lru_cache(64)
+def _steps_across(values: int, width: float, steps: int) -> list[str]:
+    return [f"{width * min(i, steps) / steps:.1f}" for i in range(values + 1)]
 
 
 def accelerations(values: Sequence[float], most_mps2: float) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher
@@ -10,7 +11,7 @@ from functools import cache, lru_cache
 from itertools import product
 from typing import Literal
 
-from merge_runner.prompts.blocks import BLOCKS, LAST, Block
+from merge_runner.prompts.blocks import BLOCKS, LAST, digest_of
 from merge_runner.records import Side
 
 Change = Literal["same", "new", "gone"]
@@ -110,7 +111,7 @@ def _own_block(paragraphs: Sequence[str], own: Iterable[tuple[str, str]]) -> tup
         text = "\n\n".join(paragraphs[:length])
         roads = ((text, text), (text, None), (None, text))
         for (merge, straight), place in product(roads, (None, LAST, *names.values())):
-            if name := names.get(Block("", merge, straight, place).digest):
+            if name := names.get(digest_of(merge, straight, place)):
                 return level_of(name), length
     return "", 1
 
@@ -127,14 +128,19 @@ def _begun(template: str) -> list[str]:
     return [paragraph.partition("{")[0] for paragraph in template.split("\n\n")]
 
 
+@lru_cache(KEPT)
+def _words(text: str) -> list[str]:
+    return _WORDS.findall(text)
+
+
 def _compared(before: str, now: str) -> tuple[tuple[Change, str], ...]:
     """The text of a block, word by word, with what is gone from the one before."""
     if before == now:
         return (("same", now),)
-    old, new = _WORDS.findall(before), _WORDS.findall(now)
+    old, new = _words(before), _words(now)
     # Most of a prompt is as before: its beginning need not be searched.
-    pairs = enumerate(zip(old, new, strict=False))
-    begin = next((i for i, (a, b) in pairs if a != b), min(len(old), len(new)))
+    shorter = range(min(len(old), len(new)))
+    begin = bisect_left(shorter, True, key=lambda last: old[: last + 1] != new[: last + 1])
     pieces: list[tuple[Change, str]] = [("same", "".join(new[:begin]))] if begin else []
     old, new = old[begin:], new[begin:]
     for kind, i1, i2, j1, j2 in SequenceMatcher(None, old, new).get_opcodes():
