@@ -480,16 +480,17 @@ def ledger(
 
     Example: merge-runner ledger --cache cache/responses
     """
-    from merge_runner.llm.cache import ResponseCache
+    from merge_runner.llm.cache import ResponseCache, require
     from merge_runner.llm.ledger import APART, Ledger, scopes
     from merge_runner.run.progress import as_table
 
-    with closing(ResponseCache(cache, read_only=True)) as opened:
-        names = scopes(opened.money)
+    require(cache)
+    with closing(ResponseCache(cache, read_only=release is None)) as opened:
+        names = scopes(opened)
         if release is not None:
             if release not in names:
                 raise unknown_name("sweep", release, names, f"with a ledger in {cache}")
-            chosen = Ledger(opened.money, release)
+            chosen = Ledger(opened, release)
             spending = chosen.read()
             agree(
                 f"{spending.reserved_usd:.4f} USD are set aside for {spending.open_attempts} "
@@ -506,7 +507,7 @@ def ledger(
                 )
             chosen.release()
             names = [release]
-        ledgers = [Ledger(opened.money, name) for name in names]
+        ledgers = [Ledger(opened, name) for name in names]
         rows = [
             {"sweep": each.scope, **asdict(each.read()), "reasons": each.reasons()}
             for each in ledgers
@@ -531,8 +532,8 @@ def models(as_json: cli.JsonOption = False) -> None:
     """
     from merge_runner.config import Price, key_status
     from merge_runner.drivers.registry import PROGRAMS
-    from merge_runner.llm.ledger import cost_usd
     from merge_runner.llm.models import load_models, shutdown_notes
+    from merge_runner.llm.prices import cost_usd
     from merge_runner.records import Usage
     from merge_runner.run.progress import as_table
 

@@ -1,9 +1,10 @@
-"""Recorded replies on disk: one text entry per call key, never evicted, never pickled.
+"""Recorded replies on disk, and what they cost: one SQLite file, in which nothing is evicted.
 
 An entry is the JSON of a request and every attempt, the answering one last, behind a checksum.
 It is durable before anyone sees it: each batch of writes is one synchronous SQLite transaction.
 Beside the entries lie the attempts of calls that have no answer yet, the notes of batches, and
-damaged entries in quarantine.
+damaged entries in quarantine. Two tables of our own in the same file hold the money of all sweeps
+(``ledger``), so that a reply and its cost are kept together or not at all.
 
 Anybody may have written the file of a folder, and diskcache unpickles keys and values, opens and
 removes the files that rows name, and applies the settings that it finds. So ``TextDisk`` takes and
@@ -18,7 +19,7 @@ import operator
 import os
 import sqlite3
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -31,24 +32,23 @@ import diskcache
 from diskcache.core import METADATA, MODE_RAW, UNKNOWN
 from pydantic import Field, TypeAdapter, ValidationError
 
-from merge_runner.errors import CacheFailed, RecordingError, UsageError
+from merge_runner.errors import CacheFailed, MergeRunnerError, RecordingError, UsageError
 from merge_runner.llm.durable import (
     BUSY_S,
     BatchWriter,
+    Execute,
     ModelLocks,
     Operation,
-    ResultT,
-    alone,
+    Rows,
     connect,
-    each_or_alone,
     making,
 )
-from merge_runner.llm.ledger import LedgerFile
 from merge_runner.records import DAMAGED, Attempt, ChatRequest, check_body, check_call
 from merge_runner.text_safety import one_line
 
 FILE = "cache.db"
-FORMAT_KEY, FORMAT = "format", "5"
+LEDGER = "ledger.db"  # of format 5, whose money lay in a file of its own
+FORMAT_KEY, FORMAT, BEFORE = "format", "6", "5"
 NEW_CACHE = "`merge-runner recording import FILE --cache NEW` makes one from a recording"
 SETTINGS = diskcache.DEFAULT_SETTINGS | {
     "eviction_policy": "none",
@@ -65,7 +65,23 @@ ATTEMPTS = TypeAdapter(Attempts)
 FAILURES = (OSError, sqlite3.Error, UnicodeDecodeError)
 # Prefixes of keys that are no call keys.
 _UNANSWERED, _DAMAGED = "attempts ", "damaged "
+# ``spent`` has sums, since a sum over all attempts at each reservation would take ever longer.
+TABLES = (
+    """CREATE TABLE spent (
+    scope TEXT, driver TEXT, usd REAL NOT NULL, overrun_usd REAL NOT NULL,
+    most_overrun REAL NOT NULL, PRIMARY KEY (scope, driver)) STRICT""",
+    """CREATE TABLE open (
+    scope TEXT, call TEXT, attempt INTEGER, usd REAL NOT NULL, driver TEXT, slot TEXT,
+    worst_usd REAL, since TEXT, outcome TEXT) STRICT""",
+    "CREATE INDEX open_call ON open (call)",
+)
+UNSEEN = "the run ended before a reply was seen; it may have been charged"
 _GET = "SELECT mode, filename, value FROM Cache WHERE key = ? AND raw = 1"
+# The rows of a call, and of its attempts whose end nobody has seen.
+_LOOK_UP = """
+SELECT key, mode, filename, value FROM Cache WHERE raw = 1 AND key IN (?1, ?2)
+UNION ALL SELECT NULL, attempt, NULL, since FROM open WHERE call = ?1 AND outcome = 'in flight'
+"""
 _KEYS = """
 SELECT CAST(key AS BLOB) FROM Cache WHERE typeof(key) = 'text' AND key >= ? AND key < ? ORDER BY key
 """
@@ -115,10 +131,11 @@ def open_texts(folder: Path) -> diskcache.Cache:
     return diskcache.Cache(str(folder), timeout=BUSY_S, disk=TextDisk, **SETTINGS)
 
 
-def refuse_others(folder: Path) -> None:
-    """Raise UsageError for settings that we do not write, and for the file of another version.
+def refuse_others(folder: Path) -> bytes:
+    """Return the format of a folder's file, as it is written there.
 
-    diskcache would obey such settings; the first version left no mark.
+    Raises UsageError for settings that we do not write, since diskcache would obey them, and for
+    the file of another version; the first one left no mark.
     """
     sql = "SELECT CAST(value AS BLOB) FROM Cache WHERE key = ? AND raw = 1"
     with contextlib.closing(connect(folder / FILE)) as connection:
@@ -128,12 +145,14 @@ def refuse_others(folder: Path) -> None:
         if key not in METADATA and (key not in SETTINGS or value != SETTINGS[key]):
             name = one_line(repr(key))[:40]
             raise UsageError(f"{folder / FILE} has the setting {name} of another program")
+    mark = bytes(mark or b"")
     # Where the mark is damaged, each entry is checked all the same.
-    if mark is not None and mark.isascii() and mark != FORMAT.encode():
+    if mark and mark.isascii() and mark not in (FORMAT.encode(), BEFORE.encode()):
         raise UsageError(
             f"the cache {folder} has format {one_line(mark.decode()[:9])}, and this merge-runner "
             f"has format {FORMAT}: {NEW_CACHE}"
         )
+    return mark
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +190,8 @@ _STORED: TypeAdapter[_Stored] = TypeAdapter(_Stored)
 class ResponseCache:
     """The cache folder. Reads are direct; writes are batched in a thread and awaited.
 
-    ``locks`` keep other live runs from asking the same model; ``money`` is the ledger's file.
+    ``locks`` keep other live runs from asking the same model. ``write`` runs an operation in the
+    next durable batch, and returns its future result.
     """
 
     def __init__(
@@ -180,26 +200,33 @@ class ResponseCache:
         *,
         overlay: Callable[[], AbstractContextManager[Mapping[str, CachedCall]]] | None = None,
         read_only: bool = False,
+        before: bool = False,
     ) -> None:
         """Open or make the folder; ``overlay`` opens a recording, entries by key.
 
         What the recording holds comes before what the folder holds; both are closed together.
-        ``read_only`` changes nothing in the folder, which must be there. Raises UsageError for a
-        folder that cannot be used.
+        ``read_only`` changes nothing in the folder, which must be there, and may be of the format
+        ``before``; else it is brought to this one. Raises UsageError for a folder that cannot be
+        used.
         """
         self.folder = folder
         self.locks = ModelLocks(folder)
-        self.money = LedgerFile(folder)
         self.has_recording = overlay is not None
         self._open_overlay, self._with_overlay = overlay, contextlib.ExitStack()
         self._disk = TextDisk(str(folder))
-        self._writer = BatchWriter(self._run_each)
-        if read_only and not (folder / FILE).exists():
-            raise UsageError(f"there is no cache in {folder}: name one with --cache")
+        self.write = BatchWriter(self._run_each).write
+        if read_only:
+            require(folder)
         try:
             if not read_only:
                 _make(folder)
-            refuse_others(folder)
+            if refuse_others(folder) == BEFORE.encode() and not before:
+                if read_only:
+                    raise UsageError(
+                        f"the cache {folder} has format {BEFORE}: a sweep or a replay with it "
+                        f"brings it to format {FORMAT}"
+                    )
+                _upgrade(folder)
             self._opened = self._file
             self._one_query = Lock()
             with contextlib.ExitStack() as unless_opened:
@@ -222,23 +249,42 @@ class ResponseCache:
         """Whether the recording holds an entry of a call key."""
         return key in self._overlay
 
-    async def put(self, entry: CachedCall) -> CachedCall:
-        """Keep an entry durably; returns what is kept, another one where an import was first."""
-        return await self.write(partial(self._keep, entry))
+    def look_up(self, key: str) -> tuple[CachedCall | None, Attempts]:
+        """Return the entry of a call, or the attempts of earlier runs, also unknown ones.
+
+        Raises RecordingError where it is damaged or made up.
+        """
+        if recorded := self._overlay.get(key):
+            return recorded, ()
+        rows = self.rows(_LOOK_UP, key, _UNANSWERED + key)
+        texts = {name: row for name, *row in rows if name is not None}
+        if key in texts:
+            return _verified(key, self._text(*texts[key])), ()
+        tried = _attempts(self._text(*texts[_UNANSWERED + key])) if texts else ()
+        begun = sorted(row for row in rows if row[0] is None and row[1] > len(tried))
+        unseen = (
+            Attempt(number, "unknown", started_at=since, error=UNSEEN)
+            for number, (*_, since) in enumerate(begun, len(tried) + 1)
+        )
+        return None, (*tried, *unseen)
 
     def put_now(
-        self, entries: Iterable[CachedCall], tried: Iterable[tuple[str, Attempts]] = ()
+        self,
+        entries: Iterable[CachedCall],
+        tried: Iterable[tuple[str, Attempts]] = (),
+        money: Iterable[Operation] = (),
     ) -> list[CachedCall]:
         """Keep entries, and attempts at calls without an answer, in one transaction in this thread.
 
-        Returns the entries that are kept.
+        What they cost is settled in it by the operations ``money``. Returns the entries that are
+        kept.
         """
         entries = list(entries)
         for entry in entries:
             self.set_damage_aside(entry.request.key)
-        kept = [partial(self._keep, entry) for entry in entries]
-        others = [partial(self._keep_tried, *each) for each in tried]
-        return self.run_now([*kept, *others])[: len(kept)]
+        kept = [partial(self.keep, entry) for entry in entries]
+        others = [partial(self.keep_attempts, *each) for each in tried]
+        return self.run_now([*kept, *others, *money])[: len(kept)]
 
     def add_missing(self, entries: Iterable[CachedCall]) -> tuple[int, int]:
         """Keep the entries that the cache lacks; returns (added, already there)."""
@@ -261,60 +307,50 @@ class ResponseCache:
             await self.write(partial(self._move_aside, damaged))
         return damaged
 
-    def unanswered(self, key: str) -> Attempts:
-        """Return the attempts of earlier runs at a call without an answer, also unknown ones."""
-        tried = self._tried(key)
-        return (*tried, *self.money.begun(key, len(tried)))
-
-    def all_attempts(self, key: str) -> Attempts:
-        """Return the attempts at a call: those of its entry, or of one without an answer."""
-        entry = self.get(key)
-        return entry.attempts if entry else self.unanswered(key)
-
-    async def put_unanswered(self, key: str, attempts: Attempts) -> None:
-        """Keep the attempts at a call that has no answer yet, durably."""
-        await self.write(partial(self._keep_tried, key, attempts))
-
     def all_unanswered(self) -> dict[str, Attempts]:
         """Return the attempts at all calls without an answer, by call key."""
         keys = (name.removeprefix(_UNANSWERED) for name in self.names(_UNANSWERED))
         return {key: self._tried(key) for key in keys}
 
-    async def write(self, operation: Callable[[], ResultT]) -> ResultT:
-        """Run an operation on this cache in the next durable batch; raises CacheFailed."""
-        return await self._writer.write(operation)
-
-    def run_now(self, operations: list[Operation]) -> list[Any]:
+    def run_now(self, operations: Sequence[Operation]) -> list[Any]:
         """Run operations in one durable transaction, in this thread."""
-        with self._told("written"), self._texts.transact():
-            results = [operation() for operation in operations]
-            if self._file != self._opened:
-                raise FileNotFoundError("it is no longer there")
-        return results
+        try:
+            with self._texts.transact():
+                execute = self._texts._sql
+                results = [operation(execute) for operation in operations]
+                if self._file != self._opened:
+                    raise FileNotFoundError("it is no longer there")
+                return results
+        except (diskcache.Timeout, *FAILURES) as exc:
+            # On a full disk SQLite rolls back itself, and diskcache's own attempt hides the reason.
+            hidden = exc.__context__ if isinstance(exc, sqlite3.Error) else None
+            raise self._failure("written", hidden or exc) from exc
 
-    def _run_each(self, operations: list[Operation]) -> list[Any]:
+    def _run_each(self, operations: Sequence[Operation]) -> list[Any]:
         """Run operations in one durable transaction, each with its result or its own error."""
-        told = self._told("written")
-        # Of this thread, in which the transaction is.
-        execute = self._texts._sql
-        return each_or_alone(self.run_now, lambda each: alone(execute, told(each)), operations)
+        try:
+            return self.run_now(operations)
+        except CacheFailed:
+            raise
+        except (MergeRunnerError, *DAMAGED):
+            return self.run_now([partial(_alone, operation) for operation in operations])
 
     def read(self, name: str) -> str | None:
         """Return the text under a name, or None; raises RecordingError where it is damaged."""
-        rows = self._rows(_GET, name)
-        return _checked(self._disk.fetch(*rows[0])) if rows else None
+        rows = self.rows(_GET, name)
+        return self._text(*rows[0]) if rows else None
 
-    def replace(self, name: str, text: str) -> None:
+    def replace(self, name: str, text: str, _: Execute) -> None:
         """Keep a text under a name that is no call key, behind a checksum; an operation."""
         self._texts.set(name, _behind_checksum(text))
 
-    def remove(self, name: str) -> None:
+    def remove(self, name: str, _: Execute) -> None:
         """Forget the text under a name that is no call key; an operation."""
         self._texts.delete(name)
 
     def names(self, prefix: str) -> list[str]:
         """Return the names, none of a call, that begin with a prefix."""
-        rows = self._rows(_KEYS, prefix, prefix + chr(0x10FFFF))
+        rows = self.rows(_KEYS, prefix, prefix + chr(0x10FFFF))
         return [name.decode(errors="replace") for (name,) in rows]
 
     def entries(self, left_out: list[str] | None = None) -> Iterator[CachedCall]:
@@ -322,17 +358,19 @@ class ResponseCache:
 
         What is damaged, or none of ours, is left out, and the reason added to ``left_out``.
         """
-        with self._told("read"):
+        try:
             for row in self._reading.execute(_CALLS):
                 try:
-                    ((key, raw, *value),) = self._rows(_CALL, *row)
-                    key, text = self._disk.get(key, raw), self._disk.fetch(*value)
-                    entry = _verified(key, _checked(text))
+                    ((key, raw, *value),) = self.rows(_CALL, *row)
+                    key, text = self._disk.get(key, raw), self._text(*value)
+                    entry = _verified(key, text)
                     check_body(entry.request.body)
                     yield entry
                 except (RecordingError, *DAMAGED) as exc:
                     if left_out is not None:
                         left_out.append(str(exc))
+        except FAILURES as exc:
+            raise self._failure("read", exc) from exc
         yield from self._overlay.values()
 
     def recorded(self, name: str, **fields: str) -> set[str]:
@@ -354,12 +392,11 @@ class ResponseCache:
         """Close the folder and the recording before it, and free its locks."""
         self._with_overlay.close()
         self.locks.close()
-        self.money.close()
         self._reading.close()  # first, since the last one to write ends the journal
         if self._texts is not None:
             self._texts.close()
 
-    def _keep(self, entry: CachedCall) -> CachedCall:
+    def keep(self, entry: CachedCall, execute: Execute) -> CachedCall:
         """Keep an entry unless there is one, and return what is kept; an operation.
 
         One that is damaged goes to quarantine.
@@ -369,10 +406,14 @@ class ResponseCache:
             try:
                 return self._kept(key) or entry
             except RecordingError:
-                self._move_aside([key])
+                self._move_aside([key], execute)
                 self._texts.add(key, text)
         self._texts.delete(_UNANSWERED + key)
         return entry
+
+    def keep_attempts(self, key: str, attempts: Attempts, execute: Execute) -> None:
+        """Keep the attempts at a call that has no answer yet; an operation."""
+        self.replace(_UNANSWERED + key, ATTEMPTS.dump_json(attempts).decode(), execute)
 
     def _damaged(self, key: str) -> list[str]:
         damaged = []
@@ -383,46 +424,43 @@ class ResponseCache:
                 damaged.append(name)
         return damaged
 
-    def _move_aside(self, names: list[str]) -> None:
+    def _move_aside(self, names: list[str], execute: Execute) -> None:
         """Rename rows, whatever they hold; an operation."""
         for name in names:
             aside = _DAMAGED + name
             aside += f" {len(before) + 1}" if (before := self.names(aside)) else ""
-            sql = "UPDATE Cache SET key = ? WHERE key = ? AND raw = 1"
-            self._texts._sql(sql, [aside, name])
-
-    def _keep_tried(self, key: str, attempts: Attempts) -> None:
-        self.replace(_UNANSWERED + key, ATTEMPTS.dump_json(attempts).decode())
+            execute("UPDATE Cache SET key = ? WHERE key = ? AND raw = 1", [aside, name])
 
     def _kept(self, key: str) -> CachedCall | None:
         text = self.read(key)
         return None if text is None else _verified(key, text)
 
     def _tried(self, key: str) -> Attempts:
-        try:
-            return ATTEMPTS.validate_json(self.read(_UNANSWERED + key) or "[]")
-        except ValidationError as exc:
-            raise RecordingError("the list of earlier attempts is damaged") from exc
+        return _attempts(self.read(_UNANSWERED + key) or "[]")
 
-    def _rows(self, sql: str, *values: object) -> list[tuple[Any, ...]]:
-        with self._told("read"), self._one_query:
-            return self._reading.execute(sql, values).fetchall()
+    def _text(self, mode: object, filename: object, value: object) -> str:
+        """Return the text of a row; raises RecordingError where it is damaged."""
+        return _checked(self._disk.fetch(mode, filename, value))
 
-    @contextlib.contextmanager
-    def _told(self, done: str) -> Iterator[None]:
-        """Raise CacheFailed where the folder cannot be used, RecordingError for what is no text."""
+    def rows(self, sql: str, *values: object) -> Rows:
+        """Return the rows of a query; raises CacheFailed, or RecordingError for what is no text."""
         try:
-            yield
-        except (diskcache.Timeout, *FAILURES) as exc:
-            if "utf-8" in str(exc).lower():  # SQLite says no more of it
-                raise RecordingError("the recorded reply is damaged: it is no text") from exc
-            why = f"cannot be {done}: {str(exc) or 'another program writes'}"
-            if self._file != self._opened:
-                why = "was removed, moved or replaced while it was in use"
-            raise CacheFailed(
-                f"the cache {self.folder} {why}. When that is mended, or a copy of it put back, "
-                "run the same command again: what is in no cache is asked again"
-            ) from exc
+            with self._one_query:
+                return self._reading.execute(sql, values).fetchall()
+        except FAILURES as exc:
+            raise self._failure("read", exc) from exc
+
+    def _failure(self, done: str, why: BaseException) -> CacheFailed | RecordingError:
+        """Return the error of a folder that cannot be used, or of what is no text."""
+        if "utf-8" in str(why).lower():  # SQLite says no more of it
+            return RecordingError("the recorded reply is damaged: it is no text")
+        told = f"cannot be {done}: {str(why) or 'another program writes'}"
+        if self._file != self._opened:
+            told = "was removed, moved or replaced while it was in use"
+        return CacheFailed(
+            f"the cache {self.folder} {told}. When that is mended, or a copy of it put back, "
+            "run the same command again: what is in no cache is asked again"
+        )
 
     @property
     def _file(self) -> tuple[int, int] | None:
@@ -439,7 +477,7 @@ def import_folder(folder: Path, cache: ResponseCache) -> tuple[int, int]:
     The folder is only read. Raises RecordingError, when all others are added, if any was damaged.
     """
     left_out: list[str] = []
-    with closing(ResponseCache(folder, read_only=True)) as source:
+    with closing(ResponseCache(folder, read_only=True, before=True)) as source:
         added, there = cache.add_missing(source.entries(left_out))
     if left_out:
         raise RecordingError(
@@ -457,9 +495,63 @@ def _make(folder: Path) -> None:
         return
     with making(folder), tempfile.TemporaryDirectory(prefix="new-", dir=folder) as new:
         if not (folder / FILE).exists():
-            with closing(open_texts(Path(new))) as made:
+            with closing(open_texts(Path(new))) as made, made.transact():
                 made.set(FORMAT_KEY, FORMAT)
+                for statement in TABLES:
+                    made._sql(statement)
             os.replace(Path(new) / FILE, folder / FILE)
+
+
+def _upgrade(folder: Path) -> None:
+    """Bring a folder of the format before to this one, with the money of its ledger."""
+    locks = ModelLocks(folder)
+    with making(folder), closing(connect(folder / FILE, "rw")) as database, closing(locks):
+        if refuse_others(folder) == FORMAT.encode():
+            return
+        if not locks.take_all():
+            raise UsageError(f"an older merge-runner works with {folder}: wait until it has ended")
+        has_ledger = (folder / LEDGER).is_file() and (folder / LEDGER).stat().st_size > 0
+        if has_ledger:
+            database.execute("ATTACH ? AS before", [str(folder / LEDGER)])
+        with database:
+            database.execute("BEGIN IMMEDIATE")
+            for statement in TABLES:
+                database.execute(statement)
+            for table in ("spent", "open") if has_ledger else ():
+                database.execute(f"INSERT INTO main.{table} SELECT * FROM before.{table}")  # noqa: S608
+            sql = "UPDATE Cache SET value = ? WHERE key = ? AND raw = 1"
+            database.execute(sql, [FORMAT, FORMAT_KEY])
+
+
+def require(folder: Path) -> None:
+    """Raise UsageError unless there is a cache in a folder."""
+    if not (folder / FILE).exists():
+        raise UsageError(f"there is no cache in {folder}: name one with --cache")
+
+
+def _alone(operation: Operation, execute: Execute) -> object:
+    """Run an operation in a savepoint of a transaction; an error of its own is returned.
+
+    It is undone then, and the others of the transaction go on. Raises what is wrong with the disk.
+    """
+    execute("SAVEPOINT operation")
+    result: object
+    try:
+        result = operation(execute)
+    except CacheFailed:
+        raise
+    except (MergeRunnerError, *DAMAGED) as exc:
+        execute("ROLLBACK TO operation")
+        result = exc
+    execute("RELEASE operation")
+    return result
+
+
+def _attempts(text: str) -> Attempts:
+    try:
+        return ATTEMPTS.validate_json(text)
+    except ValidationError as exc:
+        raise RecordingError("the list of earlier attempts is damaged") from exc
 
 
 def _verified(key: str, text: str) -> CachedCall:

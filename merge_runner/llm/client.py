@@ -24,6 +24,7 @@ from merge_runner.errors import (
     RecordingError,
     SweepStopped,
 )
+from merge_runner.llm.budget import Budget, PaidAttempt
 from merge_runner.llm.cache import Attempts, CachedCall, ResponseCache
 from merge_runner.llm.formats import FORMATS, WireFormat, as_text, read_reply
 from merge_runner.llm.http_outcome import (
@@ -40,16 +41,9 @@ from merge_runner.llm.http_outcome import (
     utc_after,
     why_refused,
 )
-from merge_runner.llm.ledger import (
-    TOLERANCE_USD,
-    Asked,
-    Budget,
-    Ledger,
-    PaidAttempt,
-    cost_usd,
-    is_underpriced,
-)
+from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger
 from merge_runner.llm.limiter import Limiter
+from merge_runner.llm.prices import cost_usd, is_underpriced
 from merge_runner.records import (
     ANSWERS,
     SCRIPTED_HEADER,
@@ -222,7 +216,7 @@ class LlmClient:
         self._wire = FORMATS[self.entry.format]
         self._own_names = frozenset({None, self.entry.id, *self.entry.aliases})
         # Without a name a ledger keeps nothing.
-        self.money = self.budget or Budget(Ledger(self.cache.money, ""))
+        self.money = self.budget or Budget(Ledger(self.cache, ""))
 
     @property
     def sealed(self) -> bool:
@@ -235,13 +229,14 @@ class LlmClient:
         Raises CallFailed, TrialSuspended or SweepStopped.
         """
         request = self._request(prompt, slot)
-        reply, damaged = None, False
+        reply, attempts = None, None
         try:
-            reply = self._known(request)
+            recorded, attempts = self.cache.look_up(request.key)
+            if recorded:
+                reply = self._read(recorded, len(recorded.attempts))
         except RecordingError as exc:
             if self.sealed:
                 raise CallFailed(f"{self.name}: call {request.key}: {exc}", request) from exc
-            damaged = True
         if reply is None and self.sealed:
             raise ReplayMiss("no recorded reply", request)
         if reply is None:
@@ -249,7 +244,7 @@ class LlmClient:
             call = self.under_way.get(request.key)
             shared = call is not None and not call.task.cancelling()
             if call is None or not shared:
-                call = self._start(request, order, damaged=damaged)
+                call = self._start(request, order, attempts)
             call.asking += 1
             try:
                 # Shielded: the call may be paid for already when its trial is cancelled.
@@ -339,11 +334,6 @@ class LlmClient:
         finally:
             call.wait = None
 
-    def _known(self, request: ChatRequest) -> ChatReply | None:
-        """Return the recorded reply; raises RecordingError for a damaged one."""
-        recorded = self.cache.get(request.key)
-        return self._read(recorded, len(recorded.attempts)) if recorded else None
-
     def _count(self, reply: ChatReply) -> None:
         """Count an answer that a trial uses, and who gave it where it is another model."""
         last, meter = reply.attempts[-1], self.meter
@@ -368,7 +358,7 @@ class LlmClient:
             attempts = (*attempts[:-1], last)
         return ChatReply(reading.text, last.outcome, recorded.request, attempts, earlier)
 
-    def _start(self, request: ChatRequest, order: int, *, damaged: bool) -> Call:
+    def _start(self, request: ChatRequest, order: int, earlier: Attempts | None) -> Call:
         # An upper bound: no tokeniser makes more tokens than bytes.
         worst = Usage(
             input_tokens=len(request.body.encode()), output_tokens=self.entry.max_output_tokens
@@ -376,7 +366,9 @@ class LlmClient:
         tier = as_text(self.entry.parameters.get("service_tier"))
         dearest_usd = max(cost_usd(self.entry, worst, each) or 0.0 for each in {None, tier})
         asked = Asked(self.driver, str(request.slot), dearest_usd)
-        call = Call(request, order, asked, worst, self.entry.deadline_s, damaged)
+        call = Call(request, order, asked, worst, self.entry.deadline_s)
+        call.attempts, call.earlier = [*(earlier or ())], len(earlier or ())
+        call.damaged = earlier is None
         call.task = asyncio.create_task(self._call(call))
         self.under_way[request.key] = call
 
@@ -409,7 +401,12 @@ class LlmClient:
                 loop = asyncio.get_running_loop()
                 telling = loop.call_later(LONG_WAIT_S, self._tell_first_wait, call)
         try:
-            await self._resume(call)
+            if call.damaged:
+                await self._quarantine(call)
+            if call.open:  # the attempt that has begun in a batch is the one that goes on
+                end = call.open.note.lines[call.request.key]
+                call.attempts = [each for each in call.attempts if each.number < end]
+                call.earlier = len(call.attempts)
             return await self._attempts(call)
         except SweepStopped:
             alone = False  # the next call would only be refused in the same way
@@ -429,24 +426,17 @@ class LlmClient:
             f"until {datetime.now(UTC) + left:%H:%M:%S} UTC, {last}"
         )
 
-    async def _resume(self, call: Call) -> None:
-        """Give a call the attempts of earlier runs; what is damaged goes to quarantine."""
+    async def _quarantine(self, call: Call) -> None:
+        """Move what is damaged of a call to quarantine, and take what is left of its attempts."""
         key = call.request.key
-        attempts: Attempts = ()
-        try:
-            attempts = self.cache.unanswered(key)
-        except RecordingError:
-            call.damaged = True
-        for name in await self.cache.quarantine(key) if call.damaged else ():
+        for name in await self.cache.quarantine(key):
             self.meter.damaged.append(name)
             self.meter.notes.append(
                 f"{self.driver}: {call.asked.slot}: what is recorded is damaged; it is set aside "
                 f"in the cache as 'damaged {name}', and asked again"
             )
-        # The attempt that has begun in a batch is the one that goes on.
-        end = call.open.note.lines[key] if call.open else math.inf
-        call.attempts = [each for each in attempts if each.number < end]
-        call.earlier = len(call.attempts)
+        _, earlier = self.cache.look_up(key)
+        call.attempts, call.earlier = [*earlier], len(earlier)
 
     async def _attempts(self, call: Call) -> ChatReply:
         """Make attempts until one brings an answer, which is kept together with all of them."""
@@ -587,8 +577,7 @@ class LlmClient:
         if error is None:
             attempts = tuple(call.attempts)
             answered = CachedCall(call.request, attempts)
-            kept = await self.cache.put(answered)
-            await paid.settle(record)
+            kept = await paid.settle(record, partial(self.cache.keep, answered))
             self._answered.add(call.request.key)
             if kept is not answered:  # an import was first
                 return self._read(kept, call.earlier)
@@ -597,8 +586,8 @@ class LlmClient:
         if outcome.pause:
             self.limiter.pause(outcome.delay_s or backoff_s(len(call.own_attempts)))
         # Before the error, which may end the whole run.
-        await self.cache.put_unanswered(call.request.key, tuple(call.attempts))
-        await paid.settle(record)
+        attempts = tuple(call.attempts)
+        await paid.settle(record, partial(self.cache.keep_attempts, call.request.key, attempts))
         raise error
 
     def _error(self, call: Call, outcome: AttemptOutcome) -> MergeRunnerError | None:

@@ -15,18 +15,19 @@ import os
 import re
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from merge_runner.errors import CacheFailed, MergeRunnerError, UsageError
-from merge_runner.records import DAMAGED
+from merge_runner.errors import UsageError
 
 BUSY_S = 600.0  # another process may be writing long replies to a slow disk
 # Live runs share it, and who releases what is set aside holds it alone.
 LIVE = "live.lock"
 ResultT = TypeVar("ResultT")
-Operation = Callable[[], Any]
+Rows = list[tuple[Any, ...]]
+# Executes a statement in the transaction of an operation.
+Execute = Callable[..., sqlite3.Cursor]
+Operation = Callable[[Execute], Any]
 
 
 @contextlib.contextmanager
@@ -52,38 +53,6 @@ def connect(file: Path, mode: str = "ro") -> sqlite3.Connection:
     )
 
 
-def alone(execute: Callable[[str], object], operation: Operation) -> object:
-    """Run an operation in a savepoint of a transaction; an error of its own is returned.
-
-    It is undone then, and the others of the transaction go on. Raises what is wrong with the disk.
-    """
-    execute("SAVEPOINT operation")
-    result: object
-    try:
-        result = operation()
-    except CacheFailed:
-        raise
-    except (MergeRunnerError, *DAMAGED) as exc:
-        execute("ROLLBACK TO operation")
-        result = exc
-    execute("RELEASE operation")
-    return result
-
-
-def each_or_alone(
-    run_now: Callable[[list[Operation]], list[Any]],
-    alone: Callable[[Operation], object],
-    operations: list[Operation],
-) -> list[Any]:
-    """Run operations in one transaction; where one fails all are run again, each alone in it."""
-    try:
-        return run_now(operations)
-    except CacheFailed:
-        raise
-    except (MergeRunnerError, *DAMAGED):
-        return run_now([partial(alone, each) for each in operations])
-
-
 class BatchWriter:
     """Hands operations to ``run`` in batches, in a thread, one batch at a time.
 
@@ -92,29 +61,34 @@ class BatchWriter:
 
     def __init__(self, run: Callable[[list[Operation]], list[Any]]) -> None:
         self._run = run
-        self._pending: list[Operation] = []
-        self._next_batch: asyncio.Task[list[Any]] | None = None
-        self._one_batch_at_a_time = asyncio.Lock()
+        self._waiting: list[tuple[Operation, asyncio.Future[Any]]] = []
+        self._writing: asyncio.Task[None] | None = None
 
-    async def write(self, operation: Callable[[], ResultT]) -> ResultT:
-        """Run an operation in the next batch; returns its result once the batch is durable."""
-        # Whoever comes first begins a batch; all who come until its writing begins join it.
-        if self._next_batch is None:
-            self._next_batch = asyncio.create_task(self._write_batch())
-        batch, place = self._next_batch, len(self._pending)
-        self._pending.append(operation)
-        # Shielded: if one gives up waiting, the writes of the others go on.
-        result: ResultT | Exception = (await asyncio.shield(batch))[place]
-        if isinstance(result, Exception):
-            raise result
-        return result
+    def write(self, operation: Callable[[Execute], ResultT]) -> asyncio.Future[ResultT]:
+        """Return the future result of an operation, there once its batch is durable."""
+        future = asyncio.get_running_loop().create_future()
+        self._waiting.append((operation, future))
+        if self._writing is None or self._writing.done():
+            self._writing = asyncio.create_task(self._write_all())
+        return future
 
-    async def _write_batch(self) -> list[Any]:
-        """Write all that has gathered while the previous batch was written."""
-        async with self._one_batch_at_a_time:
-            operations, self._pending, self._next_batch = self._pending, [], None
+    async def _write_all(self) -> None:
+        """Write in each batch all that has gathered while the previous one was written."""
+        while self._waiting:
+            batch, self._waiting = self._waiting, []
             # In a thread, since the event loop must not wait for a disk.
-            return await asyncio.to_thread(self._run, operations)
+            run = asyncio.to_thread(self._run, [operation for operation, _ in batch])
+            running = asyncio.ensure_future(run)
+            await asyncio.wait([running])
+            failed = running.exception()
+            for place, (_, future) in enumerate(batch):
+                if future.cancelled():  # whoever gave up waiting disturbs no other
+                    continue
+                result = failed or running.result()[place]
+                if isinstance(result, BaseException):
+                    future.set_exception(result)
+                else:
+                    future.set_result(result)
 
 
 class ModelLocks:

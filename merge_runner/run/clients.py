@@ -8,15 +8,17 @@ from contextlib import AsyncExitStack
 from resource import RLIM_INFINITY, RLIMIT_NOFILE, getrlimit, setrlimit
 from typing import TYPE_CHECKING
 
-from merge_runner.config import driver_name, resolve_endpoint
+from merge_runner.config import resolve_endpoint
 from merge_runner.errors import UsageError
 from merge_runner.llm.batch.providers import SERVICES, batch_terms
 from merge_runner.llm.batch.rounds import Rounds
+from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import Call, LlmClient
-from merge_runner.llm.ledger import Budget, Ledger, cost_usd
+from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.llm.models import load_models
+from merge_runner.llm.prices import cost_usd
 from merge_runner.records import Usage
 from merge_runner.run.estimate import trial_costs
 from merge_runner.run.plan import Options, Plan
@@ -48,7 +50,7 @@ def live_clients(
     registered model go on from earlier clients, and get those that are made. Raises UsageError
     where a key is missing, or a cap could not be enforced.
     """
-    _check_money(plan, options, ledger, cache)
+    _check_money(plan, options, ledger)
     _allow_files(options.connections + SPARE_FILES)
     connect = _connections(plan, options, {**os.environ, **(urls or {})}, rounds)
     limiters = {} if limiters is None else limiters
@@ -119,11 +121,8 @@ def _connections(
     return connect
 
 
-def _check_money(plan: Plan, options: Options, ledger: Ledger, cache: ResponseCache) -> None:
-    """Settle what a killed run has kept.
-
-    Raises UsageError where a price is unknown under a cap, or what is spent is damaged.
-    """
+def _check_money(plan: Plan, options: Options, ledger: Ledger) -> None:
+    """Raise UsageError where a price is unknown under a cap, or what is spent is damaged."""
     for name, entry in plan.entries.items():
         unknown = cost_usd(entry, Usage(input_tokens=1, output_tokens=1)) is None
         if options.max_cost_usd is not None and unknown:
@@ -132,8 +131,6 @@ def _check_money(plan: Plan, options: Options, ledger: Ledger, cache: ResponseCa
                 "experiments/models.toml"
             )
     if not plan.is_free:
-        drivers = {driver_name(name, plan.endpoints[name]) for name in plan.entries}
-        ledger.settle_kept(drivers, cache.all_attempts)
         ledger.read()
 
 

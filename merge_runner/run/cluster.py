@@ -42,7 +42,8 @@ from merge_runner.errors import (
 )
 from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.client import Meter, Wait
-from merge_runner.llm.ledger import Asked, Ledger, LedgerFile, Rows
+from merge_runner.llm.durable import Rows
+from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.llm.limiter import Limiter
 from merge_runner.records import Attempt, TrialRecord, TrialSpec, Usage
 from merge_runner.registry import plugin_sources, using
@@ -265,8 +266,8 @@ class Desk:
 class ToldLedger(Ledger):
     """A worker's ledger, whose attempts the coordinator reserves before they begin."""
 
-    def __init__(self, money: LedgerFile, scope: str, desk: Desk) -> None:
-        super().__init__(money, scope)
+    def __init__(self, store: ResponseCache, scope: str, desk: Desk) -> None:
+        super().__init__(store, scope)
         self._desk = desk
         self._numbers: dict[str, int] = {}  # by key of a call, which has one attempt at a time
 
@@ -277,17 +278,11 @@ class ToldLedger(Ledger):
             self._numbers[key] = number
         return is_paid
 
-    def withdraw(self, key: str) -> None:
-        """Tell that an attempt that may be reserved is not sent."""
-        if (number := self._numbers.pop(key, None)) is not None:
-            self._desk.cost(number, 0.0)
-
-    async def settle(self, key: str, attempt: Attempt, driver: str) -> None:
-        """Settle an attempt, and tell what it has cost where that is known."""
-        await super().settle(key, attempt, driver)
-        told = self._numbers.pop(key, None)
-        if told is not None and attempt.cost_usd is not None:
-            self._desk.cost(told, attempt.cost_usd)
+    def ended(self, key: str, usd: float | None) -> None:
+        """Tell what an attempt that may be reserved has cost, where that is known."""
+        number = self._numbers.pop(key, None)
+        if number is not None and usd is not None:
+            self._desk.cost(number, usd)
 
 
 async def exchange(name: str, answers: Mapping[int, bool], *, dask_worker: Worker) -> Told:
@@ -354,9 +349,9 @@ async def _play(task: Task, kept: dict[str, Any]) -> Played:
     async with AsyncExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="merge-runner-")))
         replies = stack.enter_context(closing(ResponseCache(folder)))
-        ledger = ToldLedger(replies.money, task.plan.ledger, kept.setdefault(task.name, Desk()))
-        replies.put_now(*task.recorded)
-        ledger.settle_share("", [(driver, 0, 0, ratio) for driver, ratio in task.overruns], [])
+        ledger = ToldLedger(replies, task.plan.ledger, kept.setdefault(task.name, Desk()))
+        overruns = [(driver, 0, 0, ratio) for driver, ratio in task.overruns]
+        replies.put_now(*task.recorded, [partial(ledger.share, "", overruns, [])])
         try:
             clients = live_clients(
                 task.plan, task.options, task.earlier, replies, ledger,
@@ -514,7 +509,7 @@ class DaskTasks:
 
         What is spent stays so, whatever becomes of the worker.
         """
-        write, begun, ledger = self._cache.money.writer.write, self._begun[task.name], self._ledger
+        write, begun, ledger = self._cache.write, self._begun[task.name], self._ledger
         cap_usd, answers = self._options.max_cost_usd, dict[int, bool]()
         drivers = dict[int, str]()
         while True:
@@ -553,7 +548,7 @@ class DaskTasks:
             answered |= {r.request.key: CachedCall(r.request, r.attempts) for r in replies if r}
             for call in record.failed_calls:
                 with contextlib.suppress(RecordingError):  # a damaged one is asked again
-                    if attempts := self._cache.unanswered(call.request.key):
+                    if attempts := self._cache.look_up(call.request.key)[1]:
                         unanswered[call.request.key] = attempts
         return [*answered.values()], [*unanswered.items()]
 
@@ -577,11 +572,10 @@ class DaskTasks:
                 raise type(error)(f"{error} (told by the Dask worker {address})")
 
     def _keep(self, task: Task, played: Played, paid: Rows) -> None:
-        """Keep what a task has brought, its replies first; what is ``paid`` is counted once."""
-        self._cache.put_now(*played.recorded)
-        if not self._plan.is_free:
-            counted = [(driver, -usd, -over_usd, 0.0) for driver, usd, over_usd in paid]
-            self._ledger.settle_share(task.name, [*counted, *played.spent], played.opened)
+        """Keep what a task has brought and what it cost; what is ``paid`` is counted once."""
+        counted = [(driver, -usd, -over_usd, 0.0) for driver, usd, over_usd in paid]
+        share = partial(self._ledger.share, task.name, [*counted, *played.spent], played.opened)
+        self._cache.put_now(*played.recorded, [] if self._plan.is_free else [share])
         for model, meter in played.meters.items():
             self.meters[model].add(meter)
         arms = self._plan.by_label()

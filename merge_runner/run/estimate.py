@@ -11,7 +11,7 @@ from statistics import fmean
 from merge_runner.config import ModelEntry
 from merge_runner.llm.batch.providers import batch_terms
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.ledger import cost_usd
+from merge_runner.llm.prices import cost_usd
 from merge_runner.prompts.blocks import render_prompt
 from merge_runner.records import SIDES, Usage, canonical_json, is_scripted, without_prompt
 from merge_runner.run.plan import Options, Plan, usual_prompts

@@ -202,7 +202,7 @@ def _replay(
 ) -> list[Finding]:
     """Play trials by the replies of a cache, or else the stored ones, and compare their rows."""
     stored = StoredReplies(plan, plan.by_label())
-    # Of a cache a sealed client only asks ``get``.
+    # Of a cache a sealed client only asks ``look_up``.
     runner = LocalRunner.sealed(plan, cache or cast(ResponseCache, stored))
     by_key = {(spec.trial_id, spec.spec_hash): spec for spec in specs}
     kind = "replay" if cache is None else "cache"
@@ -228,8 +228,11 @@ class StoredReplies:
     arms: dict[str, Arm]
     spec: TrialSpec = field(init=False)
     rows: list[dict[str, Any]] = field(init=False)
-    money: None = None  # the ledger of a sealed client keeps nothing
     has_recording: bool = False
+
+    def look_up(self, key: str) -> tuple[CachedCall | None, tuple[Attempt, ...]]:
+        """Return the call with this key, and no attempts at one without an answer."""
+        return self.get(key), ()
 
     def get(self, key: str) -> CachedCall | None:
         """Return the call with this key, each answer read anew; None where there is none.

@@ -507,7 +507,7 @@ async def open_sweep(
             others = _others_under_the_cap(plan, options, cache, say)
             asked = plan.entries.items()
             cache.locks.take({f"{e.id} at {plan.endpoints[name]}" for name, e in asked})
-        ledger = Ledger(cache.money, plan.ledger, others)
+        ledger = Ledger(cache, plan.ledger, others)
         yield Sweep(plan, options, cache, stored, todo, say, ledger)
 
 
@@ -586,11 +586,11 @@ def _others_under_the_cap(
     own, study = plan.ledger, plan.study.name
     others = [
         scope
-        for scope in scopes(cache.money)
+        for scope in scopes(cache)
         if scope != own
         and (scope in options.ledgers or (study in (own, scope) and scope.split("/")[0] == study))
     ]
-    if spent_usd := sum(Ledger(cache.money, scope).read().committed_usd for scope in others):
+    if spent_usd := sum(Ledger(cache, scope).read().committed_usd for scope in others):
         say(f"{spent_usd:.4f} USD of {', '.join(others)} count against the budget, too")
     return others
 

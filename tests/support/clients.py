@@ -7,10 +7,11 @@ import sqlite3
 import pytest
 
 from merge_runner.config import ModelEntry, Price
+from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.http_outcome import RawReply
-from merge_runner.llm.ledger import Budget, Ledger
+from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import Limiter
 from merge_runner.records import Slot
 from tests.support.virtual_time import now_s
@@ -83,9 +84,8 @@ def opened(tmp_path_factory):
 @pytest.fixture
 def cache(opened):
     with sqlite3.connect(opened.folder / "cache.db") as database:
-        database.execute("DELETE FROM Cache")
-    for table in ("open", "spent"):
-        opened.money.run_now([lambda table=table: opened.money.write(f"DELETE FROM {table}")])
+        for table in ("Cache", "open", "spent"):
+            database.execute(f"DELETE FROM {table}")
     return opened
 
 
@@ -104,7 +104,7 @@ def make(cache):
             cache=cache,
             transport=Server(*replies),
             limiter=limiter or Limiter(),
-            budget=None if entry.price == "free" else Budget(Ledger(cache.money, "test"), cap),
+            budget=None if entry.price == "free" else Budget(Ledger(cache, "test"), cap),
             passed=passed,
             known=known,
             under_way=under_way,

@@ -36,9 +36,9 @@ from merge_runner.errors import (
     TrialSuspended,
 )
 from merge_runner.llm.batch.providers import BatchFailed, BatchService, BatchStatus
+from merge_runner.llm.budget import USED_UP, PaidAttempt
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.http_outcome import AttemptOutcome, backoff_s, judge
-from merge_runner.llm.ledger import USED_UP, PaidAttempt
 from merge_runner.records import ChatRequest
 
 # The prefix of names in the cache.
@@ -198,9 +198,9 @@ class Rounds:
 
     def _ended(self, key: str, batch: Batch) -> bool:
         with contextlib.suppress(RecordingError):  # damaged: nothing is known of its attempts
-            tried = {each.number: each.outcome for each in self._cache.unanswered(key)}
-            outcome = tried.get(batch.note.lines[key], "unknown")
-            return outcome != "unknown" or self._cache.get(key) is not None
+            entry, attempts = self._cache.look_up(key)
+            outcomes = {each.number: each.outcome for each in attempts}
+            return entry is not None or outcomes.get(batch.note.lines[key], "unknown") != "unknown"
         return False
 
     async def _next_round(

@@ -14,12 +14,14 @@ from aiohttp import web
 
 from merge_runner.config import Endpoint, ModelEntry, Price
 from merge_runner.errors import MergeRunnerError
+from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import HttpTransport
-from merge_runner.llm.ledger import Budget, Ledger, cost_usd
+from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import Limiter
+from merge_runner.llm.prices import cost_usd
 from merge_runner.records import Slot, Usage, canonical_json
 from tests.integration.llm.test_scenarios import (  # noqa: F401 # fixtures
     GEMINI,
@@ -110,7 +112,7 @@ async def asked(cache, till, faults, *, cap, name, calls=CALLS, passed=True):
             cache=cache,
             transport=transport,
             limiter=Limiter(),
-            budget=Budget(Ledger(cache.money, name), cap * worst, each(worst)),
+            budget=Budget(Ledger(cache, name), cap * worst, each(worst)),
             passed=passed,
         )
 

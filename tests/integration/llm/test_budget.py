@@ -3,17 +3,17 @@
 import asyncio
 import contextlib
 import math
-import shutil
-import sqlite3
+from functools import partial
 from uuid import uuid4
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from merge_runner.errors import CacheFailed, TrialSuspended, UsageError
+from merge_runner.errors import CacheFailed, RecordingError, TrialSuspended, UsageError
+from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.ledger import FILE, TABLES, Asked, Budget, Ledger, Spending, scopes
+from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.records import Attempt, Slot, make_request
 from tests.support.cases import cases
 from tests.support.harness import each
@@ -40,7 +40,7 @@ def cache(tmp_path_factory):
 
 @pytest.fixture
 def ledger(cache, request):
-    return Ledger(cache.money, request.node.name)
+    return Ledger(cache, request.node.name)
 
 
 def asked(worst, driver=""):
@@ -59,7 +59,16 @@ async def attempt(budget, trial, worst, actual, turns=0, model="m"):
         await paid.begin(1)
         for _ in range(turns):
             await asyncio.sleep(0)
-        await paid.settle(tried(actual))
+        await paid.settle(tried(actual), nothing)
+
+
+def nothing(execute):
+    """Keeps nothing beside the money."""
+
+
+def now(ledger, operation, *arguments):
+    """Run an operation of a ledger."""
+    return ledger.store.run_now([partial(operation, *arguments)])[0]
 
 
 def set_aside(budget, trial, worst, driver=""):
@@ -69,7 +78,7 @@ def set_aside(budget, trial, worst, driver=""):
 @settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(calls, st.integers(0, 60))
 async def test_what_is_spent_and_set_aside_never_exceeds_the_cap(cache, plan, trial_usd):
-    ledger = Ledger(cache.money, f"sweep {uuid4()}")
+    ledger = Ledger(cache, f"sweep {uuid4()}")
     budget = Budget(ledger, CAP, each(trial_usd))
     reserve = ledger.reserve
 
@@ -106,7 +115,7 @@ class Trials:
 
     def begin_a_run(self):
         trial = [each(self.case["trial"])] if "trial" in self.case else []
-        self.budget = Budget(Ledger(self.cache.money, self.scope), self.case.get("cap"), *trial)
+        self.budget = Budget(Ledger(self.cache, self.scope), self.case.get("cap"), *trial)
 
     async def job(self, trial, verb, worst=0, actual="0"):
         if verb == "begins":
@@ -160,13 +169,13 @@ async def test_an_attempt_that_a_dead_process_began_counts_too(ledger, cache):
     dead = Budget(ledger, 1.0)
     paid = await set_aside(dead, 1, 0.75)
     await paid.begin(1)
-    assert [a.outcome for a in cache.unanswered("key 1")] == ["unknown"]
+    assert [a.outcome for a in cache.look_up("key 1")[1]] == ["unknown"]
     with pytest.raises(TrialSuspended):
         await set_aside(Budget(ledger, 1.0), 1, 0.5)
 
 
 async def test_the_ledger_refuses_what_two_processes_reserved_at_once(ledger, cache):
-    both = [Budget(Ledger(cache.money, "shared"), 1.0) for _ in range(2)]
+    both = [Budget(Ledger(cache, "shared"), 1.0) for _ in range(2)]
     # Neither knows of the other's yet.
     paid = [await set_aside(budget, trial, 0.75) for trial, budget in enumerate(both)]
     await paid[0].begin(1)
@@ -178,29 +187,20 @@ async def test_the_ledger_refuses_what_two_processes_reserved_at_once(ledger, ca
 async def test_money_that_is_left_is_spent_although_an_older_trial_never_asks_for_its_own(
     ledger, monkeypatch
 ):
-    monkeypatch.setattr("merge_runner.llm.ledger.PATIENCE_S", 0.01)
+    monkeypatch.setattr("merge_runner.llm.budget.PATIENCE_S", 0.01)
     budget = Budget(ledger, 4.0, each(2.0))
     await budget.admit(1)
     await budget.admit(2)
     await attempt(budget, 2, 3.0, 3.0)
 
 
-async def test_a_damaged_record_of_spending_is_told_and_not_believed(tmp_path):
-    cache = ResponseCache(tmp_path)
-    await attempt(Budget(Ledger(cache.money, "s")), 1, 0.5, 0.25)
-    cache.close()
-    (tmp_path / "ledger.db").write_bytes(b"no database" * 1_000)
-    with pytest.raises(UsageError, match="so that no cap could hold"):
-        Ledger(cache.money, "s").read()
-
-
 @pytest.mark.parametrize("usd", [-9.0, -math.inf])
 async def test_spending_that_nobody_can_have_spent_is_not_believed(ledger, cache, usd):
     await attempt(Budget(ledger), 1, 0.5, 0.25)
-    cache.money.run_now([lambda: cache.money.write("UPDATE spent SET usd = ?", usd)])
+    cache.run_now([lambda execute: execute("UPDATE spent SET usd = ?", (usd,))])
     with pytest.raises(UsageError, match="so that no cap could hold"):
         ledger.read()
-    cache.money.run_now([lambda: cache.money.write("DELETE FROM spent")])
+    cache.run_now([lambda execute: execute("DELETE FROM spent")])
 
 
 O3 = Asked("o3 at gateway", "L_4_0 rep 1 left, decision 3", 0.25)
@@ -209,12 +209,13 @@ O3 = Asked("o3 at gateway", "L_4_0 rep 1 left, decision 3", 0.25)
 async def test_what_is_set_aside_is_told_with_the_reason_of_each_attempt(ledger):
     retried = enumerate(("timeout", "connection_lost", "server_error"), 1)
     for key, number, outcome in (("a", 1, "timeout"), *(("b", *one) for one in retried)):
-        ledger.reserve(key, number, 0.25, None, O3)
+        now(ledger, ledger.reserve, key, number, 0.25, None, O3)
         actual = 0.0 if outcome == "connection_lost" else None
-        await ledger.settle(key, Attempt(number, outcome, cost_usd=actual), O3.driver)
-    ledger.reserve("d", 1, 0.125, None, O3)
-    ledger.reserve("paid", 1, 0.25, None, O3)
-    await ledger.settle("paid", tried(0.1), O3.driver)
+        ended = Attempt(number, outcome, cost_usd=actual)
+        now(ledger, ledger.settle, key, ended, O3.driver)
+    now(ledger, ledger.reserve, "d", 1, 0.125, None, O3)
+    now(ledger, ledger.reserve, "paid", 1, 0.25, None, O3)
+    now(ledger, ledger.settle, "paid", tried(0.1), O3.driver)
     reasons = ledger.reasons()
     assert [(r["outcome"], r["attempts"], r["usd"]) for r in reasons] == [
         ("timeout", 2, 0.5),
@@ -231,81 +232,57 @@ async def test_what_is_released_counts_no_longer(ledger, cache):
     with pytest.raises(TrialSuspended):
         await set_aside(Budget(ledger, 1.0), 1, 0.5)
     ledger.release()
-    again = Ledger(cache.money, ledger.scope)
+    again = Ledger(cache, ledger.scope)
     assert (again.spending.committed_usd, again.reasons()) == (0, [])
     await set_aside(Budget(again, 1.0), 1, 0.5)
 
 
 async def test_a_task_s_share_gives_way_to_what_the_task_has_spent_and_open(ledger, tmp_path):
     cache = ResponseCache(tmp_path)
-    task = Ledger(cache.money, "task")
+    task = Ledger(cache, "task")
     for key in ("a", "b"):
-        task.reserve(key, 1, 0.25, None, O3)
-    await task.settle("a", tried(0.5), O3.driver)
-    ledger.reserve("task 1", 1, 2.0, None, O3)
-    ledger.settle_share("task 1", *task.rows())
+        now(task, task.reserve, key, 1, 0.25, None, O3)
+    now(task, task.settle, "a", tried(0.5), O3.driver)
+    now(ledger, ledger.reserve, "task 1", 1, 2.0, None, O3)
+    now(ledger, ledger.share, "task 1", *task.rows())
     assert ledger.read() == task.read()
     assert (ledger.spending.spent_usd, ledger.spending.reserved_usd) == (0.5, 0.25)
     assert ledger.spending.overruns[O3.driver] == 2
     cache.close()
 
 
-async def test_an_answer_that_was_kept_right_before_a_kill_is_settled_by_the_next_run(
-    ledger, cache
-):
+@pytest.mark.parametrize("fails", ["keep", "settle"])
+async def test_a_reply_and_its_cost_are_kept_together_or_not_at_all(ledger, cache, fails):
     named = dict.fromkeys(("provider", "endpoint", "model", "path"), "openai")
     slot = Slot("N_0_0", 1, "left", 0, 0)
-    request = make_request(**named, headers={}, body={}, slot=slot)
-    for key in (request.key, "another"):
-        ledger.reserve(key, 1, 0.25, None, O3)
-    await cache.put(CachedCall(request, (Attempt(1, "ok", 200, cost_usd=0.125, reply="{}"),)))
-    ledger.settle_kept({"another driver"}, cache.all_attempts)
-    assert ledger.read().spent_usd == 0
-    ledger.settle_kept({O3.driver}, cache.all_attempts)
-    spending = ledger.read()
-    assert (spending.spent_usd, spending.reserved_usd, spending.open_attempts) == (0.125, 0.25, 1)
+    request = make_request(**named, headers={}, body={"test": fails}, slot=slot)
+    answer = Attempt(1, "ok", 200, cost_usd=0.125, reply="{}")
+    operations = {
+        "keep": partial(cache.keep, CachedCall(request, (answer,))),
+        "settle": partial(ledger.settle, request.key, answer, O3.driver),
+    }
+
+    def raising(execute):
+        operations[fails](execute)
+        raise RecordingError("nothing of this is kept")
+
+    now(ledger, ledger.reserve, request.key, 1, 0.25, None, O3)
+    both = {**operations, fails: raising}
+    with pytest.raises(RecordingError):
+        await cache.write(lambda execute: [each(execute) for each in both.values()])
+    assert cache.get(request.key) is None
+    assert (ledger.read().spent_usd, ledger.spending.reserved_usd) == (0, 0.25)
+    await cache.write(lambda execute: [each(execute) for each in operations.values()])
+    assert cache.get(request.key).attempts == (answer,)
+    assert (ledger.read().spent_usd, ledger.spending.reserved_usd) == (0.125, 0)
 
 
-async def test_nobody_reads_the_ledger_s_file_before_its_tables_are_there(tmp_path):
+def test_money_that_cannot_be_written_is_no_damaged_record(tmp_path):
     cache = ResponseCache(tmp_path)
-    ledger = Ledger(cache.money, "sweep")
-    reserving = asyncio.create_task(asyncio.to_thread(ledger.reserve, "key", 1, 0.25, None, O3))
-    while not reserving.done():
-        ledger.read()
-        await asyncio.sleep(0)
-    assert ledger.read().reserved_usd == 0.25
-    cache.close()
-
-
-@pytest.mark.parametrize("after", ["", "COMMIT;"])
-async def test_a_kill_while_the_ledger_s_file_is_made_is_recovered_from(tmp_path, after):
-    made, killed = tmp_path / "made", tmp_path / "killed"
-    made.mkdir()
-    opened = sqlite3.connect(made / FILE, isolation_level=None)
-    with contextlib.closing(opened), contextlib.closing(ResponseCache(killed)) as cache:
-        opened.execute("PRAGMA cache_size = 1")  # pages go to the file before the end
-        tables, commit, _ = TABLES.partition("COMMIT;")
-        opened.executescript(tables + (after and f"{commit} BEGIN; DELETE FROM spent;"))
-        rows = ((f"a study {number}", "m", 0, 0, 0) for number in range(1_000))
-        opened.executemany("INSERT INTO spent VALUES (?, ?, ?, ?, ?)", rows)
-        for file in made.iterdir():
-            shutil.copy(file, killed)
-        assert {FILE, f"{FILE}-journal"} <= {file.name for file in killed.iterdir()}
-        assert (killed / FILE).stat().st_size
-        ledger = Ledger(cache.money, "a study")
-        assert scopes(cache.money) == []
-        assert ledger.read() == Spending()
-        assert await ledger.begin("key", 1, 2.0, None, asked(2.0))
-        assert ledger.read().committed_usd == 2.0
-
-
-def test_a_ledger_that_cannot_be_written_is_no_damaged_one(tmp_path):
-    cache = ResponseCache(tmp_path)
-    ledger = Ledger(cache.money, "sweep")
-    ledger.reserve("key", 1, 0.25, None, O3)
-    cache.money.write("PRAGMA max_page_count = 1")
+    ledger = Ledger(cache, "sweep")
+    cache.run_now([lambda execute: execute("PRAGMA max_page_count = 1")])
     with pytest.raises(CacheFailed, match="cannot be written: database or disk is full"):
-        [ledger.reserve(f"key {number}", 1, 0.25, None, O3) for number in range(1_000)]
+        [now(ledger, ledger.reserve, str(n), 1, 0.25, None, O3) for n in range(1_000)]
     cache.close()
 
 
@@ -313,16 +290,16 @@ async def test_after_a_reply_that_cost_more_than_its_worst_case_as_much_is_set_a
     budget = Budget(ledger, 10.0)
     with contextlib.closing(await budget.set_aside(1, "key", O3)) as paid:
         await paid.begin(1)
-        await paid.settle(tried(0.75))
+        await paid.settle(tried(0.75), nothing)
     assert (ledger.spending.spent_usd, ledger.spending.overrun_usd) == (0.75, 0.5)
     assert ledger.spending.dearest == "o3 at gateway up to 3.00 times as much"
-    next_run = Budget(Ledger(cache.money, ledger.scope), 10.0)
+    next_run = Budget(Ledger(cache, ledger.scope), 10.0)
     assert (await set_aside(next_run, 2, 0.25, "another driver")).aside_usd == 0.25
     with contextlib.closing(await next_run.set_aside(1, "other", O3)) as paid:
         assert paid.aside_usd == 0.75
         await paid.begin(1)
         # A reply within what is now set aside does not count as another overrun of it.
-        await paid.settle(tried(0.5))
+        await paid.settle(tried(0.5), nothing)
     assert ledger.spending.overruns[O3.driver] == 3
 
 
@@ -364,7 +341,7 @@ async def test_however_an_attempt_ends_its_money_ends_in_the_right_place(
             if begun:
                 await paid.begin(1)
             if tried:
-                await paid.settle(tried)
+                await paid.settle(tried, nothing)
             raise error("whatever")
 
     with pytest.raises(error):

@@ -18,7 +18,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from merge_runner.errors import MergeRunnerError, RecordingError, UsageError
-from merge_runner.llm.cache import CachedCall, ResponseCache, TextDisk
+from merge_runner.llm.cache import TABLES, CachedCall, ResponseCache, TextDisk, import_folder
+from merge_runner.llm.ledger import Ledger
 from merge_runner.records import Attempt, ChatRequest, Slot, Usage, make_request
 from tests.support.cases import cases
 from tests.support.json_values import paths, replaced
@@ -40,10 +41,14 @@ def by_key(*entries):
     return {each.request.key: each for each in entries}
 
 
+async def keep(cache, kept):
+    return await cache.write(partial(cache.keep, kept))
+
+
 async def put(cache, *entries):
     # The limit only ends a test whose write is lost.
     async with asyncio.timeout(10):
-        await asyncio.gather(*(cache.put(each) for each in entries))
+        await asyncio.gather(*(keep(cache, each) for each in entries))
 
 
 @pytest.fixture
@@ -117,14 +122,18 @@ def test_an_entry_survives_its_text_form(recorded):
 
 PUT_AND_DIE = """
 import asyncio, os, sys
+from functools import partial
 from pathlib import Path
 from merge_runner.llm.cache import CachedCall, ResponseCache
-asyncio.run(ResponseCache(Path(sys.argv[1])).put(CachedCall.from_json(sys.argv[2])))
+async def keep():
+    cache = ResponseCache(Path(sys.argv[1]))
+    await cache.write(partial(cache.keep, CachedCall.from_json(sys.argv[2])))
+asyncio.run(keep())
 os._exit(7)
 """
 
 
-def test_a_reply_outlives_a_process_that_dies_after_put(folder):
+def test_a_reply_outlives_a_process_that_dies_after_it_is_kept(folder):
     arguments = [sys.executable, "-c", PUT_AND_DIE, folder, entry(1).to_json()]
     assert subprocess.run(arguments, check=False).returncode == 7
     reopened = ResponseCache(folder)
@@ -143,14 +152,14 @@ async def test_many_concurrent_puts_are_all_kept_and_readable_by_others(cache, o
 async def test_a_kept_reply_is_never_replaced(cache, other):
     """Where another process was first, its reply is the one that all go on with."""
     first, second = entry(1, reply=said("first")), entry(1, reply=said("second"))
-    assert await other.put(first) == first
-    assert await cache.put(second) == first
+    assert await keep(other, first) == first
+    assert await keep(cache, second) == first
     assert cache.put_now([second, entry(2)]) == [first, entry(2)]
     assert cache.get(second.request.key) == first
 
 
 async def test_a_put_that_is_cancelled_or_cannot_be_kept_disturbs_no_other(cache):
-    given_up = asyncio.create_task(cache.put(entry(1)))
+    given_up = asyncio.create_task(keep(cache, entry(1)))
     kept = asyncio.create_task(put(cache, entry(2)))
     await asyncio.sleep(0)
     given_up.cancel()
@@ -166,35 +175,30 @@ async def test_a_put_that_is_cancelled_or_cannot_be_kept_disturbs_no_other(cache
 async def test_a_write_that_fails_is_told_to_all_who_wait(cache, folder):
     with sqlite3.connect(folder / "cache.db") as database:
         database.execute("DROP TABLE Cache")
-    writing = (cache.put(entry(1)), cache.put(entry(2)))
+    writing = (keep(cache, entry(1)), keep(cache, entry(2)))
     async with asyncio.timeout(10):
         results = await asyncio.gather(*writing, return_exceptions=True)
     assert [isinstance(result, MergeRunnerError) for result in results] == [True, True]
 
 
-@pytest.mark.parametrize("place", ["replies", "money"])
-async def test_what_fails_alone_is_undone_alone_and_those_written_with_it_are_kept(cache, place):
-    money = cache.money
-    money.write("SELECT 1")  # makes its tables
-    write = cache.write if place == "replies" else money.writer.write
-
-    def add(name):
-        if place == "replies":
-            cache.replace(name, "text")
-        else:
-            money.write("INSERT INTO open (scope, usd) VALUES (?, 1.0)", name)
+async def test_what_fails_alone_is_undone_alone_and_those_written_with_it_are_kept(cache):
+    def add(name, execute):
+        cache.replace(name, "text", execute)
+        execute("INSERT INTO open (scope, usd) VALUES (?, 1.0)", (name,))
         return name
 
-    def add_and_fail():
-        add("row 2")
+    def add_and_fail(execute):
+        add("row 2", execute)
         raise RecordingError("no reply of ours")
 
-    writing = (write(partial(add, "row 1")), write(add_and_fail), write(partial(add, "row 3")))
-    first, failed, last = await asyncio.gather(*writing, return_exceptions=True)
+    operations = (partial(add, "row 1"), add_and_fail, partial(add, "row 3"))
+    first, failed, last = await asyncio.gather(
+        *map(cache.write, operations), return_exceptions=True
+    )
     assert isinstance(failed, RecordingError)
     assert (first, last) == ("row 1", "row 3")
-    kept = money.read("SELECT scope FROM open ORDER BY scope")
-    assert (cache.names("row ") or [name for (name,) in kept]) == ["row 1", "row 3"]
+    assert cache.names("row ") == ["row 1", "row 3"]
+    assert cache.rows("SELECT scope FROM open ORDER BY scope") == [("row 1",), ("row 3",)]
 
 
 async def test_damage_is_set_aside_by_the_writer_while_another_process_writes(
@@ -206,7 +210,7 @@ async def test_damage_is_set_aside_by_the_writer_while_another_process_writes(
     stock[key] = "no JSON"
     with contextlib.closing(sqlite3.connect(folder / "cache.db", isolation_level=None)) as other:
         other.execute("BEGIN IMMEDIATE")
-        keeping = asyncio.create_task(cache.put(entry(1)))
+        keeping = asyncio.create_task(keep(cache, entry(1)))
         await asyncio.sleep(0)
         other.execute("COMMIT")
     assert await keeping == entry(1)
@@ -326,17 +330,17 @@ def test_a_damaged_entry_is_an_error_and_no_reply(cache, stock):
 
 async def test_damaged_attempts_are_set_aside_and_good_ones_are_not(cache, stock):
     key = entry(1).request.key
-    await cache.put_unanswered(key, entry(1).attempts)
+    await cache.write(partial(cache.keep_attempts, key, entry(1).attempts))
     assert cache.set_damage_aside(key) == []
     name = next(name for name in stock if name.startswith("attempts "))
     stock[name] = "no JSON"
     assert cache.set_damage_aside(key) == [name]
     assert cache.set_damage_aside(key) == []
-    assert cache.unanswered(key) == ()
+    assert cache.look_up(key) == (None, ())
     assert stock[f"damaged {name}"] == "no JSON"
 
 
-@pytest.mark.parametrize("mark", [None, "4", "6"])
+@pytest.mark.parametrize("mark", [None, "4", "7"])
 @pytest.mark.parametrize("read_only", [False, True])
 def test_a_folder_of_another_format_is_refused_and_left_alone(
     folder, cache, stock, mark, read_only
@@ -347,10 +351,35 @@ def test_a_folder_of_another_format_is_refused_and_left_alone(
     stock.close()
     cache.close()
     before = (folder / "cache.db").read_bytes()
-    told = f"has format {mark or 1}, and this merge-runner has format 5: .*import FILE --cache NEW`"
+    told = f"has format {mark or 1}, and this merge-runner has format 6: .*import FILE --cache NEW`"
     with pytest.raises(UsageError, match=told):
         ResponseCache(folder, read_only=read_only)
     assert (folder / "cache.db").read_bytes() == before
+
+
+def test_a_folder_of_the_format_before_goes_on_with_its_replies_and_its_money(folder, tmp_path):
+    kept = entry(1)
+    with contextlib.closing(ResponseCache(folder)) as cache:
+        cache.put_now([kept])
+    before = shutil.copytree(folder, tmp_path / "before")
+    with contextlib.closing(sqlite3.connect(before / "cache.db")) as database, database:
+        database.execute("UPDATE Cache SET value = '5' WHERE key = 'format'")
+        for table in ("spent", "open"):
+            database.execute(f"DROP TABLE {table}")
+    with contextlib.closing(sqlite3.connect(before / "ledger.db")) as database, database:
+        for statement in TABLES:
+            database.execute(statement)
+        database.execute("INSERT INTO spent VALUES ('a study', 'm', 0.5, 0, 0)")
+        database.execute("INSERT INTO open (scope, call, usd) VALUES ('a study', 'key', 0.25)")
+    with contextlib.closing(ResponseCache(folder)) as cache:
+        assert import_folder(before, cache) == (0, 1)
+    with pytest.raises(UsageError, match="a sweep or a replay with it brings it to format 6"):
+        ResponseCache(before, read_only=True)
+    for _ in range(2):
+        with contextlib.closing(ResponseCache(before)) as cache:
+            assert list(cache.entries()) == [kept]
+            spending = Ledger(cache, "a study").spending
+            assert (spending.spent_usd, spending.reserved_usd) == (0.5, 0.25)
 
 
 def changed(folder, sql, **values):
@@ -408,7 +437,7 @@ def model_folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("full") / "responses"
     cache = ResponseCache(folder)
     cache.put_now(FULL)
-    asyncio.run(cache.put_unanswered(entry(9).request.key, entry(9).attempts))
+    cache.put_now([], [(entry(9).request.key, entry(9).attempts)])
     cache.close()
     gc.collect()  # the connections of other threads, or their files go while they are copied
     return folder

@@ -12,6 +12,7 @@ import os
 import shutil
 import socket
 from contextlib import closing
+from functools import partial
 from importlib import import_module
 
 import psutil
@@ -155,14 +156,15 @@ async def test_a_worker_that_is_killed_costs_its_task_and_nothing_else(
 
 def test_the_share_of_a_task_stays_reserved_until_the_task_is_kept(tmp_path):
     with closing(ResponseCache(tmp_path)) as cache:
-        ledger = Ledger(cache.money, "baseline")
+        ledger = Ledger(cache, "baseline")
         for name in ("lost", "kept"):
             asked = Asked("Dask worker tcp://1", "L_4_0", 5.0)
-            assert ledger.reserve(name, 1, 5.0, None, asked)
+            reserve = partial(ledger.reserve, name, 1, 5.0, None, asked)
+            assert cache.run_now([reserve]) == [True]
         assert (ledger.read().reserved_usd, ledger.read().open_attempts) == (10, 2)
         unclear = ("a key", 1, 0.5, "o3", "N_0_0", 0.5, "2026-01-01T00:00:00Z", "read_timeout")
-        ledger.settle_share("kept", [("o3", 1.5, 0.25, 2.0)], [unclear])
-        spending = Ledger(cache.money, "baseline").read()
+        cache.run_now([partial(ledger.share, "kept", [("o3", 1.5, 0.25, 2.0)], [unclear])])
+        spending = Ledger(cache, "baseline").read()
         assert (spending.spent_usd, spending.reserved_usd, spending.open_attempts) == (1.5, 5.5, 2)
         assert spending.overruns == {"o3": 2.0}
         assert [reason["driver"] for reason in ledger.reasons()] == ["Dask worker tcp://1", "o3"]

@@ -6,6 +6,7 @@ import json
 import signal
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from unittest.mock import Mock
 
 import duckdb
@@ -147,7 +148,8 @@ async def test_the_cap_is_kept_as_the_user_gave_it_whoever_else_spends_under_it(
     )
     (tmp_path / "models.toml").write_text(MODEL.format(name="dear", price=2.0))
     with closing(ResponseCache(options.cache)) as cache:
-        assert Ledger(cache.money, "other").reserve("key", 1, 0.49, None, Asked("o3"))
+        reserve = partial(Ledger(cache, "other").reserve, "key", 1, 0.49, None, Asked("o3"))
+        assert cache.run_now([reserve]) == [True]
     plan = make_plan(str(tmp_path / "study.toml"))
     options = replace(options, max_cost_usd=cap, ledgers=(plan.ledger, "other"))
     summary = await run_sweep(plan, options, say=print)

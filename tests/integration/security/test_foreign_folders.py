@@ -5,6 +5,7 @@ import json
 import shutil
 import sqlite3
 from dataclasses import asdict
+from functools import partial
 
 import diskcache
 import duckdb
@@ -87,7 +88,7 @@ def test_a_file_that_a_row_names_is_neither_read_nor_deleted(folder, mode, leads
     assert cache.set_damage_aside(key) == [key]
     assert cache.put_now([FIRST]) == [FIRST]
     assert list(cache.entries()) == [SECOND, FIRST]
-    cache.run_now([lambda: cache.remove(f"damaged {key}")])
+    cache.run_now([partial(cache.remove, f"damaged {key}")])
     cache.close()
     assert inside.read_text() == victim.read_text() == SECRET
     shutil.rmtree(folder / "aa")
@@ -163,7 +164,7 @@ def plant(cache, key, /, **changes):
     text = json.loads(FIRST.to_json())
     for part in (text["entry"]["request"], text["entry"]["attempts"][0]):
         part.update({name: value for name, value in changes.items() if name in part})
-    cache.run_now([lambda: cache.replace(key, json.dumps(text))])
+    cache.run_now([partial(cache.replace, key, json.dumps(text))])
 
 
 @pytest.mark.parametrize("changes", FIELDS.values(), ids=FIELDS)

@@ -155,7 +155,7 @@ async def test_a_rejected_request_fails_this_call_alone(make, cache):
     assert outcomes(caught.value.attempts) == ["server_error", "bad_request"]
     assert caught.value.request == client.transport.sent[0]
     assert list(cache.entries()) == []
-    assert cache.unanswered(caught.value.request.key) == caught.value.attempts
+    assert cache.look_up(caught.value.request.key)[1] == caught.value.attempts
     reply = await make(answer()).ask("prompt", slot())
     assert [each.number for each in reply.attempts] == [1, 2, 3], "an earlier run's count too"
     assert (await client.ask("prompt", slot(2))).outcome == "ok"
@@ -288,7 +288,7 @@ async def test_drain_gives_up_calls_that_wait_for_their_turn(make):
 @pytest.mark.parametrize("drains", [False, True])
 async def test_a_call_that_waits_for_its_coordinator_can_be_given_up(make, cache, drains, told):
     client, desk = make(answer(), price=PRICE), Desk()
-    client.money.ledger = ToldLedger(cache.money, "test", desk)
+    client.money.ledger = ToldLedger(cache, "test", desk)
     asked = await begun(client.ask("prompt", slot()))
     if told:
         assert (await desk.exchange({})).asking.keys() == {1}

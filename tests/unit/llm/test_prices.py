@@ -3,7 +3,7 @@
 import pytest
 
 from merge_runner.config import ModelEntry, Price
-from merge_runner.llm.ledger import cost_usd, is_underpriced
+from merge_runner.llm.prices import cost_usd, is_underpriced
 from merge_runner.records import Usage
 from tests.support.cases import cases, table
 

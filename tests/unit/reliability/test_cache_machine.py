@@ -9,6 +9,7 @@ import os
 import shutil
 import sqlite3
 import tempfile
+from functools import partial
 from pathlib import Path
 
 from hypothesis import settings
@@ -22,8 +23,9 @@ from hypothesis.stateful import (
 )
 
 from merge_runner.errors import TrialSuspended
+from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.ledger import Asked, Budget, Ledger
+from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.records import Attempt, Slot, make_request
 
 QUESTIONS = 4
@@ -46,7 +48,7 @@ class Process:
 
     def __init__(self, folder, cap_usd):
         self.cache = ResponseCache(folder)
-        self.budget = Budget(Ledger(self.cache.money, "s"), cap_usd)
+        self.budget = Budget(Ledger(self.cache, "s"), cap_usd)
         self.in_flight_calls = {}  # its cache, the paid attempt and those before, by question
 
 
@@ -92,7 +94,7 @@ class CacheMachine(RuleBasedStateMachine):
             assert known == self.answered[question], "what is answered is not asked again"
             return
         assert known is None
-        earlier = list(process.cache.unanswered(key))
+        earlier = list(process.cache.look_up(key)[1])
         if paid := self.paid_for(process, question, earlier):
             self.tried.pop(question, None)
             process.in_flight_calls[question] = process.cache, paid, earlier
@@ -137,8 +139,7 @@ class CacheMachine(RuleBasedStateMachine):
         reply = f'{{"text": "ä {self.made}"}}'
         attempts.append(Attempt(len(attempts) + 1, "ok", 200, reply=reply, cost_usd=float(cost)))
         entry = CachedCall(REQUESTS[question], tuple(attempts))
-        kept = self.wait(cache.put(entry))
-        self.wait(paid.settle(attempts[-1]))
+        kept = self.wait(paid.settle(attempts[-1], partial(cache.keep, entry)))
         paid.close()
         assert kept == entry
         self.answered[question] = entry
@@ -152,8 +153,8 @@ class CacheMachine(RuleBasedStateMachine):
         self.charged_usd += cost
         told = float(cost) if known else None
         attempts.append(Attempt(len(attempts) + 1, "server_error", 500, cost_usd=told))
-        self.wait(cache.put_unanswered(REQUESTS[question].key, tuple(attempts)))
-        self.wait(paid.settle(attempts[-1]))
+        key = REQUESTS[question].key
+        self.wait(paid.settle(attempts[-1], partial(cache.keep_attempts, key, tuple(attempts))))
         paid.close()
         self.tried[question] = tuple(attempts)
 
@@ -201,7 +202,7 @@ class CacheMachine(RuleBasedStateMachine):
     @invariant()
     def the_sum_never_passes_the_cap(self):
         for process in self.running.values():
-            counted_usd = Ledger(process.cache.money, "s").read().committed_usd
+            counted_usd = Ledger(process.cache, "s").read().committed_usd
             assert self.charged_usd <= counted_usd + 1e-6
             assert counted_usd <= self.cap_usd + 1e-6
 
@@ -211,7 +212,7 @@ class CacheMachine(RuleBasedStateMachine):
             found = {entry.request.key: entry for entry in process.cache.entries()}
             assert found == {REQUESTS[q].key: entry for q, entry in self.answered.items()}
             for question in self.tried.keys() - self.answered.keys():
-                assert process.cache.unanswered(REQUESTS[question].key) == self.tried[question]
+                assert process.cache.look_up(REQUESTS[question].key)[1] == self.tried[question]
 
 
 def test_nothing_answered_is_asked_again_and_the_cap_holds_in_any_order():

@@ -17,10 +17,11 @@ from merge_runner.config import ModelEntry, Price
 from merge_runner.errors import CacheFailed, EndpointRefused, ProviderDown, QuotaExhausted
 from merge_runner.llm.batch.providers import BatchFailed, BatchStatus
 from merge_runner.llm.batch.rounds import Rounds
+from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.ledger import Budget, Ledger
+from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import Limiter
 from merge_runner.records import CallFailed, Slot
 from tests.support.clients import answer, error
@@ -128,7 +129,7 @@ class Run:
         self.cache, self.said, self.alone = cache, [], Alone()
         self.rounds = Rounds(cache, {"m"}, submits=submits, say=self.said.append)
         self.rounds.services["m"] = service
-        self.ledger = Ledger(cache.money, scope)
+        self.ledger = Ledger(cache, scope)
         entry = ModelEntry(
             provider="openai", format="openai-chat", id="m-1", max_output_tokens=100, price=price
         )
@@ -271,11 +272,11 @@ async def test_results_that_are_fewer_than_the_provider_counts_are_read_again(
 async def test_what_could_not_be_kept_is_fetched_again_and_not_paid_twice(
     cache, monkeypatch, service, run
 ):
-    async def is_full(*_):
+    def is_full(*_):
         raise CacheFailed("the disk is full")
 
     with monkeypatch.context() as patch:
-        patch.setattr(cache, "put", is_full)
+        patch.setattr(cache, "keep", is_full)
         assert {type(each) for each in await run.ask(2)} == {CacheFailed}
         await run.end()
     later = Run(cache, service)
@@ -403,7 +404,7 @@ async def test_where_no_batch_can_be_created_the_next_run_looks_for_it_first(cac
     service.creations = []
     assert texts(await Run(cache, service).ask(3)) == ["batched 1", "batched 2", "batched 3"]
     assert service.sizes == [3]
-    assert Ledger(cache.money, "test").read().open_attempts == 0
+    assert Ledger(cache, "test").read().open_attempts == 0
 
 
 async def test_a_provider_that_is_down_while_a_batch_waits_is_waited_for(service, run):

@@ -1,0 +1,61 @@
+"""What attempts cost: by the registry's figures, or by the table of genai-prices."""
+
+from __future__ import annotations
+
+import contextlib
+from decimal import Decimal
+from functools import partial
+
+from merge_runner.config import ModelEntry, Price
+from merge_runner.records import Usage
+
+# The provider names of genai-prices where they differ from ours.
+GENAI_PRICES_PROVIDER = {"gemini": "google"}
+PER_MILLION = Decimal(1_000_000)
+# What is billed at more than the plain price, about twice at OpenAI.
+DEARER_TIERS = frozenset({"priority"})
+
+
+def cost_usd(entry: ModelEntry, usage: Usage, tier: str | None = None) -> float | None:
+    """Return the cost of an attempt in USD, None where the price or the tokens are unknown.
+
+    ``tier`` is the service tier that the reply names; one without a price of its own is priced as
+    the plain one.
+    """
+    price, read, written = entry.price, usage.input_tokens, usage.output_tokens
+    if price == "free":
+        return 0.0
+    if read is None or written is None:
+        return None
+    cached = usage.cached_input_tokens or 0
+    if cached > read:
+        cached = 0  # the server counts wrongly: none is taken for cheap
+    if isinstance(price, Price):
+        cached_price = price.input if price.cached_input is None else price.cached_input
+        parts = ((read - cached, price.input), (cached, cached_price), (written, price.output))
+        # Decimals of the written figures, so that sums of costs have no digits that nobody wrote.
+        plain = sum(n * Decimal(str(usd)) for n, usd in parts) / PER_MILLION
+        return float(plain * Decimal(str(price.tiers.get(tier or "", 1))))
+    from genai_prices import Usage as PricedUsage  # here, since it takes long to load
+    from genai_prices import calc_price
+
+    priced = PricedUsage(input_tokens=read, cache_read_tokens=cached, output_tokens=written)
+    provider = GENAI_PRICES_PROVIDER.get(entry.provider, entry.provider)
+    calculate = partial(calc_price, priced, model_ref=entry.id, provider_id=provider)
+    try:
+        # Older versions of the package know no tiers.
+        with contextlib.suppress(TypeError):
+            if tier is not None:
+                return float(calculate(price_context={"service_tier": tier}).total_price)
+        return float(calculate().total_price)
+    except LookupError:
+        return None
+
+
+def is_underpriced(entry: ModelEntry, tier: str | None) -> bool:
+    """Return whether a reply of this tier costs more than the registry knows."""
+    if tier not in DEARER_TIERS:
+        return False
+    million = Usage(1_000_000, 0, 1_000_000)
+    plain_usd = cost_usd(entry, million)
+    return bool(plain_usd) and cost_usd(entry, million, tier) == plain_usd
