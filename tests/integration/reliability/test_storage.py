@@ -244,7 +244,7 @@ async def test_one_bit_that_makes_no_text_blocks_nothing_else(merge_runner, stor
 
 async def test_a_damaged_record_of_spending_stops_no_replay(merge_runner, stored):
     with closing(sqlite3.connect(stored / "cache/responses/cache.db")) as cache, cache:
-        cache.execute("INSERT INTO spent VALUES ('baseline', 'm', -9.0, 0, 0)")
+        cache.execute("INSERT INTO spent VALUES ('baseline/emulator/set0', 'm', -9.0, 0, 0)")
     for command in ((*SWEEP, "--dry-run"), ("replay", *SWEEP[1:])):
         run = await merge_runner(*command, "--db", "new", cwd=stored)
         assert run.code == 0, run.err
