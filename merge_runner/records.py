@@ -10,7 +10,7 @@ import hashlib
 import json
 import re
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from datetime import datetime
 from functools import lru_cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -88,7 +88,13 @@ class Slot:
 
     def as_dict(self) -> dict[str, str | int]:
         """The slot as plain JSON values, by their names' order."""
-        return dict(sorted(asdict(self).items()))
+        return {
+            "condition": self.condition,
+            "decision": self.decision,
+            "repetition": self.repetition,
+            "sample_set": self.sample_set,
+            "side": self.side,
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -405,20 +411,27 @@ def without_prompt(body: str) -> str:
     return body.replace(max(_TEXT.findall(body), key=len, default='""'), '""')
 
 
-def check_call(key: str, request: ChatRequest, attempts: tuple[Attempt, ...]) -> None:
+def check_call(
+    key: str,
+    request: ChatRequest,
+    attempts: tuple[Attempt, ...],
+    asked: ChatRequest | None = None,
+) -> None:
     """Raise one of DAMAGED unless a call belongs to its key and its attempts are possible.
 
-    The last attempt is the one that was answered.
+    The last attempt is the one that was answered. A request equal to the one that is ``asked``
+    needs no key of its own.
     """
-    content = call_key(
-        endpoint=request.endpoint,
-        path=request.path,
-        headers=request.headers,
-        body=request.body,
-        slot=request.slot,
-    )
-    if not key == request.key == content:
-        raise ValueError("its content does not belong to its key")
+    if request != asked:
+        content = call_key(
+            endpoint=request.endpoint,
+            path=request.path,
+            headers=request.headers,
+            body=request.body,
+            slot=request.slot,
+        )
+        if not key == request.key == content:
+            raise ValueError("its content does not belong to its key")
     numbers = [attempt.number for attempt in attempts]
     if numbers != sorted({*numbers}):
         raise ValueError("its attempts are not numbered one after the other")

@@ -16,7 +16,8 @@ from __future__ import annotations
 
 import asyncio
 import bisect
-from collections.abc import Callable, Iterable
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from operator import itemgetter
@@ -77,13 +78,9 @@ class PaidAttempt:
 
     async def settle(self, attempt: Attempt, keep: Callable[[Execute], ResultT]) -> ResultT:
         """Keep what the attempt brought, and settle what it cost, in one durable transaction."""
-
-        def both(execute: Execute) -> ResultT:
-            kept = keep(execute)
-            self.budget.ledger.settle(self.key, attempt, self.asked.driver, execute)
-            return kept
-
-        kept = await self.budget.ledger.store.write(both)
+        ledger = self.budget.ledger
+        settle = partial(ledger.settle, self.key, attempt, self.asked.driver, keep)
+        kept = await ledger.store.write(settle)
         self.cost_usd = attempt.cost_usd
         return kept
 
@@ -93,7 +90,8 @@ class PaidAttempt:
         if self.queued:
             self.budget.queued_usd -= self.aside_usd
             self.cost_usd = 0.0
-        self.budget.ledger.ended(self.key, self.cost_usd)
+        if self.budget.ledger.is_shared_out:
+            self.budget.ledger.ended(self.key, self.cost_usd)
         if self.cost_usd is not None:
             self.budget.charge(self.trial, self.cost_usd - self.aside_usd)
         self.budget.wake()
@@ -104,7 +102,7 @@ class Budget:
 
     A trial is named by its order in the sweep; ``trial_usd`` returns the USD that one is expected
     to cost. ``in_flight`` counts the attempts that have money, ``queued_usd`` is reserved in this
-    process alone.
+    process alone. ``charged_usd`` is by trial that has begun, with reservations.
     """
 
     def __init__(
@@ -120,7 +118,7 @@ class Budget:
         self.queued_usd = 0.0
         self._largest_usd = 0.0
         self._spent_before = ledger.spending.committed_usd > 0
-        self._charged_usd: dict[int, float] = {}  # by trial that has begun, with reservations
+        self.charged_usd: dict[int, float] = {}
         self._left: set[int] = set()
         # The lowest place first: attempts come before trials that wait to begin, and older trials,
         # of a lower order, before younger ones.
@@ -128,18 +126,18 @@ class Budget:
 
     async def admit(self, trial: int) -> None:
         """Wait until a trial may begin; raises TrialSuspended when no trial's end can let it."""
-        if self.cap_usd is not None and trial not in self._charged_usd:
+        if self.cap_usd is not None and trial not in self.charged_usd:
             await self._in_turn((True, trial), lambda _: self._begins(trial))
 
     def begin_anew(self, trial: int) -> None:
         """Admit a trial at once: it goes on where an earlier run has asked for it."""
         if self.cap_usd is not None and trial not in self._left:
-            self._charged_usd.setdefault(trial, 0.0)
+            self.charged_usd.setdefault(trial, 0.0)
 
     def leave(self, trial: int) -> None:
         """Free the money of a trial that has ended or is suspended."""
         self._left.add(trial)
-        if self._charged_usd.pop(trial, None) is not None:
+        if self.charged_usd.pop(trial, None) is not None:
             self.wake()
 
     async def set_aside(self, trial: int, key: str, asked: Asked) -> PaidAttempt:
@@ -148,9 +146,11 @@ class Budget:
         Waits while other attempts or older trials may free money, then raises TrialSuspended. The
         caller closes what is returned.
         """
-        if self.cap_usd is not None:
-            await self._in_turn((False, trial), partial(self._pays, trial, asked))
         usd = self._worst_usd(asked)
+        if self.cap_usd is not None and (self._queue or not self._pays(trial, usd, 0.0)):
+            pays = partial(self._pays, trial)
+            await self._in_turn((False, trial), lambda s: pays(self._worst_usd(asked), s))
+            usd = self._worst_usd(asked)
         self._largest_usd = max(self._largest_usd, usd)
         return PaidAttempt(self, trial, key, asked, usd)
 
@@ -161,8 +161,8 @@ class Budget:
 
     def charge(self, trial: int, usd: float) -> None:
         """Count what a trial that has begun spends or sets aside, or gives back."""
-        if trial in self._charged_usd:
-            self._charged_usd[trial] += usd
+        if trial in self.charged_usd:
+            self.charged_usd[trial] += usd
 
     def wake(self) -> None:
         """Let the first in the queue see whether it may go on by now."""
@@ -173,33 +173,30 @@ class Budget:
         """Begin a trial if there is money for it beside all that have begun."""
         if trial in self._left:
             raise TrialSuspended("its trial is suspended")
-        if trial in self._charged_usd:  # its other driver stood in the queue, too
+        if trial in self.charged_usd:  # its other driver stood in the queue, too
             return True
         needed_usd, left_usd = self.trial_usd(trial), self._left_usd()
-        if left_usd < needed_usd and not self._charged_usd and not self.in_flight:
+        if left_usd < needed_usd and not self.charged_usd and not self.in_flight:
             # The first one that asks begins all the same: it may cost less, and each attempt must
             # still fit.
             if self._spent_before or self._largest_usd:
                 raise self._suspended(f"a whole trial may cost {needed_usd:.2f} USD")
-        elif left_usd < needed_usd + self._needed_usd(self._charged_usd):
+        elif left_usd < needed_usd + self._needed_usd():
             return False
-        self._charged_usd[trial] = 0.0
+        self.charged_usd[trial] = 0.0
         return True
 
-    def _pays(self, trial: int, asked: Asked, waited_s: float) -> bool:
+    def _pays(self, trial: int, worst_usd: float, waited_s: float) -> bool:
         """Return whether there is money for an attempt."""
         left_usd = self._left_usd()
-        worst_usd = self._worst_usd(asked)
         if left_usd < worst_usd and not self.in_flight:
             raise self._suspended(f"the next call may cost {worst_usd:.4f} USD")
         counted_on = self.in_flight or waited_s < PATIENCE_S
-        older = (each for each in self._charged_usd if each < trial and counted_on)
+        older_usd = self._needed_usd(before=trial) if counted_on else 0.0
         # A server that ignores the output cap is known only by its first expensive reply, when the
         # others are sent already: all in flight may cost twice as much.
         twice_usd = (self.in_flight + 1) * max(worst_usd, self._largest_usd)
-        return left_usd - worst_usd >= max(
-            self._needed_usd(older), twice_usd if self.in_flight else 0.0
-        )
+        return left_usd - worst_usd >= max(older_usd, twice_usd if self.in_flight else 0.0)
 
     def _worst_usd(self, asked: Asked) -> float:
         """Return the worst case, scaled by this driver's largest observed cost overrun."""
@@ -209,9 +206,13 @@ class Budget:
         assert self.cap_usd is not None
         return self.cap_usd - self.ledger.committed_usd - self.queued_usd + TOLERANCE_USD
 
-    def _needed_usd(self, trials: Iterable[int]) -> float:
-        """Return what these begun trials are still expected to cost."""
-        return sum(max(0.0, self.trial_usd(each) - self._charged_usd[each]) for each in trials)
+    def _needed_usd(self, before: float = math.inf) -> float:
+        """Return what the trials that have begun, ``before`` another, are expected to cost yet."""
+        needed_usd = 0.0
+        for trial, charged_usd in self.charged_usd.items():
+            if trial < before:
+                needed_usd += max(0.0, self.trial_usd(trial) - charged_usd)
+        return needed_usd
 
     async def _in_turn(self, place: tuple[bool, int], may_go: Callable[[float], bool]) -> None:
         """Wait in the queue until ``may_go``, which is told for how many s this waits, is True."""
@@ -234,10 +235,11 @@ class Budget:
 
     def _suspended(self, what: str) -> TrialSuspended:
         """Return the error of a trial that cannot be paid."""
-        spending, kept_usd = self.ledger.spending, self._needed_usd(self._charged_usd)
+        spending, kept_usd = self.ledger.spending, self._needed_usd()
         reserved_usd = spending.reserved_usd + self.queued_usd
         elsewhere_usd = self.ledger.committed_usd - spending.committed_usd
-        elsewhere = f", {elsewhere_usd:.4f} by others under this cap" if elsewhere_usd else ""
+        is_elsewhere = elsewhere_usd > TOLERANCE_USD
+        elsewhere = f", {elsewhere_usd:.4f} by others under this cap" if is_elsewhere else ""
         total_usd = self.ledger.committed_usd + self.queued_usd
         return TrialSuspended(
             f"{what}, and {total_usd:.4f} of {self.cap_usd:g} USD are "

@@ -249,17 +249,22 @@ class ResponseCache:
         """Whether the recording holds an entry of a call key."""
         return key in self._overlay
 
-    def look_up(self, key: str) -> tuple[CachedCall | None, Attempts]:
+    def look_up(
+        self, key: str, request: ChatRequest | None = None
+    ) -> tuple[CachedCall | None, Attempts]:
         """Return the entry of a call, or the attempts of earlier runs, also unknown ones.
 
-        Raises RecordingError where it is damaged or made up.
+        ``request`` is the call's where it is known. Raises RecordingError where what is recorded is
+        damaged or made up.
         """
         if recorded := self._overlay.get(key):
             return recorded, ()
         rows = self.rows(_LOOK_UP, key, _UNANSWERED + key)
+        if not rows:
+            return None, ()
         texts = {name: row for name, *row in rows if name is not None}
         if key in texts:
-            return _verified(key, self._text(*texts[key])), ()
+            return _verified(key, self._text(*texts[key]), request), ()
         tried = _attempts(self._text(*texts[_UNANSWERED + key])) if texts else ()
         begun = sorted(row for row in rows if row[0] is None and row[1] > len(tried))
         unseen = (
@@ -283,7 +288,8 @@ class ResponseCache:
         for entry in entries:
             self.set_damage_aside(entry.request.key)
         kept = [partial(self.keep, entry) for entry in entries]
-        others = [partial(self.keep_attempts, *each) for each in tried]
+        others = [partial(self.remove, _UNANSWERED + entry.request.key) for entry in entries]
+        others += [partial(self.keep_attempts, *each) for each in tried]
         return self.run_now([*kept, *others, *money])[: len(kept)]
 
     def add_missing(self, entries: Iterable[CachedCall]) -> tuple[int, int]:
@@ -408,7 +414,8 @@ class ResponseCache:
             except RecordingError:
                 self._move_aside([key], execute)
                 self._texts.add(key, text)
-        self._texts.delete(_UNANSWERED + key)
+        if len(entry.attempts) > 1:
+            self._texts.delete(_UNANSWERED + key)
         return entry
 
     def keep_attempts(self, key: str, attempts: Attempts, execute: Execute) -> None:
@@ -554,11 +561,11 @@ def _attempts(text: str) -> Attempts:
         raise RecordingError("the list of earlier attempts is damaged") from exc
 
 
-def _verified(key: str, text: str) -> CachedCall:
+def _verified(key: str, text: str, request: ChatRequest | None = None) -> CachedCall:
     """Return the entry that a row holds; raises RecordingError unless it belongs to its key."""
     entry = CachedCall.from_json(text)
     try:
-        check_call(key, entry.request, entry.attempts)
+        check_call(key, entry.request, entry.attempts, request)
     except DAMAGED as exc:
         raise RecordingError(f"the recorded reply is damaged: {exc}") from exc
     return entry

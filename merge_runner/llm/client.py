@@ -8,8 +8,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections import Counter, deque
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, datetime, timedelta
 from functools import partial
@@ -123,6 +122,11 @@ class Call:
         return self.attempts[self.earlier :]
 
     @property
+    def empty(self) -> int:
+        """The number of empty answers in this run."""
+        return sum(attempt.outcome == "empty" for attempt in self.own_attempts)
+
+    @property
     def last_failure(self) -> str:
         """The reason why the last attempt brought no answer."""
         return self.attempts[-1].error or self.attempts[-1].outcome
@@ -231,13 +235,13 @@ class LlmClient:
         request = self._request(prompt, slot)
         reply, attempts = None, None
         try:
-            recorded, attempts = self.cache.look_up(request.key)
+            recorded, attempts = self.cache.look_up(request.key, request)
             if recorded:
                 reply = self._read(recorded, len(recorded.attempts))
         except RecordingError as exc:
             if self.sealed:
                 raise CallFailed(f"{self.name}: call {request.key}: {exc}", request) from exc
-        if reply is None and self.sealed:
+        if reply is None and self.transport is None:
             raise ReplayMiss("no recorded reply", request)
         if reply is None:
             # The attempts are counted once, for whoever asked first.
@@ -313,35 +317,25 @@ class LlmClient:
         """The calls of this client that are under way."""
         return [call for call in self.under_way.values() if call.asked.driver == self.driver]
 
-    @contextmanager
-    def _waiting(
-        self,
-        call: Call,
-        what: str,
-        until: datetime | None = None,
-        *,
-        idle: bool = False,
-        paid: bool = False,
-    ) -> Iterator[None]:
-        """Mark a call as waiting, so that it can be given up: nothing of it is in flight."""
+    def _waits(self, call: Call, wait: Wait) -> None:
+        """Mark a call as waiting, so that it can be given up: nothing of it is in flight.
+
+        It is in flight again when its ``wait`` is None. Raises CallFailed where nobody wants it.
+        """
         if self._stopping:
             raise CallFailed("the sweep was stopped", call.request)
-        if not (call.asking or paid):
+        if not (call.asking or wait.paid):
             raise CallFailed("its trial was left", call.request)
-        call.wait = Wait(what, until, idle, paid)
-        try:
-            yield
-        finally:
-            call.wait = None
+        call.wait = wait
 
     def _count(self, reply: ChatReply) -> None:
         """Count an answer that a trial uses, and who gave it where it is another model."""
-        last, meter = reply.attempts[-1], self.meter
-        meter.calls_cached += reply.cached
-        meter.calls_live += not reply.cached
-        shared = reply.cached and reply.request.key in self._answered
+        last, meter, cached = reply.attempts[-1], self.meter, reply.cached
+        meter.calls_cached += cached
+        meter.calls_live += not cached
+        shared = cached and reply.request.key in self._answered
         meter.calls_shared += shared
-        if self.cache.has_recording and reply.cached and not shared:
+        if self.cache.has_recording and cached and not shared:
             meter.calls_recorded += self.cache.in_recording(reply.request.key)
         if last.model_served not in self._own_names:
             meter.mismatches[f"{self.entry.id} -> {last.model_served}"] += 1
@@ -364,7 +358,9 @@ class LlmClient:
             input_tokens=len(request.body.encode()), output_tokens=self.entry.max_output_tokens
         )
         tier = as_text(self.entry.parameters.get("service_tier"))
-        dearest_usd = max(cost_usd(self.entry, worst, each) or 0.0 for each in {None, tier})
+        dearest_usd = cost_usd(self.entry, worst) or 0.0
+        if tier is not None:
+            dearest_usd = max(dearest_usd, cost_usd(self.entry, worst, tier) or 0.0)
         asked = Asked(self.driver, str(request.slot), dearest_usd)
         call = Call(request, order, asked, worst, self.entry.deadline_s)
         call.attempts, call.earlier = [*(earlier or ())], len(earlier or ())
@@ -387,27 +383,38 @@ class LlmClient:
             call.open = self.rounds.waiting.get(call.request.key)
         if call.open:
             self.money.begin_anew(call.order)
-        with self._waiting(call, NO_ROOM, idle=True):
+        if call.order not in self.money.charged_usd:
+            self._waits(call, Wait(NO_ROOM, idle=True))
             await self.money.admit(call.order)
-        alone = not self.passed and not call.open  # nobody waits for an answer that may take hours
-        telling: asyncio.TimerHandle | None = None
-        if alone:
-            with self._waiting(call, f"for the first answer of {self.driver}"):
-                await self._alone.acquire()
-            if self.passed:  # answered meanwhile: nobody goes alone any more
-                self._alone.release()
-                alone = False
-            else:
-                loop = asyncio.get_running_loop()
-                telling = loop.call_later(LONG_WAIT_S, self._tell_first_wait, call)
+            call.wait = None
+        if call.damaged:
+            await self._quarantine(call)
+        if call.open:  # the attempt that has begun in a batch is the one that goes on
+            end = call.open.note.lines[call.request.key]
+            call.attempts = [each for each in call.attempts if each.number < end]
+            call.earlier = len(call.attempts)
+        elif not self.passed:  # nobody waits for an answer that may take hours
+            return await self._first(call)
         try:
-            if call.damaged:
-                await self._quarantine(call)
-            if call.open:  # the attempt that has begun in a batch is the one that goes on
-                end = call.open.note.lines[call.request.key]
-                call.attempts = [each for each in call.attempts if each.number < end]
-                call.earlier = len(call.attempts)
-            return await self._attempts(call)
+            return await self._attempt(call)
+        except TryAgain as exc:
+            return await self._try_again(call, exc)
+
+    async def _first(self, call: Call) -> ChatReply:
+        """Make a call alone, or with others where one has been answered meanwhile."""
+        self._waits(call, Wait(f"for the first answer of {self.driver}"))
+        await self._alone.acquire()
+        call.wait = None
+        alone, telling = not self.passed, None
+        if alone:
+            loop = asyncio.get_running_loop()
+            telling = loop.call_later(LONG_WAIT_S, self._tell_first_wait, call)
+        else:
+            self._alone.release()
+        try:
+            return await self._attempt(call)
+        except TryAgain as exc:
+            return await self._try_again(call, exc)
         except SweepStopped:
             alone = False  # the next call would only be refused in the same way
             raise
@@ -438,15 +445,12 @@ class LlmClient:
         _, earlier = self.cache.look_up(key)
         call.attempts, call.earlier = [*earlier], len(earlier)
 
-    async def _attempts(self, call: Call) -> ChatReply:
-        """Make attempts until one brings an answer, which is kept together with all of them."""
-        failed: list[TryAgain] = []
-        try:
-            return await self._attempt(call)
-        except TryAgain as exc:
-            failed.append(exc)
-        # Only now, since it costs time and memory that most calls need not spend.
+    async def _try_again(self, call: Call, first: TryAgain) -> ChatReply:
+        """Make attempts after a failed first one, until one brings an answer."""
+        # Only here, since it costs time and memory that most calls need not spend.
         from tenacity import AsyncRetrying, retry_if_exception_type
+
+        failed = [first]
 
         async def next_attempt() -> ChatReply:
             if failed:
@@ -470,11 +474,12 @@ class LlmClient:
         call.left_s -= seconds
         until = datetime.now(UTC) + timedelta(seconds=seconds)
         why = f"after {call.last_failure}"
-        with self._waiting(call, why, until):
-            if seconds >= LONG_WAIT_S:
-                line = f"{self.driver}: {call.asked.slot} waits until {until:%H:%M:%S} UTC {why}"
-                self.meter.notes.append(line)
-            await asyncio.sleep(seconds)
+        self._waits(call, Wait(why, until))
+        if seconds >= LONG_WAIT_S:
+            line = f"{self.driver}: {call.asked.slot} waits until {until:%H:%M:%S} UTC {why}"
+            self.meter.notes.append(line)
+        await asyncio.sleep(seconds)
+        call.wait = None
 
     def _out_of_time(self, call: Call, delay_s: float) -> MergeRunnerError:
         """Return the error of a call whose deadline would pass before the next attempt."""
@@ -503,19 +508,20 @@ class LlmClient:
             asked = replace(asked, honest_usd=asked.honest_usd * self.batch_price)
         who = (call.order, call.request.key, asked)
         if call.open is None:
-            with self._waiting(call, "for calls in flight to be paid, under --max-cost", idle=True):
-                paid = await self.money.set_aside(*who)
+            self._waits(call, Wait("for calls in flight to be paid, under --max-cost", idle=True))
+            paid = await self.money.set_aside(*who)
+            call.wait = None
         else:
             paid = self.money.going_on(*who)
         with closing(paid):
             if rounds is None or singly:
                 outcome, record = await self._send(call, paid)
                 return await self._concluded(call, paid, outcome, record)
-            with self._waiting(call, f"for batches of {self.model}", idle=True, paid=True):
-                outcome, batch = await rounds.ask(
-                    call.request, len(call.attempts) + 1, paid, self.model, call.open
-                )
-            call.open, call.singly = None, True
+            self._waits(call, Wait(f"for batches of {self.model}", idle=True, paid=True))
+            outcome, batch = await rounds.ask(
+                call.request, len(call.attempts) + 1, paid, self.model, call.open
+            )
+            call.wait, call.open, call.singly = None, None, True
             record, raw = self._record(call, outcome, batch.note.submitted_at), outcome.raw
             usd = record.cost_usd and record.cost_usd * self.batch_price
             if raw is not None and raw.status != 200 and record.usage == Usage():
@@ -527,13 +533,15 @@ class LlmClient:
         """Make one attempt as a request of its own."""
         assert self.transport is not None, "a sealed client asks nothing"
         # A turn must be used as soon as it is given, or the limits do not hold.
-        with self._waiting(call, "for a turn under the rate limits"):
-            # As a provider counts when it admits a request: its text, of which about four bytes
-            # make a token, and the whole output cap.
-            estimate = (call.worst.input_tokens or 0) // 4 + self.entry.max_output_tokens
-            settle = await self.limiter.acquire(estimate, order=call.order)
-        with self._waiting(call, "for the coordinator, which shares --max-cost out"):
+        self._waits(call, Wait("for a turn under the rate limits"))
+        # As a provider counts when it admits a request: its text, of which about four bytes
+        # make a token, and the whole output cap.
+        estimate = (call.worst.input_tokens or 0) // 4 + self.entry.max_output_tokens
+        settle = await self.limiter.acquire(estimate, order=call.order)
+        if self.money.ledger.is_shared_out:
+            self._waits(call, Wait("for the coordinator, which shares --max-cost out"))
             await paid.ask()
+        call.wait = None
         number = len(call.attempts) + 1
         await paid.begin(number)
         began, clock_s = datetime.now(UTC), asyncio.get_running_loop().time
@@ -548,7 +556,7 @@ class LlmClient:
         took_s = clock_s() - began_s
         call.left_s -= took_s
         record = self._record(call, outcome, began, took_s)
-        if record.usage.output_tokens is not None:
+        if settle is not None and record.usage.output_tokens is not None:
             settle((record.usage.input_tokens or 0) + record.usage.output_tokens)
         return outcome, record
 
@@ -622,8 +630,7 @@ class LlmClient:
         if outcome.action == "fail":
             return self._failed(call, "nothing that is asked again would help")
         self.passed = self.known = True
-        empty = sum(attempt.outcome == "empty" for attempt in call.own_attempts)
-        if outcome.name == "empty" and self._wire.retries_empty and empty <= EMPTY_RETRIES:
+        if outcome.name == "empty" and self._wire.retries_empty and call.empty <= EMPTY_RETRIES:
             return TryAgain("empty answer")
         return None
 

@@ -14,7 +14,8 @@ import fcntl
 import os
 import re
 import sqlite3
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import repeat
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -59,7 +60,7 @@ class BatchWriter:
     It returns their results, and for one that failed alone its error.
     """
 
-    def __init__(self, run: Callable[[list[Operation]], list[Any]]) -> None:
+    def __init__(self, run: Callable[[Sequence[Operation]], list[Any]]) -> None:
         self._run = run
         self._waiting: list[tuple[Operation, asyncio.Future[Any]]] = []
         self._writing: asyncio.Task[None] | None = None
@@ -75,16 +76,16 @@ class BatchWriter:
     async def _write_all(self) -> None:
         """Write in each batch all that has gathered while the previous one was written."""
         while self._waiting:
-            batch, self._waiting = self._waiting, []
+            operations, futures = zip(*self._waiting, strict=True)
+            self._waiting = []
             # In a thread, since the event loop must not wait for a disk.
-            run = asyncio.to_thread(self._run, [operation for operation, _ in batch])
-            running = asyncio.ensure_future(run)
+            running = asyncio.ensure_future(asyncio.to_thread(self._run, operations))
             await asyncio.wait([running])
             failed = running.exception()
-            for place, (_, future) in enumerate(batch):
+            results = repeat(failed) if failed else running.result()
+            for future, result in zip(futures, results, strict=False):
                 if future.cancelled():  # whoever gave up waiting disturbs no other
                     continue
-                result = failed or running.result()[place]
                 if isinstance(result, BaseException):
                     future.set_exception(result)
                 else:

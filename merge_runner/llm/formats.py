@@ -294,11 +294,13 @@ def usage_of(counts: object, *, total: str = "", **places: str) -> Usage:
     Some servers (xAI, gateways) leave the reasoning out of the output: it is at least what the
     ``total`` has beside the input, and where it is less than the reasoning alone both are added.
     """
-    told = dict[str, int | None]()
+    sums = dict[str, int]()
     for name, paths in places.items():
-        known = [count for p in paths.split() if (count := as_count(at(counts, p))) is not None]
-        told[name] = sum(known) if known else None
-    usage = Usage(**told)
+        for path in paths.split():
+            count = as_count(at(counts, path))
+            if count is not None:
+                sums[name] = sums.get(name, 0) + count
+    usage = Usage(**sums)
     read, written, reasoned = usage.input_tokens, usage.output_tokens, usage.reasoning_tokens or 0
     if written is not None and reasoned > written:
         written = min(written + reasoned, MOST_TOKENS)
@@ -366,7 +368,7 @@ class OpenAIChat(WireFormat):
                 reasoning_tokens="completion_tokens_details.reasoning_tokens",
                 total="total_tokens",
             ),
-            reasoning="".join(dict.fromkeys(as_text(each) or "" for each in thoughts)),
+            reasoning="".join(dict.fromkeys(filter(None, map(as_text, thoughts)))),
             service_tier=as_text(payload.get("service_tier")),
         )
 

@@ -83,6 +83,7 @@ class Mask:
         }
         # The least that any spelling of a character of theirs has.
         self._escape = "\\" if any({*secret} & {*'/"\\'} for secret in given) else "\\u00"
+        self._hints = re.compile("|".join(map(re.escape, [*self._pieces, self._escape])))
         runs = {s[at : at + RUN] for s in given for at in range(max(1, len(s) - RUN + 1))}
         # Each run wherever it begins; of a short secret, which may begin a run, there is one alone.
         longest_first = sorted(map(re.escape, runs), key=len, reverse=True)
@@ -90,6 +91,8 @@ class Mask:
 
     def __call__(self, text: str) -> str:
         """Return the text without the secrets."""
+        if self._hints.search(text) is None:
+            return text
         kept, done = [], 0
         for begin, end in sorted(self._spans(text, NESTED)):
             if begin >= done:
@@ -207,11 +210,14 @@ class HttpTransport:
 
     def _refuse_others(self, reply: httpx.Response, own_id: str) -> None:
         """Raise TransportFailure where an answer names another request of this transport."""
-        named = [part.strip() for h in ID_HEADERS for part in reply.headers.get(h, "").split(",")]
-        ours = {part for part in named if part.startswith(self._own)}
-        self._answers_named = bool(ours)
-        if ours - {own_id}:
-            raise TransportFailure("wrong_answer", "the server sent the answer to another request")
+        self._answers_named = False
+        for header in ID_HEADERS:
+            for part in reply.headers.get(header, "").split(","):
+                named = part.strip()
+                self._answers_named |= named.startswith(self._own)
+                if named.startswith(self._own) and named != own_id:
+                    why = "the server sent the answer to another request"
+                    raise TransportFailure("wrong_answer", why)
 
     async def _read(self, reply: httpx.Response, most_bytes: int) -> RawReply:
         body = bytearray()
@@ -223,7 +229,7 @@ class HttpTransport:
                     f"the reply is longer than {most_bytes / 1e6:g} MB (max_reply_mb)",
                     action="fail",
                 )
-        headers = {name.lower(): value for name, value in reply.headers.items()}
+        headers = dict(reply.headers.items())  # httpx has their names in lower case
         # As UTF-8, the encoding of JSON, whatever a header says. A provider may echo the key in an
         # error; it must not get into a log or a database.
         text = self._mask(body.decode("utf-8-sig", errors="replace"))

@@ -261,6 +261,8 @@ def judge(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
     if raw.status != 200:
         reading = Reading("error", usage=reading.usage)  # which is billed
         return replace(judge_error(raw.error, wire), reading=reading, raw=raw)
+    if reading.outcome not in ("error", "empty"):
+        return AttemptOutcome("accept", reading.outcome, reading=reading, raw=raw)
     told = is_error(body.get("error")) or is_error(at(body, "choices.0.error"))
     if reading.outcome == "error" and not told and reading.finish_reason in BROKEN_OFF:
         why = f"the server broke its answer off (finish reason {reading.finish_reason})"

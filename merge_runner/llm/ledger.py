@@ -14,14 +14,14 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import Any
 
 from merge_runner.errors import CacheFailed, RecordingError, UsageError
 from merge_runner.llm.cache import FILE, ResponseCache
-from merge_runner.llm.durable import Execute, Rows
+from merge_runner.llm.durable import Execute, ResultT, Rows
 from merge_runner.records import Attempt
 
 TOLERANCE_USD = 1e-9  # sums of floats
@@ -109,14 +109,18 @@ class Ledger:
     """The spending of one sweep; ``scope`` names it in the cache. ``spending`` is its last state.
 
     Several processes may run the sweep: every change sums anew. The ledger of a model that costs
-    nothing has no name, and keeps no record. What ``others`` hold counts under the same cap.
+    nothing has no name, and keeps no record. What ``others`` hold counts under the same cap:
+    ``committed_usd`` is the most that may have been spent under it.
     """
+
+    is_shared_out = False  # by a coordinator, which is asked before each attempt
 
     def __init__(self, store: ResponseCache, scope: str, others: Sequence[str] = ()) -> None:
         self.store = store
         self.scope = scope
         self.spending = Spending()
-        self._others, self._elsewhere_usd = json.dumps(others), 0.0
+        self.committed_usd = 0.0
+        self._others = json.dumps(others)
         # A damaged record is an error only where money is to be spent: a replay needs none.
         with contextlib.suppress(UsageError, CacheFailed, RecordingError):
             self.read()
@@ -127,14 +131,9 @@ class Ledger:
             self._sum(self.store.rows(_SUMS, self.scope, self._others))
         return self.spending
 
-    @property
-    def committed_usd(self) -> float:
-        """The most that may have been spent under the cap, as last read."""
-        return self.spending.committed_usd + self._elsewhere_usd
-
     def _sum(self, rows: Iterable[tuple[Any, ...]]) -> None:
         """Take the rows of _SUMS; raises UsageError for sums that cannot be."""
-        (_, reserved_usd, attempts, _), (_, self._elsewhere_usd, _, _), *spent = rows
+        (_, reserved_usd, attempts, _), (_, elsewhere_usd, _, _), *spent = rows
         spent_usd = overrun_usd = 0.0
         overruns = {}
         for driver, usd, over_usd, most in spent:
@@ -151,6 +150,7 @@ class Ledger:
                 "on with --cache NEW, which counts from 0"
             )
         self.spending = Spending(spent_usd, reserved_usd, attempts, overrun_usd, overruns)
+        self.committed_usd = spent_usd + reserved_usd + elsewhere_usd
 
     def reserve(
         self,
@@ -168,29 +168,39 @@ class Ledger:
         since = datetime.now(UTC).isoformat(timespec="milliseconds")
         place = (asked.driver, asked.slot, asked.honest_usd, since, "in flight")
         execute(_OPEN, (self.scope, key, number, usd, *place))
+        self.committed_usd += usd
         reserved_usd, attempts = self.spending.reserved_usd + usd, self.spending.open_attempts + 1
         self.spending = replace(self.spending, reserved_usd=reserved_usd, open_attempts=attempts)
         return True
 
     async def ask(self, key: str, usd: float, asked: Asked) -> bool:
-        """Return whether there is money for an attempt where others share the cap out."""
+        """Return whether the coordinator has money for an attempt, where there is one."""
         return True
 
     def ended(self, key: str, usd: float | None) -> None:
         """Say there what an attempt at a call has cost; None: unknown."""
 
-    def settle(self, key: str, attempt: Attempt, driver: str, execute: Execute) -> None:
-        """Settle an attempt at a call; its reservation stays where the cost is unknown.
+    def settle(
+        self,
+        key: str,
+        attempt: Attempt,
+        driver: str,
+        keep: Callable[[Execute], ResultT],
+        execute: Execute,
+    ) -> ResultT:
+        """Keep what an attempt at a call brought, and settle what it cost; an operation.
 
-        An operation.
+        Its reservation stays where the cost is unknown. Returns what is kept.
         """
+        kept = keep(execute)
         if not self.scope:
-            return
+            return kept
         if attempt.cost_usd is None:  # it may have been charged
             execute(_KEEP, (attempt.outcome, key, attempt.number))
         else:
             self.pay(key, attempt.number, attempt.cost_usd, driver, execute)
         self._sum(execute(_SUMS, (self.scope, self._others)))
+        return kept
 
     def pay(
         self, key: str, number: int, usd: float, driver: str, execute: Execute

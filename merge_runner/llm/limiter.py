@@ -78,10 +78,10 @@ class Limiter:
         self._changed = asyncio.Event()
         self._dispatcher: asyncio.Task[None] | None = None
 
-    async def acquire(self, tokens: int, *, order: int = 0) -> Callable[[int], None]:
+    async def acquire(self, tokens: int, *, order: int = 0) -> Callable[[int], None] | None:
         """Wait for a turn; ``tokens`` is the estimate of what the request will use.
 
-        What is returned replaces it by the tokens that the request used.
+        Where tokens are limited, what is returned replaces it by those that the request used.
         """
         if self._tpm is not None and tokens > self._tpm:
             raise UsageError(
@@ -100,7 +100,7 @@ class Limiter:
             if self._dispatcher is None or self._dispatcher.done():
                 self._dispatcher = asyncio.create_task(self._dispatch())
             await turn.given
-        return partial(self._settle, turn)
+        return None if self._tpm is None else partial(self._settle, turn)
 
     def pause(self, seconds: float) -> None:
         """Dispatch nothing for a while: the server asked everybody on this key to wait."""

@@ -32,10 +32,10 @@ def cost_usd(entry: ModelEntry, usage: Usage, tier: str | None = None) -> float 
         cached = 0  # the server counts wrongly: none is taken for cheap
     if isinstance(price, Price):
         cached_price = price.input if price.cached_input is None else price.cached_input
-        parts = ((read - cached, price.input), (cached, cached_price), (written, price.output))
         # Decimals of the written figures, so that sums of costs have no digits that nobody wrote.
-        plain = sum(n * Decimal(str(usd)) for n, usd in parts) / PER_MILLION
-        return float(plain * Decimal(str(price.tiers.get(tier or "", 1))))
+        plain = (read - cached) * Decimal(str(price.input)) + cached * Decimal(str(cached_price))
+        plain += written * Decimal(str(price.output))
+        return float(plain / PER_MILLION * Decimal(str(price.tiers.get(tier or "", 1))))
     from genai_prices import Usage as PricedUsage  # here, since it takes long to load
     from genai_prices import calc_price
 

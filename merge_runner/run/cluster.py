@@ -266,6 +266,8 @@ class Desk:
 class ToldLedger(Ledger):
     """A worker's ledger, whose attempts the coordinator reserves before they begin."""
 
+    is_shared_out = True
+
     def __init__(self, store: ResponseCache, scope: str, desk: Desk) -> None:
         super().__init__(store, scope)
         self._desk = desk

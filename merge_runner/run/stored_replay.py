@@ -30,6 +30,7 @@ from merge_runner.records import (
     SIDES,
     Attempt,
     CallFailed,
+    ChatRequest,
     Slot,
     TrialRecord,
     TrialSpec,
@@ -230,7 +231,7 @@ class StoredReplies:
     rows: list[dict[str, Any]] = field(init=False)
     has_recording: bool = False
 
-    def look_up(self, key: str) -> tuple[CachedCall | None, tuple[Attempt, ...]]:
+    def look_up(self, key: str, _: ChatRequest) -> tuple[CachedCall | None, tuple[Attempt, ...]]:
         """Return the call with this key, and no attempts at one without an answer."""
         return self.get(key), ()
 

@@ -212,10 +212,10 @@ async def test_what_is_set_aside_is_told_with_the_reason_of_each_attempt(ledger)
         now(ledger, ledger.reserve, key, number, 0.25, None, O3)
         actual = 0.0 if outcome == "connection_lost" else None
         ended = Attempt(number, outcome, cost_usd=actual)
-        now(ledger, ledger.settle, key, ended, O3.driver)
+        now(ledger, ledger.settle, key, ended, O3.driver, nothing)
     now(ledger, ledger.reserve, "d", 1, 0.125, None, O3)
     now(ledger, ledger.reserve, "paid", 1, 0.25, None, O3)
-    now(ledger, ledger.settle, "paid", tried(0.1), O3.driver)
+    now(ledger, ledger.settle, "paid", tried(0.1), O3.driver, nothing)
     reasons = ledger.reasons()
     assert [(r["outcome"], r["attempts"], r["usd"]) for r in reasons] == [
         ("timeout", 2, 0.5),
@@ -242,7 +242,7 @@ async def test_a_task_s_share_gives_way_to_what_the_task_has_spent_and_open(ledg
     task = Ledger(cache, "task")
     for key in ("a", "b"):
         now(task, task.reserve, key, 1, 0.25, None, O3)
-    now(task, task.settle, "a", tried(0.5), O3.driver)
+    now(task, task.settle, "a", tried(0.5), O3.driver, nothing)
     now(ledger, ledger.reserve, "task 1", 1, 2.0, None, O3)
     now(ledger, ledger.share, "task 1", *task.rows())
     assert ledger.read() == task.read()
@@ -259,7 +259,7 @@ async def test_a_reply_and_its_cost_are_kept_together_or_not_at_all(ledger, cach
     answer = Attempt(1, "ok", 200, cost_usd=0.125, reply="{}")
     operations = {
         "keep": partial(cache.keep, CachedCall(request, (answer,))),
-        "settle": partial(ledger.settle, request.key, answer, O3.driver),
+        "settle": partial(ledger.settle, request.key, answer, O3.driver, nothing),
     }
 
     def raising(execute):
