@@ -480,7 +480,8 @@ def ledger(
 
     Example: merge-runner ledger --cache cache/responses
     """
-    from merge_runner.llm.cache import ResponseCache, require
+    from merge_runner.llm.cache import ResponseCache
+    from merge_runner.llm.cache_file import require
     from merge_runner.llm.ledger import APART, Ledger, scopes
     from merge_runner.run.progress import as_table
 

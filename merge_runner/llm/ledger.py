@@ -20,7 +20,8 @@ from datetime import UTC, datetime
 from typing import Any
 
 from merge_runner.errors import CacheFailed, RecordingError, UsageError
-from merge_runner.llm.cache import FILE, ResponseCache
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.cache_file import FILE
 from merge_runner.llm.durable import Execute, ResultT, Rows
 from merge_runner.records import Attempt
 

@@ -14,7 +14,8 @@ from merge_runner.llm.batch.providers import SERVICES, batch_terms
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.client import Call, LlmClient
+from merge_runner.llm.call import Call
+from merge_runner.llm.client import LlmClient
 from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.llm.models import load_models

@@ -41,7 +41,7 @@ from merge_runner.errors import (
     UsageError,
 )
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.client import Meter, Wait
+from merge_runner.llm.call import Meter, Wait
 from merge_runner.llm.durable import Rows
 from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.llm.limiter import Limiter

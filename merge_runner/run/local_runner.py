@@ -32,7 +32,8 @@ from merge_runner.errors import (
 )
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.client import LlmClient, Wait
+from merge_runner.llm.call import Wait
+from merge_runner.llm.client import LlmClient
 from merge_runner.llm.http_outcome import REGISTRY
 from merge_runner.llm.limiter import Limiter
 from merge_runner.records import SIDES, ChatReply, Decision, Slot, TrialRecord, TrialSpec

@@ -25,7 +25,7 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, NonNegativeInt
 
 from merge_runner.audit.checks import Audit
 from merge_runner.drivers.registry import EMULATOR
-from merge_runner.llm.client import Meter
+from merge_runner.llm.call import Meter
 from merge_runner.llm.ledger import APART, Ledger
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, command_at
 from merge_runner.prompts.blocks import decomposed

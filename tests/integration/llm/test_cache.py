@@ -18,7 +18,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from merge_runner.errors import MergeRunnerError, RecordingError, UsageError
-from merge_runner.llm.cache import TABLES, CachedCall, ResponseCache, TextDisk, import_folder
+from merge_runner.llm.cache import CachedCall, ResponseCache, import_folder
+from merge_runner.llm.cache_file import TABLES, TextDisk
 from merge_runner.llm.ledger import Ledger
 from merge_runner.records import Attempt, ChatRequest, Slot, Usage, make_request
 from tests.support.cases import cases

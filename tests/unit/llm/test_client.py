@@ -9,7 +9,7 @@ import pytest
 
 from merge_runner.errors import EndpointRefused, QuotaExhausted, TrialSuspended, UsageError
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.client import Meter
+from merge_runner.llm.call import Meter
 from merge_runner.llm.http_outcome import TransportFailure
 from merge_runner.llm.ledger import Asked
 from merge_runner.llm.limiter import Limiter, Pause

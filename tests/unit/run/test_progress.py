@@ -5,7 +5,7 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from merge_runner.llm.client import Meter
+from merge_runner.llm.call import Meter
 from merge_runner.records import Attempt, Usage
 from merge_runner.run.estimate import Estimate
 from merge_runner.run.plan import make_plan

@@ -1,0 +1,149 @@
+"""The file of a cache folder: made whole or not at all, refused if it is none of ours, upgraded.
+
+Anybody may have written the file of a folder, and diskcache unpickles keys and values, opens and
+removes the files that rows name, and applies the settings that it finds. So ``TextDisk`` takes and
+gives texts alone, and a file with other settings than ours is refused before diskcache opens it.
+"""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import tempfile
+from contextlib import closing
+from pathlib import Path
+
+import diskcache
+from diskcache.core import METADATA, MODE_RAW, UNKNOWN
+
+from merge_runner.errors import RecordingError, UsageError
+from merge_runner.llm.durable import BUSY_S, ModelLocks, connect, making
+from merge_runner.text_safety import one_line
+
+FILE = "cache.db"
+LEDGER = "ledger.db"  # of format 5, whose money lay in a file of its own
+FORMAT_KEY, FORMAT, BEFORE = "format", "6", "5"
+NEW_CACHE = "`merge-runner recording import FILE --cache NEW` makes one from a recording"
+SETTINGS = diskcache.DEFAULT_SETTINGS | {
+    "eviction_policy": "none",
+    "cull_limit": 0,
+    "size_limit": 2**62,
+    "sqlite_synchronous": 2,  # FULL: an acknowledged reply survives a power cut
+    "disk_min_file_size": 2**40,  # everything in the one SQLite file
+    "sqlite_mmap_size": 0,  # what is mapped counts as this process's memory
+}
+FAILURES = (OSError, sqlite3.Error, UnicodeDecodeError)
+# ``spent`` has sums, since a sum over all attempts at each reservation would take ever longer.
+TABLES = (
+    """CREATE TABLE spent (
+    scope TEXT, driver TEXT, usd REAL NOT NULL, overrun_usd REAL NOT NULL,
+    most_overrun REAL NOT NULL, PRIMARY KEY (scope, driver)) STRICT""",
+    """CREATE TABLE open (
+    scope TEXT, call TEXT, attempt INTEGER, usd REAL NOT NULL, driver TEXT, slot TEXT,
+    worst_usd REAL, since TEXT, outcome TEXT) STRICT""",
+    "CREATE INDEX open_call ON open (call)",
+)
+
+
+class TextDisk(diskcache.Disk):  # type: ignore[misc] # diskcache ships no types
+    """Texts alone: nothing is unpickled, and no file that a row names is opened or removed."""
+
+    def put(self, key: object) -> tuple[str, bool]:
+        """Return the key as it is stored; raises TypeError unless it is a text."""
+        if not isinstance(key, str):
+            raise TypeError("the cache has texts alone as keys")
+        return key, True
+
+    def get(self, key: object, raw: object) -> str:
+        """Return a stored key; raises RecordingError unless it is a text."""
+        if not (raw and isinstance(key, str)):
+            raise RecordingError("the cache holds a key that is no text: it is not ours")
+        return key
+
+    def store(self, value: object, read: bool, key: object = UNKNOWN) -> tuple[int, int, None, str]:
+        """Return a row's size, mode, file name and value; raises TypeError unless it is a text."""
+        if not isinstance(value, str):
+            raise TypeError("the cache stores texts alone")
+        return 0, MODE_RAW, None, value
+
+    def fetch(self, mode: object, filename: object, value: object, read: bool = False) -> str:
+        """Return the text of a row; raises RecordingError unless it holds one."""
+        if filename is not None or mode != MODE_RAW:
+            raise RecordingError("the cache holds a pickle or names a file: it is not ours")
+        if not isinstance(value, str):
+            raise RecordingError("the recorded reply is damaged: it is no text")
+        return value
+
+    def remove(self, file_path: object) -> None:
+        """Leave a file that a row names where it is: we wrote none."""
+
+
+def open_texts(folder: Path) -> diskcache.Cache:
+    """Return the diskcache of a folder, whose file is made if there is none."""
+    return diskcache.Cache(str(folder), timeout=BUSY_S, disk=TextDisk, **SETTINGS)
+
+
+def refuse_others(folder: Path) -> bytes:
+    """Return the format of a folder's file, as it is written there.
+
+    Raises UsageError for settings that we do not write, since diskcache would obey them, and for
+    the file of another version; the first one left no mark.
+    """
+    sql = "SELECT CAST(value AS BLOB) FROM Cache WHERE key = ? AND raw = 1"
+    with closing(connect(folder / FILE)) as connection:
+        settings = connection.execute("SELECT key, value FROM Settings").fetchall()
+        (mark,) = connection.execute(sql, [FORMAT_KEY]).fetchone() or (b"1",)
+    for key, value in settings:
+        if key not in METADATA and (key not in SETTINGS or value != SETTINGS[key]):
+            name = one_line(repr(key))[:40]
+            raise UsageError(f"{folder / FILE} has the setting {name} of another program")
+    mark = bytes(mark or b"")
+    # Where the mark is damaged, each entry is checked all the same.
+    if mark and mark.isascii() and mark not in (FORMAT.encode(), BEFORE.encode()):
+        raise UsageError(
+            f"the cache {folder} has format {one_line(mark.decode()[:9])}, and this merge-runner "
+            f"has format {FORMAT}: {NEW_CACHE}"
+        )
+    return mark
+
+
+def make(folder: Path) -> None:
+    """Make a folder and its file, whole or not at all: an empty one is never taken for new."""
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    folder.chmod(0o700)
+    if (folder / FILE).exists():
+        return
+    with making(folder), tempfile.TemporaryDirectory(prefix="new-", dir=folder) as new:
+        if not (folder / FILE).exists():
+            with closing(open_texts(Path(new))) as made, made.transact():
+                made.set(FORMAT_KEY, FORMAT)
+                for statement in TABLES:
+                    made._sql(statement)
+            os.replace(Path(new) / FILE, folder / FILE)
+
+
+def upgrade(folder: Path) -> None:
+    """Bring a folder of the format before to this one, with the money of its ledger."""
+    locks = ModelLocks(folder)
+    with making(folder), closing(connect(folder / FILE, "rw")) as database, closing(locks):
+        if refuse_others(folder) == FORMAT.encode():
+            return
+        if not locks.take_all():
+            raise UsageError(f"an older merge-runner works with {folder}: wait until it has ended")
+        has_ledger = (folder / LEDGER).is_file() and (folder / LEDGER).stat().st_size > 0
+        if has_ledger:
+            database.execute("ATTACH ? AS before", [str(folder / LEDGER)])
+        with database:
+            database.execute("BEGIN IMMEDIATE")
+            for statement in TABLES:
+                database.execute(statement)
+            for table in ("spent", "open") if has_ledger else ():
+                database.execute(f"INSERT INTO main.{table} SELECT * FROM before.{table}")  # noqa: S608
+            sql = "UPDATE Cache SET value = ? WHERE key = ? AND raw = 1"
+            database.execute(sql, [FORMAT, FORMAT_KEY])
+
+
+def require(folder: Path) -> None:
+    """Raise UsageError unless there is a cache in a folder."""
+    if not (folder / FILE).exists():
+        raise UsageError(f"there is no cache in {folder}: name one with --cache")
