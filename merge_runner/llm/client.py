@@ -216,7 +216,7 @@ class LlmClient:
         """The calls of this client that are under way."""
         return [call for call in self.under_way.values() if call.asked.driver == self.driver]
 
-    def _waits(self, call: Call, wait: Wait) -> None:
+    def _mark_waiting(self, call: Call, wait: Wait) -> None:
         """Mark a call as waiting, so that it can be given up: nothing of it is in flight.
 
         It is in flight again when its ``wait`` is None. Raises CallFailed where nobody wants it.
@@ -283,7 +283,7 @@ class LlmClient:
         if call.open:
             self.money.begin_anew(call.order)
         if call.order not in self.money.charged_usd:
-            self._waits(call, Wait(NO_ROOM, idle=True))
+            self._mark_waiting(call, Wait(NO_ROOM, idle=True))
             await self.money.admit(call.order)
             call.wait = None
         if call.damaged:
@@ -301,7 +301,7 @@ class LlmClient:
 
     async def _first(self, call: Call) -> ChatReply:
         """Make a call alone, or with others where one has been answered meanwhile."""
-        self._waits(call, Wait(f"for the first answer of {self.driver}"))
+        self._mark_waiting(call, Wait(f"for the first answer of {self.driver}"))
         await self._alone.acquire()
         call.wait = None
         alone, telling = not self.passed, None
@@ -311,9 +311,10 @@ class LlmClient:
         else:
             self._alone.release()
         try:
-            return await self._attempt(call)
-        except TryAgain as exc:
-            return await self._try_again(call, exc)
+            try:
+                return await self._attempt(call)
+            except TryAgain as exc:
+                return await self._try_again(call, exc)
         except SweepStopped:
             alone = False  # the next call would only be refused in the same way
             raise
@@ -373,7 +374,7 @@ class LlmClient:
         call.left_s -= seconds
         until = datetime.now(UTC) + timedelta(seconds=seconds)
         why = f"after {call.last_failure}"
-        self._waits(call, Wait(why, until))
+        self._mark_waiting(call, Wait(why, until))
         if seconds >= LONG_WAIT_S:
             line = f"{self.driver}: {call.asked.slot} waits until {until:%H:%M:%S} UTC {why}"
             self.meter.notes.append(line)
@@ -407,7 +408,9 @@ class LlmClient:
             asked = replace(asked, honest_usd=asked.honest_usd * self.batch_price)
         who = (call.order, call.request.key, asked)
         if call.open is None:
-            self._waits(call, Wait("for calls in flight to be paid, under --max-cost", idle=True))
+            self._mark_waiting(
+                call, Wait("for calls in flight to be paid, under --max-cost", idle=True)
+            )
             paid = await self.money.set_aside(*who)
             call.wait = None
         else:
@@ -416,7 +419,7 @@ class LlmClient:
             if rounds is None or singly:
                 outcome, record = await self._send(call, paid)
                 return await self._concluded(call, paid, outcome, record)
-            self._waits(call, Wait(f"for batches of {self.model}", idle=True, paid=True))
+            self._mark_waiting(call, Wait(f"for batches of {self.model}", idle=True, paid=True))
             outcome, batch = await rounds.ask(
                 call.request, len(call.attempts) + 1, paid, self.model, call.open
             )
@@ -432,13 +435,13 @@ class LlmClient:
         """Make one attempt as a request of its own."""
         assert self.transport is not None, "a sealed client asks nothing"
         # A turn must be used as soon as it is given, or the limits do not hold.
-        self._waits(call, Wait("for a turn under the rate limits"))
+        self._mark_waiting(call, Wait("for a turn under the rate limits"))
         # As a provider counts when it admits a request: its text, of which about four bytes
         # make a token, and the whole output cap.
         estimate = (call.worst.input_tokens or 0) // 4 + self.entry.max_output_tokens
         settle = await self.limiter.acquire(estimate, order=call.order)
         if self.money.ledger.is_shared_out:
-            self._waits(call, Wait("for the coordinator, which shares --max-cost out"))
+            self._mark_waiting(call, Wait("for the coordinator, which shares --max-cost out"))
             await paid.ask()
         call.wait = None
         number = len(call.attempts) + 1

@@ -124,9 +124,15 @@ async def test_a_first_call_that_waits_says_so_once_with_what_came_last_and_unti
 
 async def test_where_nobody_listens_the_run_ends_within_seconds(begin):
     client = begin(REFUSED)
+    tasks = ask_all(client)
     with pytest.raises(ProviderDown, match=r"refused: check the network, or set OPENAI_BASE_URL"):
-        await client.ask("prompt", slot())
+        await tasks[0]
     assert 5 <= now_s() < 12
+    sent = len(client.transport.sent)
+    await asyncio.sleep(60)
+    assert len(client.transport.sent) == sent, "no other call would fare better"
+    await client.drain()
+    await asyncio.gather(*tasks, return_exceptions=True)
 
 
 async def test_a_server_that_has_answered_is_waited_for_as_long_as_a_call_may_take(begin):
