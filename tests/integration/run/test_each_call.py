@@ -1,5 +1,6 @@
 """What each further call of a trial takes: counted, since times differ from machine to machine."""
 
+import re
 import sqlite3
 import sys
 import threading
@@ -11,7 +12,7 @@ import pytest
 import merge_runner
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import Options, make_plan
-from tests.support.harness import a_model, run_sweep
+from tests.support.harness import PROJECT, a_model, run_sweep
 
 # Of a call under a cap, and of one whose reply is recorded, by what is counted.
 BOUNDS = {
@@ -34,6 +35,12 @@ FEW_S, MANY_S = 3, 8  # in each of which both drivers ask
 ROOT = f"{Path(merge_runner.__file__).parent}/"
 # What shows, checks or answers is no part of the way of a call, nor is what it calls.
 ELSEWHERE = ("audit/", "cli/", "emulator/", "planted_effect.py", "run/progress.py")
+
+
+def drawn_path() -> set[str]:
+    """The files of ``llm`` on the path of a call in docs/design.md."""
+    _, _, text = (PROJECT / "docs/design.md").read_text().partition("## The path of a call")
+    return set(re.findall(r"llm/\w+\.py", text.split("```")[1]))
 
 
 class Counts:
@@ -128,5 +135,8 @@ async def test_a_further_call_takes_no_more_than_it_did(counted):
             found[name] = more.total() / calls
             told += [f"{way}, {name}: {found[name]:.1f}, to become {GOALS[name][way]}"]
             told += [f"{n / calls:8.1f} {each}" for each, n in more.most_common() if n]
+        if way == "live":
+            entered = {each.split()[0] for each in many["functions"]}
+            assert {file for file in entered if file.startswith("llm/")} == drawn_path()
         too_many = [name for name, n in found.items() if n > BOUNDS[name][way]]
         assert not too_many, "\n".join(told)
