@@ -126,7 +126,8 @@ class ResponseCache:
         self.has_recording = overlay is not None
         self._open_overlay, self._with_overlay = overlay, contextlib.ExitStack()
         self._disk = TextDisk(str(folder))
-        self.write = BatchWriter(self._run_each).write
+        self._writer = BatchWriter(self._run_each)
+        self.write = self._writer.write
         if read_only:
             require(folder)
         try:
@@ -309,6 +310,7 @@ class ResponseCache:
     def close(self) -> None:
         """Close the folder and the recording before it, and free its locks."""
         self._with_overlay.close()
+        self._writer.close()
         self.locks.close()
         self._reading.close()  # first, since the last one to write ends the journal
         if self._texts is not None:

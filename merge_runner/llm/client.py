@@ -229,7 +229,7 @@ class LlmClient:
 
     def _count(self, reply: ChatReply) -> None:
         """Count an answer that a trial uses, and who gave it where it is another model."""
-        last, meter, cached = reply.attempts[-1], self.meter, reply.cached
+        last, meter, cached = reply.attempts[-1], self.meter, reply.earlier == len(reply.attempts)
         meter.calls_cached += cached
         meter.calls_live += not cached
         shared = cached and reply.request.key in self._answered

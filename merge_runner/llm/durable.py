@@ -15,6 +15,7 @@ import os
 import re
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from itertools import repeat
 from pathlib import Path
 from typing import Any, TypeVar
@@ -62,8 +63,13 @@ class BatchWriter:
 
     def __init__(self, run: Callable[[Sequence[Operation]], list[Any]]) -> None:
         self._run = run
+        self._thread = ThreadPoolExecutor(max_workers=1)
         self._waiting: list[tuple[Operation, asyncio.Future[Any]]] = []
         self._writing: asyncio.Task[None] | None = None
+
+    def close(self) -> None:
+        """Wait for the batch that is being written, and end the thread."""
+        self._thread.shutdown()
 
     def write(self, operation: Callable[[Execute], ResultT]) -> asyncio.Future[ResultT]:
         """Return the future result of an operation, there once its batch is durable."""
@@ -75,11 +81,12 @@ class BatchWriter:
 
     async def _write_all(self) -> None:
         """Write in each batch all that has gathered while the previous one was written."""
+        loop = asyncio.get_running_loop()
         while self._waiting:
             operations, futures = zip(*self._waiting, strict=True)
             self._waiting = []
             # In a thread, since the event loop must not wait for a disk.
-            running = asyncio.ensure_future(asyncio.to_thread(self._run, operations))
+            running = loop.run_in_executor(self._thread, self._run, operations)
             await asyncio.wait([running])
             failed = running.exception()
             results = repeat(failed) if failed else running.result()
