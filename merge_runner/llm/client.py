@@ -84,9 +84,10 @@ class LlmClient:
     ``rounds``, which know it as ``model``, its name in the registry, it may be asked at
     ``batch_price`` as a share of the plain one, or its calls may wait already.
 
-    ``under_way`` are the calls of all clients of a run by key. A call is shared by all who ask for
-    its key. Where they are all cancelled, one that may be paid for goes on, so that its answer is
-    kept, and ``drain`` waits for it; one that still waits for its turn is given up.
+    ``under_way`` are the calls of all clients of a run by key, ``answered`` the keys of those that
+    were answered. A call is shared by all who ask for its key. Where they are all cancelled, one
+    that may be paid for goes on, so that its answer is kept, and ``drain`` waits for it; one that
+    still waits for its turn is given up.
     """
 
     name: str
@@ -103,12 +104,12 @@ class LlmClient:
     model: str = ""
     batch_price: float = 1.0
     under_way: dict[str, Call] = field(default_factory=dict)
+    answered: set[str] = field(default_factory=set)
     meter: Meter = field(default_factory=Meter)
     driver: str = field(init=False)
     _wire: WireFormat = field(init=False)
     _own_names: frozenset[str | None] = field(init=False)
     money: Budget = field(init=False)
-    _answered: set[str] = field(default_factory=set, init=False)  # keys of calls of this run
     _refused: int = 0
     _alone: asyncio.Lock = field(default_factory=asyncio.Lock)
     _stopping: bool = False
@@ -232,7 +233,7 @@ class LlmClient:
         last, meter, cached = reply.attempts[-1], self.meter, reply.earlier == len(reply.attempts)
         meter.calls_cached += cached
         meter.calls_live += not cached
-        shared = cached and reply.request.key in self._answered
+        shared = cached and reply.request.key in self.answered
         meter.calls_shared += shared
         if self.cache.has_recording and cached and not shared:
             meter.calls_recorded += self.cache.in_recording(reply.request.key)
@@ -488,7 +489,7 @@ class LlmClient:
             attempts = tuple(call.attempts)
             answered = CachedCall(call.request, attempts)
             kept = await paid.settle(record, partial(self.cache.keep, answered))
-            self._answered.add(call.request.key)
+            self.answered.add(call.request.key)
             if kept is not answered:  # an import was first
                 return self._read(kept, call.earlier)
             text = outcome.reading.text

@@ -66,7 +66,9 @@ def live_clients(
         rpm, tpm = (limit and max(1, int(limit * share)) for limit in rates)
         limiters.setdefault(model, Limiter(rpm=rpm, tpm=tpm, pause=pauses[plan.endpoints[name]]))
     budget = Budget(ledger, options.max_cost_usd, trial_costs(plan, earlier, batch=options.batch))
-    under_way: dict[str, Call] = {}  # two names of one model may ask the same
+    # Two names of one model may ask the same.
+    under_way: dict[str, Call] = {}
+    answered: set[str] = set()
     clients = {}
     for name, entry in plan.entries.items():
         model, terms = plan.registered[name], batch_terms(entry)
@@ -86,6 +88,7 @@ def live_clients(
             model=model,
             batch_price=terms.price_factor if terms else 1.0,
             under_way=under_way,
+            answered=answered,
         )
     return clients
 
