@@ -114,10 +114,10 @@ def people_of(conditions: Mapping[str, Any], human: Mapping[str, Any]) -> dict[s
             if ahead
         ]
     gap = human["cells"].get("gap")
-    shown = {"gap": f"{gap.text} m {gap.interval}".rstrip()} if gap else {}
+    shown = {"gap": unbroken(f"{gap.text} m {gap.interval}".rstrip())} if gap else {}
     for name, parts in counts.items():
         k, n = (sum(part) for part in zip(*parts, strict=True)) if parts else (0, 0)
         if n:
             ends = brackets([100 * end for end in wilson(k / n, n)])
-            shown[name] = f"{k} of {n}, {number(100 * k / n)} % {ends}"
-    return {name: unbroken(text) for name, text in shown.items()}
+            shown[name] = f"{k} of {n}, " + unbroken(f"{number(100 * k / n)} % {ends}")
+    return shown
