@@ -129,9 +129,9 @@ async def test_a_dry_run_says_what_batches_cost_beside_single_calls(merge_runner
         "sweep", "baseline", *TWO, "--model", "o3", "--batch", "--dry-run", OPENAI_API_KEY="k"
     )
     lines = run.out.splitlines()
-    assert lines[4].startswith("cost    about 0.27 USD in batches; about 0.55 USD and ")
-    assert lines[4].endswith(" minutes if asked singly")
-    assert lines[5] == (
+    assert lines[5].startswith("cost    about 0.27 USD in batches; about 0.55 USD and ")
+    assert lines[5].endswith(" minutes if asked singly")
+    assert lines[6] == (
         "time    about 11 rounds; each takes as long as its slowest batch: minutes, an hour, a day "
         "at most"
     )

@@ -52,7 +52,7 @@ def test_a_study_of_several_is_checked_exported_and_recorded_alone(both, prepare
     said("recording", "export", "of-one.parquet", *OF_ONE)
     info = json.loads(prepare(both, "recording", "info", "of-one.parquet", "--json").out)
     calls = duckdb.sql(f"SELECT count(DISTINCT call_key) FROM '{both}/of-one/calls.parquet'")
-    assert info["calls"] == calls.fetchone()[0]
+    assert info["calls"] == calls.fetchall()[0][0]
 
 
 @pytest.mark.parametrize(

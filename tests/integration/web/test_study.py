@@ -10,6 +10,7 @@ from html import unescape
 
 import pytest
 
+from merge_runner.errors import UsageError
 from merge_runner.results.store import query
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import Study
@@ -151,11 +152,10 @@ def test_the_scope_is_in_the_address_and_every_number_obeys_it(client, db):
     collisions = rows["o3/baseline"]["collisions"]
     assert collisions["n"] + (collisions["undecided"] or 0) == 2
     assert rows["human"]["collisions"]["n"] == 90
-    numbers = [
-        [len(group.trials) for group in Study(db, Selection(sweep=s)).played]
-        for s in ("sweep-1", "no")
-    ]
-    assert numbers == [[21, 11, 11], []]
+    played = Study(db, Selection(sweep="sweep-1")).played
+    assert [len(group.trials) for group in played] == [21, 11, 11]
+    with pytest.raises(UsageError, match="unknown run 'no'; valid: sweep-1"):
+        Study(db, Selection(sweep="no"))
 
 
 def test_links_take_the_scope_to_every_page(client):

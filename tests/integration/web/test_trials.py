@@ -158,7 +158,7 @@ def test_people_and_each_driver_are_summed_up_apart(listing):
 
 
 def test_a_sparkline_cuts_nothing_and_the_page_says_its_scale(listing):
-    rows = read(listing.site.db).every({}, page=1)
+    rows = read(listing.site.db).page({}, "trial", 1)
     with duckdb.connect(str(listing.site.db), read_only=True) as connection:
         ((slowest, fastest),) = connection.execute(
             "SELECT min(velocity_mps), max(velocity_mps) FROM states"
