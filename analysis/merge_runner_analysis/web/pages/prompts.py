@@ -46,8 +46,9 @@ WITH asked AS (
     SELECT side, arg_min(prompt, (condition, trial_id)) AS baseline
     FROM asked WHERE variant = $1 GROUP BY ALL
 )
+SELECT * REPLACE (coalesce(blocks, '{}') AS blocks)
 FROM firsts LEFT JOIN baselines USING (side) LEFT JOIN (
-    SELECT spec_hash, coalesce(spec->>'$.prompt_blocks', '{}') AS blocks FROM specs
+    SELECT spec_hash, spec->>'$.prompt_blocks' AS blocks FROM specs
 ) USING (spec_hash) ORDER BY variant <> $1, variant, reader
 """
 # Trials of a variant and of its driver's baseline in equal conditions and repetitions, whose specs
