@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 
 from merge_runner.config import PERFECT, Perception, ScenarioConfig
 from merge_runner.drivers.registry import PROGRAMS
+from merge_runner.perception import Eyes, error_process
 from merge_runner.records import FAR_BEHIND_M, SIDES
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
-from merge_runner.trial import Eyes, error_process
 from tests.support import driven_trials
 from tests.support.driven_trials import OTHER, both
 
