@@ -13,23 +13,16 @@ from pathlib import Path
 
 import duckdb
 
-from merge_runner.drivers.language_model import LanguageModel
+from merge_runner.drivers.language_model import Question
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.limiter import BURST_S, Limiter
 from merge_runner.llm.models import load_models
-from merge_runner.records import (
-    SIDES,
-    Attempt,
-    ChatReply,
-    Slot,
-    TrialRecord,
-    TrialSpec,
-    make_request,
-)
+from merge_runner.records import Attempt, ChatReply, Decision, TrialRecord, make_request
 from merge_runner.results.database import schema_sql
 from merge_runner.results.rows import rows_of
 from merge_runner.results.store import Store
 from merge_runner.run.plan import make_plan
+from merge_runner.run.trials import TrialMaker
 from merge_runner.trial import play_trial
 
 WAITERS, LIMIT, WINDOW_S = 2_000, 500, 1.0
@@ -69,8 +62,8 @@ def records(count: int) -> list[TrialRecord]:
     text = f"Y\n{'I keep my distance. ' * 80}\n```python\n{[-0.4] * 20}\n```"
     payload = {"id": "ID", "choices": [{"message": {"content": text}, "finish_reason": "stop"}]}
 
-    async def ask(prompt: str, slot: Slot, _: TrialSpec) -> ChatReply:
-        wire = FORMATS[entry.format].request(entry, prompt)
+    def decide(question: Question) -> Decision:
+        wire = FORMATS[entry.format].request(entry, question.prompt)
         request = make_request(
             provider=entry.provider,
             endpoint="benchmark",
@@ -78,20 +71,13 @@ def records(count: int) -> list[TrialRecord]:
             path=wire.path,
             headers=wire.headers,
             body=wire.body,
-            slot=slot,
+            slot=question.slot,
         )
         attempt = Attempt(1, "ok", http_status=200, reply=json.dumps(payload))
-        return ChatReply(text, "ok", request, (attempt,), 0)
+        return question.decide(question.prompt, ChatReply(text, "ok", request, (attempt,), 0))
 
-    async def play() -> list[TrialRecord]:
-        task, model = plan.arms[0].scenario, LanguageModel(ask, plan.parts.prompts)
-        specs = plan.trial_specs()
-        return [
-            await play_trial(spec, task, {side: model.make(task, spec, side) for side in SIDES})
-            for spec in specs[:count]
-        ]
-
-    return asyncio.run(play())
+    trials = TrialMaker(plan)
+    return [play_trial(trials.make(spec), decide) for spec in plan.trial_specs()[:count]]
 
 
 def store(folder: Path) -> dict[str, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -16,60 +16,81 @@ from merge_runner.records import (
     ChatReply,
     Decision,
     Observation,
+    Road,
     Side,
     Slot,
     TrialSpec,
 )
 
-Ask = Callable[[str, Slot, TrialSpec], Awaitable[ChatReply]]
-"""Asks the model with a prompt, for a slot of a trial; raises CallFailed."""
-Known = Callable[[str, Slot], bool]
-"""Whether the model has been asked with a prompt for a slot already."""
-Decided = Callable[[Decision], None]
-"""Gets each decision before it is driven; raises SweepStopped."""
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """A prompt for the model of a driver, and what the driver decides by a reply to it.
+
+    Earlier versions told a driver without a valid plan at each decision that it was its first one:
+    where a prompt has been asked in such ``older`` words, these stay, so that recordings replay.
+    ``decide`` gets the prompt that was asked, and the reply.
+    """
+
+    model: str
+    slot: Slot
+    prompt: str
+    older: str | None
+    decide: Callable[[str, ChatReply], Decision]
 
 
 @dataclass(frozen=True, slots=True)
 class LanguageModel:
-    """Makes drivers that ask one model, with the prompts of the variants."""
+    """Makes the drivers of one model, called ``name`` in a plan, with the prompts of variants."""
 
-    ask: Ask
+    name: str
     prompts: Mapping[str, Prompt]
-    decided: Decided | None = None
-    known: Known | None = None
 
     def make(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> LlmDriver:
         """See MakeDriver."""
         seat = take_seat(scenario, spec, side, model_pace(scenario))
         assert spec.variant is not None, "only human trials have no prompt variant"
         prompt = self.prompts[spec.prompts.get(side, spec.variant)]
-        return LlmDriver(self.ask, spec, seat, prompt, self.decided, self.known)
+        return LlmDriver(self.name, spec, seat, prompt)
 
 
 @dataclass(slots=True)
 class LlmDriver:
     """Keeps the plan between prompts; everything else is in the prompt."""
 
-    ask: Ask
+    model: str
     spec: TrialSpec
     seat: Seat
     prompt: Prompt
-    decided: Decided | None = None
-    known: Known | None = None
     _plan: tuple[float, ...] | None = None
     _executed: int = 0
     _is_first: bool = True
 
-    async def decide(self, observation: Observation, number: int) -> Decision:
-        """Ask the model and drive its plan, or go on with the last valid one.
+    def decide(self, observation: Observation, number: int) -> Question:
+        """Return the question by whose answer it decides."""
+        spec, is_first = self.spec, self._is_first
+        render = partial(
+            render_prompt,
+            observation,
+            None if self._plan is None else self._plan[self._executed :],
+            prompt=self.prompt,
+            scenario=self.seat.scenario,
+        )
+        self._is_first = False
+        return Question(
+            self.model,
+            Slot(spec.condition, spec.repetition, self.seat.side, number, spec.sample_set),
+            render(first=is_first),
+            render(first=True) if self._plan is None and not is_first else None,
+            partial(self._answered, observation.road),
+        )
+
+    def _answered(self, road: Road, prompt: str, reply: ChatReply) -> Decision:
+        """Drive the plan of a reply, or go on with the last valid one.
 
         Where the plan is exhausted, or there is none, the vehicle cruises.
         """
-        scenario, spec = self.seat.scenario, self.spec
-        slot = Slot(spec.condition, spec.repetition, self.seat.side, number, spec.sample_set)
-        prompt = self._prompt(observation, slot)
-        self._is_first = False
-        reply = await self.ask(prompt, slot, spec)
+        scenario = self.seat.scenario
         # A refusal or a truncated answer is an outcome of its own; it is not searched for a plan.
         parsed = (
             parse_reply(reply.text, scenario.plan_actions)
@@ -85,9 +106,9 @@ class LlmDriver:
         self._executed += wanted
         failure = parsed.failure
         if failure is None and parsed.tactical is None:
-            asked = self.prompt.asks_tactical(observation.road)
+            asked = self.prompt.asks_tactical(road)
             failure = NO_DECISION if asked else None
-        decision = Decision(
+        return Decision(
             plan=parsed.plan,
             applied=actions + (0.0,) * (wanted - len(actions)),
             tactical=parsed.tactical,
@@ -97,26 +118,3 @@ class LlmDriver:
             prompt=prompt,
             reply=reply,
         )
-        if self.decided is not None:
-            self.decided(decision)
-        return decision
-
-    def _prompt(self, observation: Observation, slot: Slot) -> str:
-        """The prompt for a slot.
-
-        Earlier versions told a driver without a valid plan at each decision that it was its first
-        one. Where such a prompt has been asked it stays, so that recordings replay.
-        """
-        render = partial(
-            render_prompt,
-            observation,
-            None if self._plan is None else self._plan[self._executed :],
-            prompt=self.prompt,
-            scenario=self.seat.scenario,
-        )
-        prompt = render(first=self._is_first)
-        if self._plan is not None or self._is_first or self.known is None:
-            return prompt
-        older = render(first=True)
-        is_older = self.known(older, slot) and not self.known(prompt, slot)
-        return older if is_older else prompt

@@ -123,7 +123,6 @@ class ResponseCache:
         """
         self.folder = folder
         self.locks = ModelLocks(folder)
-        self.has_recording = overlay is not None
         self._open_overlay, self._with_overlay = overlay, contextlib.ExitStack()
         self._disk = TextDisk(str(folder))
         self._writer = BatchWriter(self._run_each)
@@ -154,9 +153,12 @@ class ResponseCache:
         opened = self._open_overlay
         return self._with_overlay.enter_context(opened()) if opened else {}
 
-    def get(self, key: str) -> CachedCall | None:
-        """Return the entry of a call key; raises RecordingError where it is damaged or made up."""
-        return self._overlay.get(key) or self._kept(key)
+    def get(self, key: str, request: ChatRequest | None = None) -> CachedCall | None:
+        """Return the entry of a call, whose ``request`` is given where it is known.
+
+        Raises RecordingError where it is damaged or made up.
+        """
+        return self._overlay.get(key) or self._kept(key, request)
 
     def in_recording(self, key: str) -> bool:
         """Whether the recording holds an entry of a call key."""
@@ -352,9 +354,9 @@ class ResponseCache:
             aside += f" {len(before) + 1}" if (before := self.names(aside)) else ""
             execute("UPDATE Cache SET key = ? WHERE key = ? AND raw = 1", [aside, name])
 
-    def _kept(self, key: str) -> CachedCall | None:
+    def _kept(self, key: str, request: ChatRequest | None = None) -> CachedCall | None:
         text = self.read(key)
-        return None if text is None else _verified(key, text)
+        return None if text is None else _verified(key, text, request)
 
     def _tried(self, key: str) -> Attempts:
         return _attempts(self.read(_UNANSWERED + key) or "[]")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from functools import partial
@@ -22,7 +22,7 @@ from merge_runner.errors import (
 from merge_runner.llm.budget import Budget, PaidAttempt
 from merge_runner.llm.cache import Attempts, CachedCall, ResponseCache
 from merge_runner.llm.call import Call, Meter, Wait
-from merge_runner.llm.formats import FORMATS, WireFormat, as_text, read_reply
+from merge_runner.llm.formats import FORMATS, WireFormat, as_text
 from merge_runner.llm.http_outcome import (
     UNSURE,
     AttemptOutcome,
@@ -40,19 +40,15 @@ from merge_runner.llm.http_outcome import (
 from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger
 from merge_runner.llm.limiter import Limiter
 from merge_runner.llm.prices import cost_usd, is_underpriced
+from merge_runner.llm.recorded import RecordedReplies
 from merge_runner.records import (
-    ANSWERS,
     SCRIPTED_HEADER,
     Attempt,
     CallFailed,
     ChatReply,
     ChatRequest,
-    ReplayMiss,
     Slot,
     Usage,
-    is_scripted,
-    make_request,
-    reply_object,
     says_scripted,
 )
 
@@ -79,10 +75,10 @@ class LlmClient:
     ``endpoint`` is the identity that enters the keys. ``budget`` is None for a model that costs
     nothing. Until the endpoint has ``passed``, by an answer in its format, the calls of a run go
     alone: a wrong key, URL or parameter costs one call. It is ``known`` where it ever has answered,
-    and ``_refused`` counts the requests that it has refused before. Without a ``transport`` nothing
-    may be asked anew. ``strict`` says that an answer of another model stops the sweep. In
-    ``rounds``, which know it as ``model``, its name in the registry, it may be asked at
-    ``batch_price`` as a share of the plain one, or its calls may wait already.
+    and ``_refused`` counts the requests that it has refused before. ``strict`` says that an answer
+    of another model stops the sweep. In ``rounds``, which know it as ``model``, its name in the
+    registry, it may be asked at ``batch_price`` as a share of the plain one, or its calls may wait
+    already.
 
     ``under_way`` are the calls of all clients of a run by key, ``answered`` the keys of those that
     were answered. A call is shared by all who ask for its key. Where they are all cancelled, one
@@ -94,7 +90,7 @@ class LlmClient:
     entry: ModelEntry
     endpoint: str
     cache: ResponseCache
-    transport: HttpTransport | None
+    transport: HttpTransport
     limiter: Limiter
     budget: Budget | None = None
     strict: bool = False
@@ -105,10 +101,10 @@ class LlmClient:
     batch_price: float = 1.0
     under_way: dict[str, Call] = field(default_factory=dict)
     answered: set[str] = field(default_factory=set)
-    meter: Meter = field(default_factory=Meter)
     driver: str = field(init=False)
+    recorded: RecordedReplies = field(init=False)
+    meter: Meter = field(init=False)
     _wire: WireFormat = field(init=False)
-    _own_names: frozenset[str | None] = field(init=False)
     money: Budget = field(init=False)
     _refused: int = 0
     _alone: asyncio.Lock = field(default_factory=asyncio.Lock)
@@ -118,31 +114,24 @@ class LlmClient:
         """Derive what every call needs."""
         self.driver = driver_name(self.name, self.endpoint)
         self._wire = FORMATS[self.entry.format]
-        self._own_names = frozenset({None, self.entry.id, *self.entry.aliases})
+        self.recorded = RecordedReplies(
+            self.name, self.entry, self.endpoint, self._wire, self.cache
+        )
+        self.meter = self.recorded.meter
         # Without a name a ledger keeps nothing.
         self.money = self.budget or Budget(Ledger(self.cache, ""))
-
-    @property
-    def sealed(self) -> bool:
-        """Whether nothing may be asked anew."""
-        return self.transport is None
 
     async def ask(self, prompt: str, slot: Slot, *, order: int = 0) -> ChatReply:
         """Return the model's reply for a slot; lower ``order`` is served first.
 
         Raises CallFailed, TrialSuspended or SweepStopped.
         """
-        request = self._request(prompt, slot)
+        request = self.recorded.request(prompt, slot)
         reply, attempts = None, None
-        try:
+        with suppress(RecordingError):  # it is damaged
             recorded, attempts = self.cache.look_up(request.key, request)
             if recorded:
-                reply = self._read(recorded, len(recorded.attempts))
-        except RecordingError as exc:
-            if self.sealed:
-                raise CallFailed(f"{self.name}: call {request.key}: {exc}", request) from exc
-        if reply is None and self.transport is None:
-            raise ReplayMiss("no recorded reply", request)
+                reply = self.recorded.read(recorded, len(recorded.attempts))
         if reply is None:
             # The attempts are counted once, for whoever asked first.
             call = self.under_way.get(request.key)
@@ -159,33 +148,14 @@ class LlmClient:
                     call.task.cancel()  # or it would take money for a trial that is left
             if shared:
                 reply = replace(reply, earlier=len(reply.attempts))
-        self._count(reply)
+        self.recorded.count(reply, shared=request.key in self.answered)
         served = reply.attempts[-1].model_served
-        if self.strict and served not in self._own_names:
+        if self.strict and served not in self.recorded.own_names:
             raise SweepStopped(
                 f"{self.driver}: {served} answered where {self.entry.id} was asked for, at {slot}: "
                 "leave --strict-model out, or name it in `aliases` in experiments/models.toml"
             )
         return reply
-
-    def has_asked(self, prompt: str, slot: Slot) -> bool:
-        """Return whether an answer is recorded, be it damaged; one that cannot be asked counts."""
-        try:
-            return self.cache.get(self._request(prompt, slot).key) is not None
-        except (RecordingError, CallFailed):
-            return True
-
-    def _request(self, prompt: str, slot: Slot) -> ChatRequest:
-        wire = self._wire.request(self.entry, prompt)
-        return make_request(
-            provider=self.entry.provider,
-            endpoint=self.endpoint,
-            model=self.entry.id,
-            path=wire.path,
-            headers=wire.headers,
-            body=wire.body,
-            slot=slot,
-        )
 
     async def drain(self) -> None:
         """Let attempts in flight end and be saved, and give up calls that wait for one."""
@@ -227,30 +197,6 @@ class LlmClient:
         if not (call.asking or wait.paid):
             raise CallFailed("its trial was left", call.request)
         call.wait = wait
-
-    def _count(self, reply: ChatReply) -> None:
-        """Count an answer that a trial uses, and who gave it where it is another model."""
-        last, meter, cached = reply.attempts[-1], self.meter, reply.earlier == len(reply.attempts)
-        meter.calls_cached += cached
-        meter.calls_live += not cached
-        shared = cached and reply.request.key in self.answered
-        meter.calls_shared += shared
-        if self.cache.has_recording and cached and not shared:
-            meter.calls_recorded += self.cache.in_recording(reply.request.key)
-        if last.model_served not in self._own_names:
-            meter.mismatches[f"{self.entry.id} -> {last.model_served}"] += 1
-        if self.entry.provider != "emulator":
-            meter.stand_ins += is_scripted(reply.request, last)
-
-    def _read(self, recorded: CachedCall, earlier: int) -> ChatReply:
-        """Read an answer anew, as an audit does: an earlier version may have read it otherwise."""
-        attempts, last = recorded.attempts, recorded.attempts[-1]
-        payload = reply_object(last.reply or "{}") if last.http_status == 200 else {}
-        reading = read_reply(self._wire, payload)
-        if payload and reading.outcome in ANSWERS:
-            last = replace(last, outcome=reading.outcome, usage=reading.usage)
-            attempts = (*attempts[:-1], last)
-        return ChatReply(reading.text, last.outcome, recorded.request, attempts, earlier)
 
     def _start(self, request: ChatRequest, order: int, earlier: Attempts | None) -> Call:
         # An upper bound: no tokeniser makes more tokens than bytes.
@@ -434,7 +380,6 @@ class LlmClient:
 
     async def _send(self, call: Call, paid: PaidAttempt) -> tuple[AttemptOutcome, Attempt]:
         """Make one attempt as a request of its own."""
-        assert self.transport is not None, "a sealed client asks nothing"
         # A turn must be used as soon as it is given, or the limits do not hold.
         self._mark_waiting(call, Wait("for a turn under the rate limits"))
         # As a provider counts when it admits a request: its text, of which about four bytes
@@ -491,7 +436,7 @@ class LlmClient:
             kept = await paid.settle(record, partial(self.cache.keep, answered))
             self.answered.add(call.request.key)
             if kept is not answered:  # an import was first
-                return self._read(kept, call.earlier)
+                return self.recorded.read(kept, call.earlier)
             text = outcome.reading.text
             return ChatReply(text, record.outcome, call.request, attempts, call.earlier)
         if outcome.pause:

@@ -48,8 +48,11 @@ from merge_runner.llm.limiter import Limiter
 from merge_runner.records import Attempt, TrialRecord, TrialSpec, Usage
 from merge_runner.registry import plugin_sources, using
 from merge_runner.run.clients import live_clients
-from merge_runner.run.local_runner import Ended, FirstDecisions, LocalRunner, Room
+from merge_runner.run.guard import FirstDecisions
+from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import Options, Plan
+from merge_runner.run.replay import Replay
+from merge_runner.run.trials import Ended, Room
 from merge_runner.study.parts import catalogue_of
 
 if TYPE_CHECKING:
@@ -541,11 +544,12 @@ class DaskTasks:
 
     async def _recorded(self, specs: Sequence[TrialSpec]) -> Recorded:
         """What the cache holds of the calls of these trials, up to the first that is missing."""
-        player = LocalRunner.sealed(self._plan, self._cache)
+        replay = Replay(self._plan, self._cache)
         answered: dict[str, CachedCall] = {}
         unanswered: dict[str, tuple[Attempt, ...]] = {}
         for spec in specs:
-            record = await player.play_one(spec)
+            await asyncio.sleep(0)
+            record = replay.play_one(spec)
             replies = (row.decision.reply for row in record.decisions)
             answered |= {r.request.key: CachedCall(r.request, r.attempts) for r in replies if r}
             for call in record.failed_calls:

@@ -3,61 +3,41 @@
 from __future__ import annotations
 
 import asyncio
-import math
 import sys
 import traceback
 from collections import Counter
 from collections.abc import (
-    AsyncIterator,
-    Awaitable,
     Callable,
-    Collection,
     Mapping,
     Sequence,
 )
-from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import accumulate, chain
 from pathlib import Path
 
-from merge_runner.drivers.base import MakeDriver
-from merge_runner.drivers.language_model import LanguageModel
+from merge_runner.drivers.language_model import Question
 from merge_runner.errors import (
-    NoValidDecision,
     ProviderDown,
     StoreError,
     StoreLocked,
     TrialSuspended,
 )
 from merge_runner.llm.batch.rounds import Rounds
-from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.call import Wait
 from merge_runner.llm.client import LlmClient
-from merge_runner.llm.http_outcome import REGISTRY
-from merge_runner.llm.limiter import Limiter
-from merge_runner.records import SIDES, ChatReply, Decision, Slot, TrialRecord, TrialSpec
+from merge_runner.records import CallFailed, Decision, Side, TrialRecord, TrialSpec
 from merge_runner.results.store import Store
+from merge_runner.run.guard import FirstDecisions
 from merge_runner.run.plan import Plan
+from merge_runner.run.trials import Ended, Room, TrialMaker
 from merge_runner.text_safety import one_line
-from merge_runner.trial import play_trial
+from merge_runner.trial import Trial
 
-# Called with each trial that ends, or is suspended for lack of money.
-Ended = Callable[[TrialSpec, TrialRecord | TrialSuspended], None]
-# Awaited before a trial begins: returns once there is memory to hold the trial until it is stored.
-Room = Callable[[], Awaitable[None]]
 # More than bad luck explains, since nothing is answered between them; few enough to stop early.
 FAILURES_IN_A_ROW = 10
 # Calls that begin in one round of the event loop, so that each round stays short.
 A_FEW = 16
-# After so many without a valid one a live run stops, before much is paid for what is no result.
-MOST_INVALID = 20
-SHOWN = 300
-ADVICE = (
-    "look at what the prompt asks for, and in which output format; some servers hold a small "
-    "model to it by a grammar. Where replies are cut off or empty, set a higher "
-    f"`max_output_tokens` in {REGISTRY}"
-)
 EVERY_S, POLL_S = 1.0, 0.05
 # Trials in one transaction, which costs as much as storing dozens of them; and in memory while
 # storing fails, as when another program holds the file.
@@ -70,72 +50,6 @@ AGAIN = (
     "When that is fixed, run the same command again: it writes them from the recorded replies "
     "without a call."
 )
-
-
-class FirstDecisions:
-    """The decisions of each model until one is valid, of which so many may be invalid.
-
-    They are ``one_by_one`` where trials can wait for each other.
-    """
-
-    def __init__(self, most_invalid: float = math.inf, *, one_by_one: bool = False) -> None:
-        self._most_invalid = most_invalid
-        self._one_by_one = one_by_one
-        self._valid: set[str] = set()
-        self._invalid: Counter[str] = Counter()
-        self._described: dict[str, str] = {}
-        self._asked: set[str] = set()  # models that a trial asks alone
-        self._changed = asyncio.Event()
-
-    @asynccontextmanager
-    async def turn(self, models: Collection[str]) -> AsyncIterator[None]:
-        """Play a trial when its models have decided validly, or no other trial asks them."""
-        self._check()
-        alone = {*models} if self._one_by_one else set()
-        while alone & self._asked - self._valid:
-            self._changed.clear()
-            await self._changed.wait()
-        alone -= self._valid
-        self._asked |= alone
-        try:
-            yield
-        finally:
-            self._asked -= alone
-            self._changed.set()
-
-    def count(self, model: str, decision: Decision) -> None:
-        """Count a decision; raises NoValidDecision where too many are invalid."""
-        if model not in self._valid:
-            text = decision.reply.text if decision.reply else ""
-            self.add(model, decision.valid, not decision.valid, decision.failure, text)
-            self._check()
-
-    def add(
-        self, model: str, valid: int, invalid: int, failure: str | None, text: str | None
-    ) -> None:
-        """Count so many decisions; ``failure`` and ``text`` are of an invalid one."""
-        if valid:
-            self._valid.add(model)
-            self._changed.set()
-        if invalid:
-            self._invalid[model] += invalid
-            shown = one_line(" ".join((text or "").split()))[:SHOWN]
-            reply = f'"{shown}" ({(failure or "").replace("_", " ")})'
-            self._described.setdefault(model, f"The first reply is {reply}. To mend that {ADVICE}")
-
-    def without_a_valid_one(self, least: float = 1) -> list[str]:
-        """A line for each model with at least so many decisions none of which is valid."""
-        return [
-            f"none of the first {number} decisions of {model} is valid. {self._described[model]}"
-            for model, number in sorted(self._invalid.items())
-            if model not in self._valid and number >= least
-        ]
-
-    def _check(self) -> None:
-        for line in self.without_a_valid_one(self._most_invalid):
-            raise NoValidDecision(
-                f"{line}. What was answered is kept; --keep-going goes on with such a model"
-            )
 
 
 @dataclass
@@ -160,29 +74,7 @@ class LocalRunner:
 
     def __post_init__(self) -> None:
         self.meters = {name: client.meter for name, client in self.clients.items()}
-        self._arms = self.plan.by_label()
-        models = {
-            name: LanguageModel(
-                partial(self._ask, name),
-                self.plan.parts.prompts,
-                partial(self.first.count, name),
-                client.has_asked,
-            )
-            for name, client in self.clients.items()
-        }
-        self._drivers: dict[str, MakeDriver] = {**self.plan.parts.programs, **models}
-
-    @classmethod
-    def sealed(cls, plan: Plan, cache: ResponseCache, in_flight: int = 1) -> LocalRunner:
-        """Return one that plays from recorded replies alone: no key, no connection.
-
-        They come at once: more trials in flight would only wait for each other.
-        """
-        clients = {
-            name: LlmClient(name, entry, plan.endpoints[name], cache, None, Limiter())
-            for name, entry in plan.entries.items()
-        }
-        return cls(plan, clients, in_flight)
+        self._trials = TrialMaker(self.plan)
 
     @property
     def waits(self) -> Sequence[Wait]:
@@ -231,24 +123,30 @@ class LocalRunner:
 
     async def play_one(self, spec: TrialSpec) -> TrialRecord:
         """Play a trial; raises TrialSuspended where there is no money for it."""
-        arm = self._arms[spec.arm]
-        asked = {*arm.asked.values()}
+        asked = {*self._trials.arms[spec.arm].asked.values()}
         async with self.first.turn(self.clients.keys() & asked):
-            drivers = {
-                side: self._drivers[arm.asked[side]].make(arm.scenario, spec, side)
-                for side in SIDES
-            }
             self.running += 1
             try:
-                recorded = asked <= {name for name, c in self.clients.items() if c.sealed}
-                if recorded:
-                    await asyncio.sleep(0)  # nothing in such a trial lets anything else go on
-                return await play_trial(spec, arm.scenario, drivers, in_turn=recorded)
+                return await self._play(self._trials.make(spec), spec.order)
             finally:
                 self.running -= 1
                 self._asking.pop(spec.order, None)
                 for client in self.clients.values():
                     client.money.leave(spec.order)
+
+    async def _play(self, trial: Trial, order: int) -> TrialRecord:
+        """Ask all that is pending side by side; where a driver raises, no other one goes on."""
+        while questions := trial.pending():
+            try:
+                async with asyncio.TaskGroup() as group:
+                    asking = [
+                        group.create_task(self._ask(question, order, trial))
+                        for question in questions
+                    ]
+            except BaseExceptionGroup as errors:
+                raise errors.exceptions[0] from None
+            trial.answer(dict(filter(None, (task.result() for task in asking))))
+        return trial.record()
 
     async def drain(self) -> None:
         """Let calls in flight end and be saved, and drop those that still wait for a turn."""
@@ -256,10 +154,8 @@ class LocalRunner:
 
     def _watch_for_outage(self, record: TrialRecord) -> None:
         """Stop when trials keep failing for one model that answers no call in between."""
-        asked = self._arms[record.spec.arm].asked
+        asked = self._trials.arms[record.spec.arm].asked
         for name in {asked[failed.side] for failed in record.failed_calls}:
-            if self.clients[name].sealed:
-                continue
             since = name, self.clients[name].meter.calls_live
             self._failures_in_a_row[since] += 1
             failed = self._failures_in_a_row[since]
@@ -270,16 +166,25 @@ class LocalRunner:
                     "again, run the same command to go on"
                 )
 
-    async def _ask(self, model: str, prompt: str, slot: Slot, spec: TrialSpec) -> ChatReply:
-        self._asking[spec.order] += 1
+    async def _ask(
+        self, question: Question, order: int, trial: Trial
+    ) -> tuple[Side, Decision] | None:
+        """Return a decision; None where its call failed, which ends the trial."""
+        client, side = self.clients[question.model], question.slot.side
+        self._asking[order] += 1
         try:
-            client = self.clients[model]
-            if not client.sealed:  # thousands of recorded replies would all be ready at once
-                async with self._gate:
-                    await asyncio.sleep(0)
-            return await client.ask(prompt, slot, order=spec.order)
+            async with self._gate:  # thousands of recorded replies would all be ready at once
+                await asyncio.sleep(0)
+            prompt = client.recorded.prompt(question)
+            reply = await client.ask(prompt, question.slot, order=order)
+        except CallFailed as failure:
+            trial.fail(side, failure)
+            return None
         finally:
-            self._asking[spec.order] -= 1
+            self._asking[order] -= 1
+        decision = question.decide(prompt, reply)
+        self.first.count(question.model, decision)
+        return side, decision
 
 
 class Flusher:

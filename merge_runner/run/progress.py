@@ -33,13 +33,11 @@ from merge_runner.records import SIDES, ReplayMiss, Status
 from merge_runner.results.export import write_table
 from merge_runner.run.estimate import Estimate, prompts_of
 from merge_runner.run.plan import Options, Plan
+from merge_runner.run.trials import Player
 from merge_runner.text_safety import printable, say
 
 if TYPE_CHECKING:
     from rich.text import Text
-
-    from merge_runner.run.cluster import DaskTasks
-    from merge_runner.run.local_runner import LocalRunner
 
 PULSE_S = 0.05
 # In pulses: how often the file and a terminal are written, and plain lines.
@@ -159,7 +157,7 @@ class Progress:
 
     plan: Plan
     planned: int
-    runner: LocalRunner | DaskTasks
+    runner: Player
     ledger: Ledger
     stored: int = 0
     cap_usd: float | None = None

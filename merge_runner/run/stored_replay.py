@@ -1,21 +1,18 @@
-"""The audit of a database: a sealed replay, whose rows are compared with those that are stored.
+"""The audit of a database: a replay, whose rows are compared with those that are stored.
 
 The plan comes from the sweep's row, and the replies from the table ``calls`` or from a cache.
 """
 
 from __future__ import annotations
 
-import asyncio
 import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, nullcontext, suppress
-from contextvars import copy_context
 from dataclasses import dataclass, field, fields, replace
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import duckdb
 
@@ -40,8 +37,8 @@ from merge_runner.records import (
 from merge_runner.registry import Catalogue, in_use, require, using
 from merge_runner.results.recording import leaves
 from merge_runner.results.rows import Stored, in_order, rows_of
-from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import Plan, find_parts
+from merge_runner.run.replay import Replay
 from merge_runner.study.crossing import Arm
 from merge_runner.study.parts import declared_catalogue
 from merge_runner.text_safety import one_line
@@ -203,39 +200,30 @@ def _replay(
 ) -> list[Finding]:
     """Play trials by the replies of a cache, or else the stored ones, and compare their rows."""
     stored = StoredReplies(plan, plan.by_label())
-    # Of a cache a sealed client only asks ``look_up``.
-    runner = LocalRunner.sealed(plan, cache or cast(ResponseCache, stored))
+    replay = Replay(plan, cache or stored)
     by_key = {(spec.trial_id, spec.spec_hash): spec for spec in specs}
     kind = "replay" if cache is None else "cache"
-
-    async def compared() -> list[Finding]:
-        findings: list[Finding] = []
-        for key, tables in in_order(connection, by_key):
-            stored.spec, stored.rows = by_key[key], [*tables["calls"].named(key)]
-            record = await runner.play_one(stored.spec)
-            findings += _findings(record, tables, kind, sweep_id)
-        return findings
-
-    # An event loop may run in the caller's thread, where no other one can.
-    with ThreadPoolExecutor(max_workers=1) as thread:
-        return thread.submit(copy_context().run, asyncio.run, compared()).result()
+    findings: list[Finding] = []
+    for key, tables in in_order(connection, by_key):
+        stored.spec, stored.rows = by_key[key], [*tables["calls"].named(key)]
+        findings += _findings(replay.play_one(stored.spec), tables, kind, sweep_id)
+    return findings
 
 
 @dataclass
 class StoredReplies:
-    """The replies in the table ``calls``, as a client finds them: ``rows`` of one trial."""
+    """The replies in the table ``calls``: ``rows`` of one trial."""
 
     plan: Plan
     arms: dict[str, Arm]
     spec: TrialSpec = field(init=False)
     rows: list[dict[str, Any]] = field(init=False)
-    has_recording: bool = False
 
-    def look_up(self, key: str, _: ChatRequest) -> tuple[CachedCall | None, tuple[Attempt, ...]]:
-        """Return the call with this key, and no attempts at one without an answer."""
-        return self.get(key), ()
+    def in_recording(self, _: str) -> bool:
+        """Replies of a database are of none."""
+        return False
 
-    def get(self, key: str) -> CachedCall | None:
+    def get(self, key: str, _: ChatRequest | None = None) -> CachedCall | None:
         """Return the call with this key, each answer read anew; None where there is none.
 
         Raises RecordingError where its request does not have the key, and CallFailed where it

@@ -51,16 +51,17 @@ from merge_runner.results.store import Store, sweep_facts
 from merge_runner.run.clients import check_batches, live_clients, open_rounds
 from merge_runner.run.cluster import DaskTasks, connected
 from merge_runner.run.estimate import Estimate, earlier_answers, estimate
+from merge_runner.run.guard import MOST_INVALID, FirstDecisions
 from merge_runner.run.local_runner import (
     AGAIN,
     BATCH,
-    MOST_INVALID,
-    FirstDecisions,
     Flusher,
     LocalRunner,
 )
 from merge_runner.run.plan import Options, Plan, usual_prompts
 from merge_runner.run.progress import Progress, as_dict, first_of, show_progress, write_standing
+from merge_runner.run.replay import Replay
+from merge_runner.run.trials import Player
 
 INTERRUPTED = 130
 GO_ON = "Run the same command again to go on."
@@ -191,8 +192,10 @@ class Sweep:
         """
         self._stopping = stopping
         db, sweep_id, checked = self._options.db, "", None
-        if self._options.replay and (missing := await self._missing()):
-            progress = self._progress(LocalRunner.sealed(self._plan, self._cache))
+        replay = Replay(self._plan, self._cache)
+        ahead = await replay.look_ahead(self.todo) if self._options.replay else []
+        if missing := [miss for record in ahead for miss in _misses(record)]:
+            progress = self._progress(replay)
             held = described(self._options.recordings, self._cache.entries())
             nothing = f"nothing of this replay is recorded, and nothing is stored: {held}"
             self._explain(missing)
@@ -200,7 +203,8 @@ class Sweep:
         else:
             async with AsyncExitStack() as stack:
                 store = Store(db)
-                progress = self._progress(await self._runner(store, stack))
+                live = bool(self._plan.entries) and not self._options.sends_nothing
+                progress = self._progress(await self._live(store, stack) if live else replay)
                 with unreadable_is_usage():
                     sweep_id = await self._begin(store)
                 shown = show_progress(progress, db, sweep_id, quiet=self._options.quiet)
@@ -218,15 +222,6 @@ class Sweep:
             sweep_id=sweep_id, exit_code=self.exit_code, messages=self.messages,
         )  # fmt: skip
 
-    async def _missing(self) -> list[Miss]:
-        """The first misses of each trial where no call is recorded; none where any is."""
-        runner, misses = LocalRunner.sealed(self._plan, self._cache), list[Miss]()
-        for spec in self.todo:
-            misses += _misses(await runner.play_one(spec))
-            if any(meter.calls_cached for meter in runner.meters.values()):
-                return []
-        return misses
-
     def _explain(self, misses: list[Miss]) -> None:
         left_out: list[str] = []
         for line in explain(misses, self._cache.entries(left_out)) if misses else ():
@@ -235,7 +230,7 @@ class Sweep:
             number = len(left_out)
             self.messages.append(f"{number} rows of the cache are left out, one: {left_out[0]}")
 
-    def _progress(self, runner: LocalRunner | DaskTasks) -> Progress:
+    def _progress(self, runner: Player) -> Progress:
         return Progress(
             plan=self._plan,
             planned=len(self._stored) + len(self.todo),
@@ -265,10 +260,11 @@ class Sweep:
         trials = 0
         arms = self._plan.by_label()
         calls = {label: dict.fromkeys(arm.entries, 0.0) for label, arm in arms.items()}
-        runner = LocalRunner.sealed(self._plan, self._cache)
+        replay = Replay(self._plan, self._cache)
         for spec in [*self._stored, *self.todo] if whole else self.todo:
+            await asyncio.sleep(0)  # another study of this process goes on
             arm = arms[spec.arm]
-            record = await runner.play_one(spec) if arm.entries and not whole else None
+            record = replay.play_one(spec) if arm.entries and not whole else None
             if record is not None and record.status != "failed":
                 continue
             trials += 1
@@ -313,11 +309,9 @@ class Sweep:
         store.begin_sweep(row, self._plan.specs(), self._stored)
         return sweep_id
 
-    async def _runner(self, store: Store, stack: AsyncExitStack) -> LocalRunner | DaskTasks:
-        """What plays the trials: this process, or the workers of a cluster."""
+    async def _live(self, store: Store, stack: AsyncExitStack) -> Player:
+        """What plays trials that may ask models: this process, or the workers of a cluster."""
         plan, options = self._plan, self._options
-        if options.sends_nothing or not plan.entries:
-            return LocalRunner.sealed(plan, self._cache, 1 if plan.entries else options.in_flight)
         earlier = earlier_answers(plan, self._cache)
         self._rounds = rounds = open_rounds(plan, options, self._cache, self._say)
         first = FirstDecisions()
@@ -437,9 +431,8 @@ class Sweep:
             )
         while flusher.dropped:
             again, flusher.dropped = flusher.dropped[:BATCH], flusher.dropped[BATCH:]
-            runner = LocalRunner.sealed(self._plan, self._cache)
-            for spec in again:
-                flusher.add(await runner.play_one(spec))
+            replay = Replay(self._plan, self._cache)
+            await replay.play(again, lambda _, record: flusher.add(record))
             await flusher.close()
 
     def _end(self, store: Store, sweep_id: str) -> None:

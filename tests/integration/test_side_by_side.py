@@ -93,11 +93,11 @@ class Meanwhile:
     def patch(self, monkeypatch):
         decide = LlmDriver.decide
 
-        async def counted(driver, observation, number):
+        def counted(driver, observation, number):
             self.count += 1
             if self.count % 10 == 1:
                 self.call()
-            return await decide(driver, observation, number)
+            return decide(driver, observation, number)
 
         monkeypatch.setattr(LlmDriver, "decide", counted)
 

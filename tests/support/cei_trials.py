@@ -26,8 +26,8 @@ def cei(*, clock=None, **changes):
     return PROGRAMS["cei"].with_changes("cei", changes, clock)
 
 
-async def played(condition, repetition, task, program):
-    return await play(both(program), condition, repetition, scenario=task)
+def played(condition, repetition, task, program):
+    return play(both(program), condition, repetition, scenario=task)
 
 
 def simulated(condition, repetition, task):

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from merge_runner.records import SIDES
-from merge_runner.trial import play_trial
+from merge_runner.trial import Trial, play_trial
 from tests.support.specs import spec_of
 
 OTHER = {"left": "right", "right": "left"}
@@ -14,11 +14,15 @@ def spec(condition, repetition=1):
     return spec_of(condition, repetition=repetition, trial_id=trial_id)
 
 
+def ask_nobody(question):
+    raise AssertionError(f"a program asks {question}")
+
+
 def both(program):
     return dict.fromkeys(SIDES, program)
 
 
-async def play(programs, condition, repetition=1, *, scenario, seeds=None):
+def play(programs, condition, repetition=1, *, scenario, seeds=None):
     """A trial of these programs by side; ``seeds`` by side in place of the slot's."""
     trial, drivers = spec(condition, repetition), {}
     for side, program in programs.items():
@@ -26,4 +30,4 @@ async def play(programs, condition, repetition=1, *, scenario, seeds=None):
         if seeds is not None:
             seat = replace(seat, seed=seeds[side], other_seed=seeds[OTHER[side]])
         drivers[side] = program.driver(seat)
-    return await play_trial(trial, scenario, drivers)
+    return play_trial(Trial(trial, scenario, drivers), ask_nobody)

@@ -229,27 +229,27 @@ def test_no_speed_appears_negative():
     assert max(seen.other_speed_mps for seen in told) > 1.0
 
 
-async def play(name="projected-order", condition="L_4_-8", repetition=1, **scenario):
+def play(name="projected-order", condition="L_4_-8", repetition=1, **scenario):
     task = ScenarioConfig(**scenario)
-    return await driven_trials.play(both(PROGRAMS[name]), condition, repetition, scenario=task)
+    return driven_trials.play(both(PROGRAMS[name]), condition, repetition, scenario=task)
 
 
 def outcome(trial):
     return trial.status, trial.merged_first, trial.end_time_s, trial.states
 
 
-async def test_a_driver_whose_eyes_miss_nothing_drives_as_one_that_is_told_the_truth():
+def test_a_driver_whose_eyes_miss_nothing_drives_as_one_that_is_told_the_truth():
     far = {"range_m": 1e6}
-    trial, usual = await play(perception_left=far, perception_right=far), await play()
+    trial, usual = play(perception_left=far, perception_right=far), play()
     assert outcome(trial) == outcome(usual)
     assert [row.decision for row in trial.decisions] == [row.decision for row in usual.decisions]
     assert all(row.told and row.told.other_seen for row in trial.decisions)
-    foggy = await play(perception_right=FOGGY)
+    foggy = play(perception_right=FOGGY)
     assert outcome(foggy) != outcome(usual)
     assert all((row.told is None) == (row.side == "left") for row in foggy.decisions)
 
 
-async def test_both_sides_have_errors_of_their_own_and_a_slot_keeps_its_errors():
+def test_both_sides_have_errors_of_their_own_and_a_slot_keeps_its_errors():
     """Whoever drives: with a steady world, which does not show who does."""
     noisy = {"perception_left": {"speed_sd_mps": 0.3}, "perception_right": {"speed_sd_mps": 0.3}}
 
@@ -261,12 +261,12 @@ async def test_both_sides_have_errors_of_their_own_and_a_slot_keeps_its_errors()
             if row.side == side
         ][:4]
 
-    trial = await play("constant", "N_0_0", **noisy)
+    trial = play("constant", "N_0_0", **noisy)
     assert errors(trial, "left") != errors(trial, "right")
-    other = await play("projected-order", "N_0_0", **noisy)
+    other = play("projected-order", "N_0_0", **noisy)
     for side in SIDES:
         assert errors(trial, side) == pytest.approx(errors(other, side))
-    again = await play("constant", "N_0_0", 2, **noisy)
+    again = play("constant", "N_0_0", 2, **noisy)
     assert errors(again, "left") != errors(trial, "left")
 
 

@@ -8,12 +8,13 @@ import pytest
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Seat, take_seat
+from merge_runner.drivers.language_model import Question
 from merge_runner.drivers.pace import model_pace, program_pace
 from merge_runner.drivers.registry import PROGRAMS
-from merge_runner.errors import SweepStopped, TrialSuspended, UsageError
+from merge_runner.errors import UsageError
 from merge_runner.records import SIDES, Attempt, CallFailed, ChatRequest, Decision, Slot
 from merge_runner.results.database import SCHEMA
-from merge_runner.trial import play_trial
+from merge_runner.trial import Trial, play_trial
 from tests.support import driven_trials
 from tests.support.driven_trials import both
 from tests.support.specs import spec_of
@@ -23,19 +24,27 @@ ATTEMPTS = (Attempt(1, "http_500"), Attempt(2, "timeout"))
 REQUEST = ChatRequest("key", "test", "test", "model", "/", {}, "{}", Slot("N_0_0", 1, "left", 0, 0))
 
 
-async def play(left, right, condition="N_0_0", *, in_turn=False, **scenario):
-    """A trial; a driver with a ``rate_hz`` keeps it."""
+def begin(left, right, condition="N_0_0", **scenario):
+    """A trial before its first decision; a driver with a ``rate_hz`` keeps it."""
     drivers, task = {"left": left, "right": right}, ScenarioConfig(**scenario)
     for side, driver in drivers.items():
         rate_hz = getattr(driver, "rate_hz", None)
         pace = program_pace(task, rate_hz) if rate_hz else model_pace(task)
         driver.seat = Seat(task, side, pace, 0)
-    return await play_trial(spec_of(condition), task, drivers, in_turn=in_turn)
+    return Trial(spec_of(condition), task, drivers)
 
 
-async def play_constant(condition="N_0_0", **scenario):
+def decide(question):
+    return question.decide(question.prompt, None)
+
+
+def play(*drivers, **scenario):
+    return play_trial(begin(*drivers, **scenario), decide)
+
+
+def play_constant(condition="N_0_0", **scenario):
     programs = both(PROGRAMS["constant"])
-    return await driven_trials.play(programs, condition, scenario=ScenarioConfig(**scenario))
+    return driven_trials.play(programs, condition, scenario=ScenarioConfig(**scenario))
 
 
 class Holding:
@@ -51,80 +60,66 @@ class Holding:
         return self.seat.held(self.action)
 
 
-class Meeting(Holding):
-    """Notes before its answer whether the other driver has been asked as well."""
+class Asking(Holding):
+    """Asks a model, and holds its action whatever the model says."""
 
-    def __init__(self, action):
+    def decide(self, observation, number):
+        self.seen[number] = observation
+        slot = Slot("N_0_0", 1, self.seat.side, number, 0)
+        return Question("model", slot, "prompt", None, self.answered)
+
+    def answered(self, prompt, reply):
+        return self.seat.held(self.action)
+
+
+class Failing(Asking):
+    """Gets no answer at one decision."""
+
+    def __init__(self, action, at):
         super().__init__(action)
-        self.asked = 0
-        self.met = []
-        self.other = None
+        self.at = at
 
-    async def decide(self, observation, number):
-        self.asked += 1
-        await asyncio.sleep(0)  # lets every other task begin, and none that nobody has made
-        self.met.append(self.other.asked == self.asked)
-        return await super().decide(observation, number)
+    def answered(self, prompt, reply):
+        if max(self.seen) == self.at:
+            raise CallFailed("no answer", REQUEST, ATTEMPTS)
+        return super().answered(prompt, reply)
+
+
+def test_both_questions_of_an_instant_are_pending_until_they_are_answered():
+    trial = begin(Asking(0.0), Asking(-1.0))
+    for number in range(10):
+        questions = trial.pending()
+        assert [(q.slot.side, q.slot.decision) for q in questions] == [(s, number) for s in SIDES]
+        assert trial.pending() == questions
+        trial.answer({question.slot.side: decide(question) for question in reversed(questions)})
+    assert trial.pending() == []
+    assert trial.record() == play(Holding(0.0), Holding(-1.0))
+
+
+def test_a_program_decides_at_once_beside_a_driver_that_asks():
+    left, right = Holding(0.3), Asking(-0.6)
+    trial = begin(left, right, "R_-4_8")
+    assert [question.slot.side for question in trial.pending()] == ["right"]
+    assert list(left.seen) == [0]
+    assert play_trial(trial, decide) == play(Asking(0.3), Holding(-0.6), "R_-4_8")
 
 
 class Waiting(Holding):
-    """Waits for ever, and notes when it is given up."""
-
-    given_up = False
+    """A program that waits for something."""
 
     async def decide(self, observation, number):
-        try:
-            await asyncio.Event().wait()
-        except asyncio.CancelledError:
-            await asyncio.sleep(0)
-            self.given_up = True
-            raise
+        await asyncio.sleep(0)
 
 
-class Failing(Holding):
-    """Gets no answer at one decision."""
-
-    def __init__(self, action, at, error=None):
-        super().__init__(action)
-        self.at = at
-        self.error = error or CallFailed("no answer", REQUEST, ATTEMPTS)
-
-    async def decide(self, observation, number):
-        if number == self.at:
-            raise self.error
-        return await super().decide(observation, number)
+def test_a_program_that_waits_is_refused():
+    with pytest.raises(UsageError, match=r"^the right driver waits .*: a program decides at once$"):
+        play(Holding(0.0), Waiting(0.0))
 
 
-class Slow(Holding):
-    """Answers long after the other driver."""
-
-    async def decide(self, observation, number):
-        for _ in range(100):
-            await asyncio.sleep(0)
-        return await super().decide(observation, number)
-
-
-async def test_both_drivers_are_asked_before_either_has_answered():
-    left, right = Meeting(0.0), Meeting(-1.0)
-    left.other, right.other = right, left
-    trial = await play(left, right)
-    assert trial.status == "finished"
-    assert left.met == right.met == [True] * 10
-
-
-async def test_in_turn_the_trial_is_the_same_without_a_task_for_each_driver():
-    at_once = await play(Holding(0.3), Holding(-0.6), "R_-4_8")
-    left, right = Meeting(0.3), Meeting(-0.6)
-    left.other, right.other = right, left
-    assert await play(left, right, "R_-4_8", in_turn=True) == at_once
-    assert not any(left.met)
-    assert all(right.met)
-
-
-async def test_both_drivers_observe_the_same_state():
-    """Also where one of them answers late: neither sees what the other has decided."""
-    left, right = Slow(0.3), Holding(-0.6)
-    trial = await play(left, right, "R_-4_8")
+def test_both_drivers_observe_the_same_state():
+    """Neither sees what the other has decided."""
+    left, right = Asking(0.3), Holding(-0.6)
+    trial = play(left, right, "R_-4_8")
     assert len(left.seen) == len(right.seen) > 5
     for number, from_left in left.seen.items():
         from_right = right.seen[number]
@@ -136,8 +131,8 @@ async def test_both_drivers_observe_the_same_state():
         assert from_right.own_speed_mps == at_step["right"].velocity_mps
 
 
-async def test_decisions_are_made_once_a_second_from_time_0_on():
-    trial = await play(Holding(0.0), Holding(-1.0))
+def test_decisions_are_made_once_a_second_from_time_0_on():
+    trial = play(Holding(0.0), Holding(-1.0))
     # The left car needs 10 s for 100 m; at the end of the track nobody is asked again.
     expected = [(number, float(number), side) for number in range(10) for side in SIDES]
     assert [(row.number, row.time_s, row.side) for row in trial.decisions] == expected
@@ -146,8 +141,8 @@ async def test_decisions_are_made_once_a_second_from_time_0_on():
     assert moved == {"left": 0.0, "right": -2.5}
 
 
-async def test_the_prompt_rate_decides_when_the_drivers_are_asked():
-    trial = await play_constant(prompt_rate_hz=2.5)
+def test_the_prompt_rate_decides_when_the_drivers_are_asked():
+    trial = play_constant(prompt_rate_hz=2.5)
     times = [row.time_s for row in trial.decisions if row.side == "left"]
     assert times[:4] == [0.0, 0.4, 0.8, 1.2]
 
@@ -162,15 +157,15 @@ class Wavering(Holding):
         return Decision(plan=ACTIONS * 4, applied=ACTIONS)
 
 
-async def test_the_actions_of_a_decision_are_driven_in_their_order():
-    trial = await play(Wavering(0), Holding(-1.0))
+def test_the_actions_of_a_decision_are_driven_in_their_order():
+    trial = play(Wavering(0), Holding(-1.0))
     driven = [row.acceleration_mps2 for row in trial.states if row.side == "left"]
     # The row of step 0 is the start of control; steps 1 to 10 are two decisions.
     assert driven[1:11] == pytest.approx([2.5 * a for a in ACTIONS * 2])
 
 
-async def test_a_trial_ends_within_a_second_when_the_cars_collide():
-    trial = await play_constant()
+def test_a_trial_ends_within_a_second_when_the_cars_collide():
+    trial = play_constant()
     # Level cars at 10 m/s are closer than 4.5 m from 82 m on: after 3.2 s, at 3.4 s in steps.
     assert (trial.status, trial.end_time_s, trial.merged_first) == ("collided", 3.4, None)
     assert trial.states[-1].step == 17
@@ -178,19 +173,19 @@ async def test_a_trial_ends_within_a_second_when_the_cars_collide():
     assert len(trial.decisions) == 2 * 4
 
 
-async def test_a_trial_in_which_both_stand_still_times_out():
-    trial = await play(Holding(-1.0), Holding(-1.0))
+def test_a_trial_in_which_both_stand_still_times_out():
+    trial = play(Holding(-1.0), Holding(-1.0))
     assert (trial.status, trial.end_time_s, trial.merged_first) == ("timeout", 30.0, None)
     assert len(trial.decisions) == 2 * 30
     assert trial.error is None
 
 
 @pytest.mark.parametrize("failing", SIDES)
-async def test_a_failed_call_ends_the_trial_and_keeps_what_was_played(failing):
-    drivers = {side: Slow(-0.1) for side in SIDES}
+def test_a_failed_call_ends_the_trial_and_keeps_what_was_played(failing):
+    drivers = {side: Asking(-0.1) for side in SIDES}
     drivers[failing] = Failing(-0.1, at=2)
     (other,) = set(SIDES) - {failing}
-    trial = await play(**drivers)
+    trial = play(**drivers)
     assert (trial.status, trial.merged_first, trial.end_time_s) == ("failed", None, 2.0)
     assert trial.error == f"{failing}: no answer"
     (call,) = trial.failed_calls
@@ -206,9 +201,9 @@ async def test_a_failed_call_ends_the_trial_and_keeps_what_was_played(failing):
     ]
 
 
-async def test_when_both_calls_fail_the_error_names_both_sides():
+def test_when_both_calls_fail_the_error_names_both_sides():
     left, right = Failing(0.0, at=0), Failing(0.0, at=0)
-    trial = await play(left, right)
+    trial = play(left, right)
     assert trial.status == "failed"
     assert trial.error == "left: no answer; right: no answer"
     assert [call.side for call in trial.failed_calls] == list(SIDES)
@@ -216,19 +211,19 @@ async def test_when_both_calls_fail_the_error_names_both_sides():
     assert [(row.step, row.side) for row in trial.states] == [(0, "left"), (0, "right")]
 
 
-async def test_nobody_merged_first_in_a_trial_that_failed_after_the_merge():
+def test_nobody_merged_first_in_a_trial_that_failed_after_the_merge():
     """The left car passes the merge point after 5 s."""
-    trial = await play(Holding(0.0), Failing(-1.0, at=7))
+    trial = play(Holding(0.0), Failing(-1.0, at=7))
     assert (trial.status, trial.end_time_s, trial.merged_first) == ("failed", 7.0, None)
 
 
-async def test_under_own_exit_alone_the_driver_in_the_tunnel_is_not_asked():
+def test_under_own_exit_alone_the_driver_in_the_tunnel_is_not_asked():
     """In L_4_-8 the right car leaves its tunnel 0.785 s after the left one."""
     left, right = Holding(-0.5), Holding(-1.0)
     at_once = Holding(-1.0)
-    await play(Holding(-0.5), at_once, "L_4_-8")
+    play(Holding(-0.5), at_once, "L_4_-8")
     assert list(at_once.seen)[:2] == [0, 1]
-    trial = await play(left, right, "L_4_-8", control_start="own_exit")
+    trial = play(left, right, "L_4_-8", control_start="own_exit")
     assert list(left.seen)[:3] == [0, 1, 2]
     assert list(right.seen)[:2] == [1, 2]
     assert [(row.number, row.side) for row in trial.decisions[:3]] == [
@@ -258,8 +253,8 @@ def decided(trial, side):
     return [row for row in trial.decisions if row.side == side]
 
 
-async def test_each_driver_decides_at_its_own_rate_and_counts_its_own_decisions():
-    trial = await play(deciding(20, -0.1), deciding(5, -0.3), **FINE)
+def test_each_driver_decides_at_its_own_rate_and_counts_its_own_decisions():
+    trial = play(deciding(20, -0.1), deciding(5, -0.3), **FINE)
     left, right = decided(trial, "left"), decided(trial, "right")
     assert [row.number for row in left] == list(range(len(left)))
     assert [row.time_s for row in left] == pytest.approx([0.05 * n for n in range(len(left))])
@@ -269,9 +264,9 @@ async def test_each_driver_decides_at_its_own_rate_and_counts_its_own_decisions(
     assert {len(row.decision.applied) for row in right} == {4}
 
 
-async def test_a_plan_in_steps_of_its_own_drives_the_same_way_in_a_finer_world():
-    coarse = await play(Wavering(0), Holding(-1.0))
-    fine = await play(Wavering(0), deciding(20, -1.0), **FINE)
+def test_a_plan_in_steps_of_its_own_drives_the_same_way_in_a_finer_world():
+    coarse = play(Wavering(0), Holding(-1.0))
+    fine = play(Wavering(0), deciding(20, -1.0), **FINE)
     one, other = (
         {(row.side, row.time_s): (row.position_m, row.velocity_mps) for row in trial.states}
         for trial in (coarse, fine)
@@ -282,11 +277,11 @@ async def test_a_plan_in_steps_of_its_own_drives_the_same_way_in_a_finer_world()
 
 
 @pytest.mark.parametrize("failing", SIDES)
-async def test_a_failed_call_has_the_number_of_its_own_driver(failing):
+def test_a_failed_call_has_the_number_of_its_own_driver(failing):
     drivers = {side: deciding(20, -0.1) for side in SIDES}
     drivers[failing] = Failing(-0.1, at=2)
     (other,) = set(SIDES) - {failing}
-    trial = await play(**drivers, **FINE)
+    trial = play(**drivers, **FINE)
     (call,) = trial.failed_calls
     assert (call.number, call.side, trial.end_time_s) == (2, failing, 2.0)
     # Who was due at that instant too has decided, and it is not driven.
@@ -319,31 +314,8 @@ class Short(Holding):
         return Decision(plan=None, applied=(0.5,))
 
 
-async def test_what_cannot_be_driven_is_refused_in_one_line():
+def test_what_cannot_be_driven_is_refused_in_one_line():
     with pytest.raises(UsageError, match=r"^the left driver decided 1\.5: -1 to 1 can be driven$"):
-        await play(Holding(1.5), Holding(0.0))
+        play(Holding(1.5), Holding(0.0))
     with pytest.raises(UsageError, match=r"the left driver decided on \(0.5,\), and is to drive 5"):
-        await play(Short(0), Holding(0.0))
-
-
-@pytest.mark.parametrize("kind", [TrialSuspended, SweepStopped, UsageError, KeyError])
-@pytest.mark.parametrize("first", SIDES)
-async def test_a_trial_that_is_left_takes_its_other_driver_with_it(kind, first):
-    error, waiting = kind("no more"), Waiting(0.0)
-    drivers = {first: Failing(0.0, at=0, error=error)}
-    drivers = {side: drivers.get(side, waiting) for side in SIDES}
-    with pytest.raises(kind) as told:
-        await play(**drivers)
-    assert told.value is error
-    assert waiting.given_up
-
-
-async def test_a_trial_that_is_cancelled_takes_both_drivers_with_it():
-    drivers = Waiting(0.0), Waiting(0.0)
-    trial = asyncio.create_task(play(*drivers))
-    await asyncio.sleep(0)
-    await asyncio.sleep(0)
-    trial.cancel()
-    with pytest.raises(asyncio.CancelledError):
-        await trial
-    assert [driver.given_up for driver in drivers] == [True, True]
+        play(Short(0), Holding(0.0))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from merge_runner.config import ScenarioConfig
@@ -64,6 +64,13 @@ class World:
     def in_control(self, side: Side) -> bool:
         """Whether the vehicle has left its tunnel; until then it cruises by itself."""
         return self._vehicles[side].positions[-1] > self._track.tunnel_exit_m - 1e-9
+
+    def drive(self, left: Sequence[float | None], right: Sequence[float | None]) -> None:
+        """Drive some steps with the actions of both sides, or until the trial ends."""
+        for of_left, of_right in zip(left, right, strict=True):
+            self.advance({"left": of_left, "right": of_right})
+            if self.status is not None:
+                return
 
     def advance(self, actions: Mapping[Side, float | None]) -> None:
         """Drive one step with normalised actions in [-1, 1]; None lets a vehicle cruise."""

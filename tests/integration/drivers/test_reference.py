@@ -36,11 +36,11 @@ def of_side(trial, side):
 @pytest.mark.parametrize(("condition", "mirror"), [("N_0_0", "N_0_0"), ("L_2_-8", "R_-2_8")])
 @pytest.mark.parametrize("left", MIRRORABLE)
 @pytest.mark.parametrize("right", MIRRORABLE)
-async def test_a_mirrored_pair_gives_the_mirrored_trial(left, right, condition, mirror):
+def test_a_mirrored_pair_gives_the_mirrored_trial(left, right, condition, mirror):
     pair = {"left": MIRRORABLE[left], "right": MIRRORABLE[right]}
     swapped = {OTHER[side]: program for side, program in pair.items()}
-    one = await play(pair, condition, seeds={"left": 5, "right": 77}, scenario=DRAG)
-    other = await play(swapped, mirror, seeds={"right": 5, "left": 77}, scenario=DRAG)
+    one = play(pair, condition, seeds={"left": 5, "right": 77}, scenario=DRAG)
+    other = play(swapped, mirror, seeds={"right": 5, "left": 77}, scenario=DRAG)
     assert (one.status, len(one.states)) == (other.status, len(other.states))
     assert OTHER.get(one.merged_first) == other.merged_first
     for side in SIDES:
@@ -50,13 +50,13 @@ async def test_a_mirrored_pair_gives_the_mirrored_trial(left, right, condition, 
 
 
 @pytest.mark.parametrize("name", sorted({*PROGRAMS} - {"human-replay"}))
-async def test_a_program_declares_chance_exactly_where_another_seed_is_another_trial(name):
+def test_a_program_declares_chance_exactly_where_another_seed_is_another_trial(name):
     def trial(condition, *seeds):
         seeds = dict(zip(SIDES, seeds, strict=True))
         return play(both(PROGRAMS[name]), condition, scenario=FINE, seeds=seeds)
 
     for condition in HUMAN_CONDITIONS:
-        one, other = await trial(condition, 1, 2), await trial(condition, 2, 1)
+        one, other = trial(condition, 1, 2), trial(condition, 2, 1)
         if one.states != other.states:
             break
     assert (one.states != other.states) == PROGRAMS[name].chance
@@ -119,10 +119,10 @@ async def test_an_idm_finds_an_acceleration_whatever_its_parameters(
     assert abs(await accelerates(driver, now, 1)) <= FINE.max_acceleration_mps2
 
 
-async def test_of_two_idm_on_a_tie_exactly_one_yields_and_not_always_the_same():
+def test_of_two_idm_on_a_tie_exactly_one_yields_and_not_always_the_same():
     first = Counter()
     for repetition in range(1, 21):
-        trial = await play(both(PROGRAMS["idm"]), "N_0_0", repetition, scenario=FINE)
+        trial = play(both(PROGRAMS["idm"]), "N_0_0", repetition, scenario=FINE)
         assert trial.status == "finished"
         first[trial.merged_first] += 1
         slowest = {side: min(row.velocity_mps for row in of_side(trial, side)) for side in SIDES}
@@ -156,8 +156,8 @@ async def test_the_human_odds_are_drawn_and_both_sides_agree():
 
 
 @pytest.mark.parametrize("condition", ["L_4_0", "N_0_0", "R_-4_8"])
-async def test_the_second_car_opens_the_human_gap_with_one_acceleration(condition):
-    trial = await play(both(changed("human-odds", gap_sd_m=0.0)), condition, scenario=FINE)
+def test_the_second_car_opens_the_human_gap_with_one_acceleration(condition):
+    trial = play(both(changed("human-odds", gap_sd_m=0.0)), condition, scenario=FINE)
     first, second = trial.merged_first, OTHER[trial.merged_first]
     assert {round(row.acceleration_mps2, 9) for row in of_side(trial, first)} == {0.0}
     held = [round(row.acceleration_mps2, 6) for row in of_side(trial, second)][1:]
@@ -205,9 +205,9 @@ async def test_human_odds_keeps_its_speed_and_draws_once_the_other_is_in_sight(s
 
 @pytest.mark.parametrize("parameter", ["odds_intercept", "odds_headway", "odds_velocity"])
 @pytest.mark.parametrize("value", [1000.0, -1000.0])
-async def test_human_odds_that_are_certain_are_drawn_as_others(parameter, value):
+def test_human_odds_that_are_certain_are_drawn_as_others(parameter, value):
     program = changed("human-odds", **{parameter: value})
-    trial = await play(both(program), "L_4_8", scenario=FINE)
+    trial = play(both(program), "L_4_8", scenario=FINE)
     assert trial.status in ("finished", "collided")
 
 

@@ -17,9 +17,9 @@ CONSTANT = PROGRAMS["constant"].driver
 
 @pytest.mark.parametrize("rule", ["euclid2d", "rectangle", "shared_lane"])
 @pytest.mark.parametrize("condition", CONDITIONS)
-async def test_the_projected_order_opens_a_human_gap_behind_the_earlier_arrival(condition, rule):
+def test_the_projected_order_opens_a_human_gap_behind_the_earlier_arrival(condition, rule):
     scenario = ScenarioConfig(collision_rule=rule)
-    trial = await play(both(PROGRAMS["projected-order"]), condition, scenario=scenario)
+    trial = play(both(PROGRAMS["projected-order"]), condition, scenario=scenario)
     # The condition's name says who is projected to lead; on a tie the right one yields.
     leader = "right" if CONDITIONS[condition].projected_headway_m < 0 else "left"
     assert (trial.status, trial.merged_first) == ("finished", leader)
@@ -39,8 +39,8 @@ async def test_the_projected_order_opens_a_human_gap_behind_the_earlier_arrival(
 
 
 @pytest.mark.parametrize("driver", ["constant", "projected-order"])
-async def test_a_program_holds_one_action_over_a_whole_plan_and_constant_none(driver):
-    trial = await play(both(PROGRAMS[driver]), "L_4_-8", scenario=ScenarioConfig())
+def test_a_program_holds_one_action_over_a_whole_plan_and_constant_none(driver):
+    trial = play(both(PROGRAMS[driver]), "L_4_-8", scenario=ScenarioConfig())
     for decision in (row.decision for row in trial.decisions):
         action = decision.plan[0]
         assert (decision.plan, decision.applied) == ((action,) * 20, (action,) * 5)

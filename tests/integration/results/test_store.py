@@ -27,7 +27,8 @@ from merge_runner.results.store import (
 )
 from merge_runner.run.local_runner import Flusher
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.trial import play_trial
+from merge_runner.trial import Trial, play_trial
+from tests.support.driven_trials import ask_nobody
 from tests.support.gate import HANGS_S
 from tests.support.harness import environment
 from tests.support.specs import spec_of
@@ -58,7 +59,7 @@ def keyed(record: TrialRecord) -> dict:
 def played(condition="L_4_0", *, driver="projected-order", **of_spec) -> TrialRecord:
     trial = spec_of(condition, **of_spec)
     drivers = {side: PROGRAMS[driver].make(SCENARIO, trial, side) for side in ("left", "right")}
-    return asyncio.run(play_trial(trial, SCENARIO, drivers))
+    return play_trial(Trial(trial, SCENARIO, drivers), ask_nobody)
 
 
 @pytest.fixture

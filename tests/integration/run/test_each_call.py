@@ -12,6 +12,7 @@ import pytest
 import merge_runner
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import Options, make_plan
+from merge_runner.run.replay import Replay
 from tests.support.harness import PROJECT, a_model, run_sweep
 
 # Of a call under a cap, and of one whose reply is recorded, by what is counted.
@@ -90,16 +91,19 @@ def counted(monkeypatch, tmp_path):
     """Plays one trial of so many seconds, and returns the number of its calls and its counts."""
     monkeypatch.delenv("EMULATOR_BASE_URL", raising=False)
     (tmp_path / "models.toml").write_text(a_model("priced", price=PRICE))
-    connect, play, counts = sqlite3.connect, LocalRunner.play, Counts()
+    connect, counts = sqlite3.connect, Counts()
 
     def connected(*args, **kwargs):
         connection = connect(*args, **kwargs)
         connection.set_trace_callback(counts.statement)
         return connection
 
-    async def playing(*args, **kwargs):
-        counts.begin()
-        return await play(*args, **kwargs)
+    def counting(play):
+        async def playing(*args, **kwargs):
+            counts.begin()
+            return await play(*args, **kwargs)
+
+        return playing
 
     async def run(seconds: int, *, replay: bool) -> tuple[int, dict[str, Counter[str]]]:
         study = tmp_path / f"{seconds}.toml"
@@ -112,7 +116,9 @@ def counted(monkeypatch, tmp_path):
         return summary["calls"]["cached" if replay else "live"], counts.of
 
     monkeypatch.setattr(sqlite3, "connect", connected)
-    monkeypatch.setattr(LocalRunner, "play", playing)
+    monkeypatch.setattr(LocalRunner, "play", counting(LocalRunner.play))
+    # A replay begins with the trials before the first reply, and does not play them again.
+    monkeypatch.setattr(Replay, "look_ahead", counting(Replay.look_ahead))
     # Threads outlive a run.
     threading.setprofile(counts.profile)
     sys.setprofile(counts.profile)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from merge_runner.run.local_runner import MOST_INVALID
+from merge_runner.run.guard import MOST_INVALID
 from tests.support.harness import watched
 from tests.support.mock_server import FaultPlan
 

@@ -32,22 +32,21 @@ def chat_reply(text, outcome="ok"):
     return ChatReply(text=text, outcome=outcome, request=REQUEST, attempts=(), earlier=0)
 
 
-async def decide(*replies, seen=SEEN, variant="baseline", known=None, begins=0, **scenario):
-    """One decision per reply, from number ``begins`` on; ``known`` says what was asked earlier."""
-    asked = []
-
-    async def ask(prompt, slot, _):
-        asked.append((prompt, slot.decision))
-        reply = replies[slot.decision - begins]
-        return chat_reply(reply) if isinstance(reply, str) else reply
-
+def ask(*replies, seen=SEEN, variant="baseline", begins=0, **scenario):
+    """One question and decision per reply, from number ``begins`` on."""
     scenario = ScenarioConfig(**scenario)
     seat = Seat(scenario, "left", model_pace(scenario), 0)
-    driver = LlmDriver(ask, spec("N_0_0"), seat, prompt_of(variant), known=known)
-    decisions = [await driver.decide(seen, begins + n) for n in range(len(replies))]
-    assert [prompt for prompt, _ in asked] == [decision.prompt for decision in decisions]
-    assert [number - begins for _, number in asked] == list(range(len(replies)))
-    return decisions
+    driver = LlmDriver("model", spec("N_0_0"), seat, prompt_of(variant))
+    for number, reply in enumerate(replies, begins):
+        question = driver.decide(seen, number)
+        assert (question.model, question.slot) == ("model", replace(SLOT, decision=number))
+        answer = chat_reply(reply) if isinstance(reply, str) else reply
+        yield question, question.decide(question.prompt, answer)
+
+
+def decide(*replies, **how):
+    """One decision per reply."""
+    return [decision for _, decision in ask(*replies, **how)]
 
 
 def remaining(decision):
@@ -60,9 +59,9 @@ def listed(plan):
     return f"[{', '.join(f'{a:.2f}' for a in plan)}]"
 
 
-async def test_exactly_the_first_five_actions_of_a_valid_plan_are_applied():
+def test_exactly_the_first_five_actions_of_a_valid_plan_are_applied():
     reply = chat_reply(valid(PLAN))
-    (decision,) = await decide(reply)
+    (decision,) = decide(reply)
     assert (decision.plan, decision.applied) == (PLAN, (0.01, 0.02, 0.03, 0.04, 0.05))
     assert (decision.valid, decision.fallback, decision.failure) == (True, False, None)
     assert (decision.tactical, decision.rationale) == ("M", "I go on.")
@@ -70,30 +69,21 @@ async def test_exactly_the_first_five_actions_of_a_valid_plan_are_applied():
 
 
 @pytest.mark.parametrize("begins", [0, 2])  # 2: a driver that leaves its tunnel later
-async def test_only_the_first_prompt_says_that_it_is_the_first(begins):
-    decisions = await decide(*[INVALID] * 3, valid(PLAN), INVALID, begins=begins)
+def test_only_the_first_prompt_says_that_it_is_the_first(begins):
+    decisions = decide(*[INVALID] * 3, valid(PLAN), INVALID, begins=begins)
     first = "none, this is your first decision"
     assert [remaining(d) for d in decisions] == [first, *["none"] * 3, listed(PLAN[5:])]
 
 
-@pytest.mark.parametrize(
-    ("asked", "expected"),
-    [
-        ({"none, this is your first decision"}, "none, this is your first decision"),
-        ({"none, this is your first decision", "none"}, "none"),
-        (set(), "none"),
-    ],
-)
-async def test_a_prompt_that_an_earlier_version_has_asked_stays_as_it_was(asked, expected):
-    def known(prompt, slot):
-        return slot.decision == 1 and any(f"yet): {words}\n" in prompt for words in asked)
-
-    decisions = await decide(INVALID, INVALID, INVALID, known=known)
-    assert [remaining(d) for d in decisions[1:]] == [expected, "none"]
+def test_what_an_earlier_version_would_have_asked_is_known_until_there_is_a_plan():
+    """It told a driver without a valid plan at each decision that it was its first one."""
+    questions = [question for question, _ in ask(INVALID, INVALID, valid(PLAN), INVALID)]
+    first = questions[0].prompt
+    assert [question.older for question in questions] == [None, first, first, None]
 
 
-async def test_a_plan_without_the_decision_that_was_asked_for_is_driven_and_named():
-    (decision,) = await decide(GO_ON)
+def test_a_plan_without_the_decision_that_was_asked_for_is_driven_and_named():
+    (decision,) = decide(GO_ON)
     assert (decision.valid, decision.failure, decision.tactical) == (True, "no_decision", None)
     assert (decision.plan, decision.applied, decision.fallback) == (PLAN, PLAN[:5], False)
 
@@ -106,8 +96,8 @@ async def test_a_plan_without_the_decision_that_was_asked_for_is_driven_and_name
         (SEEN, "baseline", f"Decision: Merge first\n{list(PLAN)}"),
     ],
 )
-async def test_nothing_is_missing_where_none_is_asked_for_or_one_is_given(seen, variant, text):
-    (decision,) = await decide(text, seen=seen, variant=variant)
+def test_nothing_is_missing_where_none_is_asked_for_or_one_is_given(seen, variant, text):
+    (decision,) = decide(text, seen=seen, variant=variant)
     assert (decision.valid, decision.failure) == (True, None)
 
 
@@ -135,9 +125,9 @@ async def test_nothing_is_missing_where_none_is_asked_for_or_one_is_given(seen, 
         ((PLAN, INVALID), {"prompt_rate_hz": 5}, (PLAN[:1], PLAN[1:2])),
     ],
 )
-async def test_what_is_driven_is_the_newest_plan_from_where_it_was_left(replies, scenario, applied):
+def test_what_is_driven_is_the_newest_plan_from_where_it_was_left(replies, scenario, applied):
     texts = [reply if reply is INVALID else valid(reply) for reply in replies]
-    decisions = await decide(*texts, **scenario)
+    decisions = decide(*texts, **scenario)
     assert tuple(d.applied for d in decisions) == applied
     assert [d.plan for d in decisions] == [None if x is INVALID else x for x in replies]
     assert [d.fallback for d in decisions] == [x is INVALID for x in replies]
@@ -152,22 +142,22 @@ async def test_what_is_driven_is_the_newest_plan_from_where_it_was_left(replies,
         ((valid(PLAN), *[INVALID] * 2), {"fallback": "restart"}, (PLAN[5:], PLAN[5:])),
     ],
 )
-async def test_the_next_prompt_shows_the_actions_that_were_not_executed(replies, scenario, rest):
-    decisions = await decide(*replies, **scenario)
+def test_the_next_prompt_shows_the_actions_that_were_not_executed(replies, scenario, rest):
+    decisions = decide(*replies, **scenario)
     assert [remaining(d) for d in decisions[1:]] == [*map(listed, rest)]
 
 
 @pytest.mark.parametrize("outcome", ["refusal", "truncated", "empty"])
-async def test_an_answer_that_is_not_ok_is_named_and_not_searched_for_a_plan(outcome):
+def test_an_answer_that_is_not_ok_is_named_and_not_searched_for_a_plan(outcome):
     reply = chat_reply(valid(OTHER_PLAN), outcome)
-    decisions = await decide(valid(PLAN), reply)
+    decisions = decide(valid(PLAN), reply)
     found = decisions[1]
     assert (found.valid, found.plan, found.failure, found.tactical) == (False, None, outcome, None)
     assert (found.applied, found.fallback) == (PLAN[5:10], True)
     assert found.reply is reply
 
 
-async def test_the_variant_and_what_is_seen_decide_the_prompt():
-    (baseline,), (ablated,) = await decide(INVALID), await decide(INVALID, variant="A2")
+def test_the_variant_and_what_is_seen_decide_the_prompt():
+    (baseline,), (ablated,) = decide(INVALID), decide(INVALID, variant="A2")
     assert ("Previous plan" in baseline.prompt, "Previous plan" in ablated.prompt) == (True, False)
     assert "Your distance to the merge point: 50.00 m" in baseline.prompt

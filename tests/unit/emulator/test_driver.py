@@ -1,4 +1,3 @@
-import asyncio
 import math
 from dataclasses import replace
 
@@ -14,7 +13,7 @@ from merge_runner.records import SIDES, ChatReply, Slot
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
-from merge_runner.trial import play_trial
+from merge_runner.trial import Trial, play_trial
 from tests.support.specs import spec_of
 
 SCENARIO = ScenarioConfig()
@@ -49,27 +48,24 @@ def first_action(prompt, slot=None):
     return parse_reply(answer(prompt, slot), SCENARIO.plan_actions).plan[0]
 
 
-async def play(condition, repetition):
+def play(condition, repetition):
     """A trial in this process, the scripted driver on either side."""
 
-    async def ask(prompt, slot, _):
-        return ChatReply(answer(prompt, slot), "ok", None, (), earlier=0)
+    def decide(question):
+        text = answer(question.prompt, question.slot)
+        return question.decide(question.prompt, ChatReply(text, "ok", None, (), earlier=0))
 
     spec = spec_of(condition, repetition=repetition, variant="baseline")
-    model = LanguageModel(ask, {"baseline": prompt_of("baseline")})
+    model = LanguageModel("emulator", {"baseline": prompt_of("baseline")})
     drivers = {side: model.make(SCENARIO, spec, side) for side in SIDES}
-    return await play_trial(spec, SCENARIO, drivers)
+    return play_trial(Trial(spec, SCENARIO, drivers), decide)
 
 
 @pytest.fixture(scope="module")
 def trials():
     """The baseline's 110 trials, by condition and repetition."""
-
-    async def play_all():
-        pairs = [(condition, n) for n in REPETITIONS for condition in CONDITIONS]
-        return {pair: await play(*pair) for pair in pairs}
-
-    return asyncio.run(play_all())
+    pairs = [(condition, n) for n in REPETITIONS for condition in CONDITIONS]
+    return {pair: play(*pair) for pair in pairs}
 
 
 def test_draws_are_the_same_on_every_machine_and_keep_their_arguments_apart():

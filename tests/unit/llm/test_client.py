@@ -7,6 +7,7 @@ from collections import Counter
 import diskcache
 import pytest
 
+from merge_runner.drivers.language_model import Question
 from merge_runner.errors import EndpointRefused, QuotaExhausted, TrialSuspended, UsageError
 from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.call import Meter
@@ -110,17 +111,19 @@ async def test_words_that_no_file_can_hold_lose_no_reply(make, cache):
     assert cache.get(reply.request.key).attempts == reply.attempts
 
 
+def question(prompt="prompt", older=None, **repetition):
+    return Question("my-model", slot(**repetition), prompt, older, lambda *answered: answered)
+
+
 async def test_a_damaged_reply_is_told_set_aside_and_asked_again(make, cache):
     key = (await make(answer("old")).ask("prompt", slot())).request.key
     with diskcache.Cache(str(cache.folder)) as stock:
         # One character of the answer differs, and all else is as it was.
         damaged = stock[key] = stock[key].replace("old", "odd")
     client = make(answer("new"))
-    client.transport, server = None, client.transport
     with pytest.raises(CallFailed, match=key) as caught:  # a replay asks nothing again
-        await client.ask("prompt", slot())
+        client.recorded.decide(question())
     assert caught.value.request.key == key
-    client.transport = server
     assert (await client.ask("prompt", slot())).text == "new"
     assert client.meter.damaged == [key]
     assert any(key in note and "set aside" in note for note in client.meter.notes)
@@ -442,27 +445,34 @@ async def test_a_limit_longer_than_the_deadline_ends_the_run_and_an_outage_its_c
         assert (len(client.transport.sent), now_s()) == (1, 0)
 
 
-async def test_a_sealed_replay_misses_what_is_not_recorded(make):
-    await make(answer("recorded")).ask("prompt", slot())
-    client = make(answer("another"))
-    client.transport = None
-    assert (await client.ask("prompt", slot())).text == "recorded"
+async def test_a_replay_misses_what_is_not_recorded(make):
+    client = make(answer("recorded"))
+    await client.ask("prompt", slot())
+    prompt, reply = client.recorded.decide(question())
+    assert (prompt, reply.text, reply.cached) == ("prompt", "recorded", True)
     with pytest.raises(ReplayMiss) as caught:
-        await client.ask("prompt", slot(2))
+        client.recorded.decide(question(repetition=2))
     assert caught.value.request.slot == slot(2)
+    assert (client.meter.calls_live, client.meter.calls_cached) == (1, 1)
+
+
+@pytest.mark.parametrize(
+    ("asked", "expected"), [(["older"], "older"), (["older", "new"], "new"), ([], "new")]
+)
+async def test_a_prompt_that_an_earlier_version_has_asked_stays_as_it_was(make, asked, expected):
+    client = make(*map(answer, asked))
+    for prompt in asked:
+        await client.ask(prompt, slot())
+    assert client.recorded.prompt(question("new", older="older")) == expected
+    assert client.recorded.prompt(question("new")) == "new"
 
 
 @pytest.mark.parametrize("body", [answer("<think>M [1"), answer("M", finish="MAX_TOKENS")])
-async def test_an_answer_that_an_earlier_version_kept_is_read_by_the_rules_of_now(
-    make, cache, body
-):
-    sealed = make(None)
-    sealed.transport = None
-    with pytest.raises(ReplayMiss) as missed:
-        await sealed.ask("p", slot())
+def test_an_answer_that_an_earlier_version_kept_is_read_by_the_rules_of_now(make, cache, body):
+    recorded = make(None).recorded
     kept = Attempt(1, "ok", http_status=200, reply=body.body)
-    cache.put_now([CachedCall(missed.value.request, (kept,))], [])
-    reply = await sealed.ask("p", slot())
+    cache.put_now([CachedCall(recorded.request("prompt", slot()), (kept,))], [])
+    _, reply = recorded.decide(question())
     assert (reply.outcome, reply.attempts[-1].outcome) == ("truncated", "truncated")
     assert reply.attempts[-1].usage == Usage(10, output_tokens=5), "it was kept without"
 

@@ -6,7 +6,7 @@ import pytest
 
 from merge_runner.errors import NoValidDecision
 from merge_runner.records import Decision
-from merge_runner.run.local_runner import MOST_INVALID, FirstDecisions
+from merge_runner.run.guard import MOST_INVALID, FirstDecisions
 
 VALID, INVALID = Decision((0.0,), (0.0,)), Decision(None, (0.0,), failure="no_array", fallback=True)
 

@@ -10,8 +10,9 @@ from merge_runner.records import SIDES
 from merge_runner.registry import using
 from merge_runner.study.file import StudyFile
 from merge_runner.study.parts import declared_catalogue
-from merge_runner.trial import play_trial
+from merge_runner.trial import Trial, play_trial
 from tests.support.braking import BRAKING
+from tests.support.driven_trials import ask_nobody
 
 HEAD = 'repetitions = 1\nconditions = ["N_0_0"]\n'
 
@@ -23,13 +24,13 @@ def plan_of(plan_of):
     return lambda text, models=(): plan_of(text + added, models, BRAKING)
 
 
-async def played(plan):
+def played(plan):
     """The first trial of a plan whose drivers are programs."""
     (spec, *_), (arm, *_) = plan.trial_specs(), plan.arms
     drivers = {
         side: plan.parts.programs[arm.sides[side]].make(arm.scenario, spec, side) for side in SIDES
     }
-    return await play_trial(spec, arm.scenario, drivers)
+    return play_trial(Trial(spec, arm.scenario, drivers), ask_nobody)
 
 
 def specs(plan):
@@ -44,9 +45,9 @@ def hashes(plan):
 MINE = '[drivers.mine]\nprogram = "braking"\n'
 
 
-async def test_a_driver_of_a_study_drives_by_its_parameters_and_has_them_in_its_spec(plan_of):
+def test_a_driver_of_a_study_drives_by_its_parameters_and_has_them_in_its_spec(plan_of):
     plan = plan_of(MINE + "strength = 0.5\n", "mine")
-    assert {row.decision.applied for row in (await played(plan)).decisions} == {(-0.5,)}
+    assert {row.decision.applied for row in (played(plan)).decisions} == {(-0.5,)}
     (spec,) = specs(plan)
     assert spec["left"]["parameters"] == {"set": "mild", "strength": 0.5, "unused": 1.0}
     assert (spec["left"]["program"], spec["left"]["based_on"]) == ("mine", "braking")
@@ -54,10 +55,10 @@ async def test_a_driver_of_a_study_drives_by_its_parameters_and_has_them_in_its_
     assert not before & hashes(plan_of(MINE + "strength = 0.6\n", "mine"))
 
 
-async def test_a_set_brings_its_parameters_and_single_ones_go_before_it(plan_of):
+def test_a_set_brings_its_parameters_and_single_ones_go_before_it(plan_of):
     plan = plan_of(MINE + 'set = "hard"\nunused = 3\n', "mine")
     assert specs(plan)[0]["left"]["parameters"] == {"set": "hard", "strength": 0.9, "unused": 3.0}
-    assert {row.decision.applied for row in (await played(plan)).decisions} == {(-0.9,)}
+    assert {row.decision.applied for row in (played(plan)).decisions} == {(-0.9,)}
 
 
 def test_it_stands_in_pairs_and_in_the_sweep_with_its_study(plan_of):
@@ -66,9 +67,9 @@ def test_it_stands_in_pairs_and_in_the_sweep_with_its_study(plan_of):
     assert "[drivers.mine]" in plan.model_dump(mode="json")["study"]["text"]
 
 
-async def test_a_clock_holds_each_action(plan_of):
+def test_a_clock_holds_each_action(plan_of):
     plan = plan_of(MINE + "clock = 1.0\n", "mine")
-    trial = await played(plan)
+    trial = played(plan)
     left = [row for row in trial.decisions if row.side == "left"]
     assert [row.time_s for row in left] == [float(n) for n in range(len(left))]
     assert specs(plan)[0]["left"]["rate_hz"] == 1.0

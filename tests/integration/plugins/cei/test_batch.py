@@ -14,13 +14,13 @@ TRIALS = [("N_0_0", 1), ("L_0_-8", 4), ("R_-4_8", 9), ("L_4_8", 12)]
 
 
 @pytest.mark.parametrize("resistance", ["human", "none"])
-async def test_a_trial_of_many_is_the_one_that_the_runner_plays(resistance):
+def test_a_trial_of_many_is_the_one_that_the_runner_plays(resistance):
     """Of two rules of collision, one with each resistance."""
     rule = {"human": "rectangle", "none": "euclid2d"}[resistance]
     task = scenario(resistance=resistance, collision_rule=rule)
     traces = simulate(model(task), [simulated(*trial, task) for trial in TRIALS])
     for n, trial in enumerate(TRIALS):
-        record = await played(*trial, task, cei(set="K0"))
+        record = played(*trial, task, cei(set="K0"))
         until = traces.ended_at[n] + 1
         assert (record.status, record.states[-1].step) == (traces.status[n], until - 1)
         found = np.stack([of[:until, :, n] for of in (traces.positions_m, traces.speeds_mps)], 2)

@@ -34,9 +34,9 @@ from tests.support.driven_trials import spec
         ),
     ],
 )
-async def test_one_seeded_trial_stays_as_it_is(view_from_m, end_s, golden):
+def test_one_seeded_trial_stays_as_it_is(view_from_m, end_s, golden):
     eyes = {f"perception_{side}": Perception(view_from_m=view_from_m) for side in SIDES}
-    record = await played("R_0_8", 3, scenario(**eyes), cei(set="K0"))
+    record = played("R_0_8", 3, scenario(**eyes), cei(set="K0"))
     rows = [row for row in record.states if row.step in (20, 80)]
     found = [number for row in rows for number in (row.position_m, row.velocity_mps)]
     assert found == pytest.approx(golden, abs=1e-6)
@@ -112,9 +112,9 @@ def test_the_usual_set_suits_the_resistance_unless_one_is_chosen(resistance):
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize("set_", ["K0", "F1", "drag-free"])
-async def test_a_driver_that_never_sees_the_other_drives_at_the_speed_that_it_desires(set_):
+def test_a_driver_that_never_sees_the_other_drives_at_the_speed_that_it_desires(set_):
     blind = {f"perception_{side}": Perception(view_from_m=1e-9, delay_s=20.0) for side in SIDES}
-    trial = await played("L_4_-8", 1, scenario(**blind), cei(set=set_))
+    trial = played("L_4_-8", 1, scenario(**blind), cei(set=set_))
     assert not any(row.told.other_seen for row in trial.decisions)
     own = [row.velocity_mps for row in trial.states if row.side == "left"]
     assert own == pytest.approx([own[0]] * len(own), abs=0.3)

@@ -71,11 +71,11 @@ def test_a_summary_leaves_out_what_no_fit_can_tell(both):
 @pytest.mark.parametrize("clock_s", [None, 1.0])
 @pytest.mark.parametrize("perception", [{"view_from_m": 25.0}, {"range_m": 7.0}])
 @pytest.mark.parametrize("resistance", ["none", "human"])
-async def test_drivers_that_see_each_other_late_mostly_still_avoid_a_collision(
+def test_drivers_that_see_each_other_late_mostly_still_avoid_a_collision(
     perception, clock_s, resistance
 ):
     eyes = {f"perception_{side}": Perception(**perception) for side in SIDES}
     task, driver = scenario(resistance=resistance, **eyes), cei(clock=clock_s)
     slots = product(("L_4_-8", "N_0_0", "R_-4_8"), (1, 2, 3))
-    trials = [await played(*slot, task, driver) for slot in slots]
+    trials = [played(*slot, task, driver) for slot in slots]
     assert sum(trial.status == "collided" for trial in trials) <= 4

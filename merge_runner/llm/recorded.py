@@ -1,0 +1,133 @@
+"""The recorded replies of one model: all that a replay has, and what a live run looks up first."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+from merge_runner.config import ModelEntry
+from merge_runner.drivers.language_model import Question
+from merge_runner.errors import RecordingError
+from merge_runner.llm.cache import CachedCall
+from merge_runner.llm.call import Meter
+from merge_runner.llm.formats import WireFormat, read_reply
+from merge_runner.records import (
+    ANSWERS,
+    CallFailed,
+    ChatReply,
+    ChatRequest,
+    Decision,
+    ReplayMiss,
+    Slot,
+    is_scripted,
+    make_request,
+    reply_object,
+)
+
+
+class Calls(Protocol):
+    """Recorded calls, as a cache has them."""
+
+    def get(self, key: str, request: ChatRequest) -> CachedCall | None:
+        """Return the call with the key of a request.
+
+        Raises RecordingError for a damaged one, and CallFailed for one that has failed.
+        """
+        ...
+
+    def in_recording(self, key: str) -> bool:
+        """Whether a recording that was named holds the call with this key."""
+        ...
+
+
+@dataclass(slots=True)
+class RecordedReplies:
+    """The replies in ``calls`` to the model ``name`` of a plan at an endpoint, as it is asked.
+
+    The ``meter`` counts those that a trial uses.
+    """
+
+    name: str
+    entry: ModelEntry
+    endpoint: str
+    wire: WireFormat
+    calls: Calls
+    meter: Meter = field(default_factory=Meter)
+    own_names: frozenset[str | None] = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Derive the names under which the model may answer."""
+        self.own_names = frozenset({None, self.entry.id, *self.entry.aliases})
+
+    def decide(self, question: Question) -> Decision:
+        """Return the decision by the recorded reply; raises ReplayMiss or CallFailed."""
+        prompt = self.prompt(question)
+        request = self.request(prompt, question.slot)
+        try:
+            reply = self.reply(request)
+        except RecordingError as exc:
+            raise CallFailed(f"{self.name}: call {request.key}: {exc}", request) from exc
+        if reply is None:
+            raise ReplayMiss("no recorded reply", request)
+        self.count(reply)
+        return question.decide(prompt, reply)
+
+    def prompt(self, question: Question) -> str:
+        """Return the prompt of a question, in the older words where these alone were asked."""
+        prompt, older, slot = question.prompt, question.older, question.slot
+        if older is None or self.has_asked(prompt, slot) or not self.has_asked(older, slot):
+            return prompt
+        return older
+
+    def has_asked(self, prompt: str, slot: Slot) -> bool:
+        """Return whether an answer is recorded, be it damaged; one that cannot be asked counts."""
+        try:
+            request = self.request(prompt, slot)
+            return self.calls.get(request.key, request) is not None
+        except (RecordingError, CallFailed):
+            return True
+
+    def request(self, prompt: str, slot: Slot) -> ChatRequest:
+        """Return the request for a slot."""
+        sent = self.wire.request(self.entry, prompt)
+        return make_request(
+            provider=self.entry.provider,
+            endpoint=self.endpoint,
+            model=self.entry.id,
+            path=sent.path,
+            headers=sent.headers,
+            body=sent.body,
+            slot=slot,
+        )
+
+    def reply(self, request: ChatRequest) -> ChatReply | None:
+        """Return the recorded reply to a request; raises RecordingError for a damaged one."""
+        recorded = self.calls.get(request.key, request)
+        return self.read(recorded, len(recorded.attempts)) if recorded else None
+
+    def read(self, recorded: CachedCall, earlier: int) -> ChatReply:
+        """Read an answer anew, as an audit does: an earlier version may have read it otherwise."""
+        attempts, last = recorded.attempts, recorded.attempts[-1]
+        payload = reply_object(last.reply or "{}") if last.http_status == 200 else {}
+        reading = read_reply(self.wire, payload)
+        if payload and reading.outcome in ANSWERS:
+            last = replace(last, outcome=reading.outcome, usage=reading.usage)
+            attempts = (*attempts[:-1], last)
+        return ChatReply(reading.text, last.outcome, recorded.request, attempts, earlier)
+
+    def count(self, reply: ChatReply, *, shared: bool = False) -> None:
+        """Count an answer that a trial uses, and who gave it where it is another model.
+
+        It is ``shared`` where this run has asked it for another trial.
+        """
+        last, meter = reply.attempts[-1], self.meter
+        cached = reply.earlier == len(reply.attempts)
+        meter.calls_cached += cached
+        meter.calls_live += not cached
+        meter.calls_shared += cached and shared
+        known = cached and not shared
+        meter.calls_recorded += known and self.calls.in_recording(reply.request.key)
+        if last.model_served not in self.own_names:
+            meter.mismatches[f"{self.entry.id} -> {last.model_served}"] += 1
+        if self.entry.provider != "emulator":
+            meter.stand_ins += is_scripted(reply.request, last)

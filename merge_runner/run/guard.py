@@ -1,0 +1,89 @@
+"""Stops a run before much is paid for what is no result."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections import Counter
+from collections.abc import AsyncIterator, Collection
+from contextlib import asynccontextmanager
+
+from merge_runner.errors import NoValidDecision
+from merge_runner.llm.http_outcome import REGISTRY
+from merge_runner.records import Decision
+from merge_runner.text_safety import one_line
+
+# After so many without a valid one a live run stops, before much is paid for what is no result.
+MOST_INVALID = 20
+SHOWN = 300
+ADVICE = (
+    "look at what the prompt asks for, and in which output format; some servers hold a small "
+    "model to it by a grammar. Where replies are cut off or empty, set a higher "
+    f"`max_output_tokens` in {REGISTRY}"
+)
+
+
+class FirstDecisions:
+    """The decisions of each model until one is valid, of which so many may be invalid.
+
+    They are ``one_by_one`` where trials can wait for each other.
+    """
+
+    def __init__(self, most_invalid: float = math.inf, *, one_by_one: bool = False) -> None:
+        self._most_invalid = most_invalid
+        self._one_by_one = one_by_one
+        self._valid: set[str] = set()
+        self._invalid: Counter[str] = Counter()
+        self._described: dict[str, str] = {}
+        self._asked: set[str] = set()  # models that a trial asks alone
+        self._changed = asyncio.Event()
+
+    @asynccontextmanager
+    async def turn(self, models: Collection[str]) -> AsyncIterator[None]:
+        """Play a trial when its models have decided validly, or no other trial asks them."""
+        self._check()
+        alone = {*models} if self._one_by_one else set()
+        while alone & self._asked - self._valid:
+            self._changed.clear()
+            await self._changed.wait()
+        alone -= self._valid
+        self._asked |= alone
+        try:
+            yield
+        finally:
+            self._asked -= alone
+            self._changed.set()
+
+    def count(self, model: str, decision: Decision) -> None:
+        """Count a decision; raises NoValidDecision where too many are invalid."""
+        if model not in self._valid:
+            text = decision.reply.text if decision.reply else ""
+            self.add(model, decision.valid, not decision.valid, decision.failure, text)
+            self._check()
+
+    def add(
+        self, model: str, valid: int, invalid: int, failure: str | None, text: str | None
+    ) -> None:
+        """Count so many decisions; ``failure`` and ``text`` are of an invalid one."""
+        if valid:
+            self._valid.add(model)
+            self._changed.set()
+        if invalid:
+            self._invalid[model] += invalid
+            shown = one_line(" ".join((text or "").split()))[:SHOWN]
+            reply = f'"{shown}" ({(failure or "").replace("_", " ")})'
+            self._described.setdefault(model, f"The first reply is {reply}. To mend that {ADVICE}")
+
+    def without_a_valid_one(self, least: float = 1) -> list[str]:
+        """A line for each model with at least so many decisions none of which is valid."""
+        return [
+            f"none of the first {number} decisions of {model} is valid. {self._described[model]}"
+            for model, number in sorted(self._invalid.items())
+            if model not in self._valid and number >= least
+        ]
+
+    def _check(self) -> None:
+        for line in self.without_a_valid_one(self._most_invalid):
+            raise NoValidDecision(
+                f"{line}. What was answered is kept; --keep-going goes on with such a model"
+            )

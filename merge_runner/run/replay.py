@@ -1,0 +1,80 @@
+"""Plays trials by recorded replies alone."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from merge_runner.drivers.language_model import Question
+from merge_runner.llm.call import Wait
+from merge_runner.llm.recorded import Calls, RecordedReplies
+from merge_runner.records import Decision, TrialRecord, TrialSpec
+from merge_runner.run.guard import FirstDecisions
+from merge_runner.run.plan import Plan
+from merge_runner.run.trials import Room, TrialMaker
+from merge_runner.trial import play_trial
+
+
+@dataclass
+class Replay:
+    """Plays trials by recorded ``calls`` alone: no key, no connection, and nothing to wait for."""
+
+    plan: Plan
+    calls: Calls
+    running: int = 0
+    waits: Sequence[Wait] = ()
+    workers: None = None
+    unsaved: str = "0 calls in flight"
+    first: FirstDecisions = field(default_factory=FirstDecisions)
+    _ahead: dict[int, TrialRecord] = field(default_factory=dict)  # by order, until it is their turn
+
+    def __post_init__(self) -> None:
+        """Find out which models are asked."""
+        plan, formats = self.plan, self.plan.parts.formats
+        self._trials = TrialMaker(plan)
+        self._models = {
+            name: RecordedReplies(
+                name, entry, plan.endpoints[name], formats[entry.format], self.calls
+            )
+            for name, entry in plan.entries.items()
+        }
+        self.meters = {name: model.meter for name, model in self._models.items()}
+
+    def play_one(self, spec: TrialSpec) -> TrialRecord:
+        """Play a trial."""
+        played = self._ahead.pop(spec.order, None)
+        return played or play_trial(self._trials.make(spec), self._decide)
+
+    async def look_ahead(self, specs: Sequence[TrialSpec]) -> list[TrialRecord]:
+        """Play trials until a reply is found, and return them where none is.
+
+        They are not played again. Where no model is asked, there is nothing to find out.
+        """
+        for spec in specs if self._models else ():
+            await asyncio.sleep(0)
+            self._ahead[spec.order] = self.play_one(spec)
+            if any(meter.calls_cached for meter in self.meters.values()):
+                return []
+        return [*self._ahead.values()]
+
+    async def play(
+        self,
+        specs: Sequence[TrialSpec],
+        ended: Callable[[TrialSpec, TrialRecord], None],
+        room: Room | None = None,
+    ) -> None:
+        """Play trials in order, and let what is stored and shown meanwhile go on between two."""
+        for spec in specs:
+            if room is not None:
+                await room()
+            await asyncio.sleep(0)
+            self.running = 1
+            ended(spec, self.play_one(spec))
+            self.running = 0
+
+    async def drain(self) -> None:
+        """Do nothing: no call is in flight."""
+
+    def _decide(self, question: Question) -> Decision:
+        return self._models[question.model].decide(question)

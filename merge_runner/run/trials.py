@@ -1,0 +1,69 @@
+"""What makes the trials of a plan, and what any player of them offers."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Sequence
+from typing import Protocol
+
+from merge_runner.drivers.base import MakeDriver
+from merge_runner.drivers.language_model import LanguageModel
+from merge_runner.errors import TrialSuspended
+from merge_runner.llm.call import Meter, Wait
+from merge_runner.records import SIDES, TrialRecord, TrialSpec
+from merge_runner.run.guard import FirstDecisions
+from merge_runner.run.plan import Plan
+from merge_runner.trial import Trial
+
+# Called with each trial that ends, or is suspended for lack of money.
+Ended = Callable[[TrialSpec, TrialRecord | TrialSuspended], None]
+# Awaited before a trial begins: returns once there is memory to hold the trial until it is stored.
+Room = Callable[[], Awaitable[None]]
+
+
+class Player(Protocol):
+    """What plays trials: from recorded replies, in this process, or on a cluster.
+
+    ``meters`` are by model, and ``first`` counts the first decisions of each.
+    """
+
+    first: FirstDecisions
+    meters: dict[str, Meter]
+
+    @property
+    def waits(self) -> Sequence[Wait]:
+        """What the calls wait for that are not in flight."""
+
+    @property
+    def running(self) -> int:
+        """How many trials are under way."""
+
+    @property
+    def workers(self) -> int | None:
+        """On how many workers they are; None: in this process."""
+
+    @property
+    def unsaved(self) -> str:
+        """What Ctrl-C waits for, in words."""
+
+    async def play(self, specs: Sequence[TrialSpec], ended: Ended, room: Room) -> None:
+        """Play trials in order; an error raised by ``ended`` or outside a trial ends the run."""
+
+    async def drain(self) -> None:
+        """Let calls in flight end and be saved."""
+
+
+class TrialMaker:
+    """Makes the trials of a plan."""
+
+    def __init__(self, plan: Plan) -> None:
+        self.arms = plan.by_label()
+        models = {name: LanguageModel(name, plan.parts.prompts) for name in plan.entries}
+        self._drivers: dict[str, MakeDriver | LanguageModel] = {**plan.parts.programs, **models}
+
+    def make(self, spec: TrialSpec) -> Trial:
+        """Return a trial before its first decision."""
+        arm = self.arms[spec.arm]
+        drivers = {
+            side: self._drivers[arm.asked[side]].make(arm.scenario, spec, side) for side in SIDES
+        }
+        return Trial(spec, arm.scenario, drivers)

@@ -1,0 +1,91 @@
+"""How a trial is played live: what it asks at an instant is asked side by side."""
+
+import asyncio
+from types import SimpleNamespace
+
+import pytest
+
+from merge_runner.errors import SweepStopped, TrialSuspended, UsageError
+from merge_runner.llm.call import Meter
+from merge_runner.records import SIDES, CallFailed, ChatReply, ChatRequest, Slot
+from merge_runner.run.local_runner import LocalRunner
+from merge_runner.run.plan import make_plan
+
+REPLY = f"Y\nI yield.\n```python\n{[-0.4] * 20}\n```"
+REQUEST = ChatRequest("key", "test", "test", "model", "/", {}, "{}", Slot("N_0_0", 1, "left", 0, 0))
+
+
+class Client:
+    """Answers when both sides have asked, but for the ``errors`` by side."""
+
+    def __init__(self, **errors):
+        self.errors, self.asked, self.given_up = errors, [], []
+        self.meter, self.money = Meter(), SimpleNamespace(leave=lambda order: None)
+        self.recorded = SimpleNamespace(prompt=lambda question: question.prompt)
+
+    async def ask(self, prompt, slot, *, order):
+        self.asked.append(slot.side)
+        try:
+            for _ in range(100):
+                await asyncio.sleep(0)
+        except asyncio.CancelledError:
+            self.given_up.append(slot.side)
+            raise
+        assert len(self.asked) == 2 * (1 + slot.decision)
+        if slot.side in self.errors:
+            raise self.errors[slot.side]
+        return ChatReply(REPLY, "ok", None, (), 0)
+
+
+@pytest.fixture
+def play(monkeypatch):
+    plan = make_plan("baseline", "emulator", conditions=["N_0_0"])
+
+    async def played(client):
+        return await LocalRunner(plan, {"emulator": client}, 1).play_one(plan.trial_specs()[0])
+
+    return played
+
+
+async def test_both_drivers_are_asked_before_either_has_answered(play):
+    client = Client()
+    trial = await play(client)
+    assert trial.status == "collided"
+    assert client.asked == [row.side for row in trial.decisions]
+    assert len(client.asked) > 4
+
+
+@pytest.mark.parametrize("failing", SIDES)
+async def test_a_failed_call_leaves_the_other_one_its_answer(play, failing):
+    trial = await play(Client(**{failing: CallFailed("no answer", REQUEST)}))
+    assert (trial.status, trial.error) == ("failed", f"{failing}: no answer")
+    assert [row.side for row in trial.decisions] == [side for side in SIDES if side != failing]
+
+
+async def test_a_trial_that_is_cancelled_takes_both_calls_with_it(play):
+    client = Client()
+    trial = asyncio.create_task(play(client))
+    while len(client.asked) < 2:
+        await asyncio.sleep(0)
+    trial.cancel()
+    await asyncio.wait([trial])
+    assert trial.cancelled()
+    assert client.given_up == [*SIDES]
+
+
+@pytest.mark.parametrize("kind", [TrialSuspended, SweepStopped, UsageError, KeyError])
+@pytest.mark.parametrize("first", SIDES)
+async def test_a_trial_that_is_left_takes_its_other_call_with_it(play, kind, first):
+    error = kind("no more")
+
+    class Waiting(Client):
+        async def ask(self, prompt, slot, *, order):
+            if slot.side == first:
+                raise error
+            return await super().ask(prompt, slot, order=order)
+
+    client = Waiting()
+    with pytest.raises(kind) as told:
+        await play(client)
+    assert told.value is error
+    assert client.given_up == client.asked
