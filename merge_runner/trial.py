@@ -108,11 +108,12 @@ class Trial:
     def _go_on(self) -> None:
         """Drive by what is decided until a driver may decide again."""
         world, (left, right) = self._world, self._states.values()
+        time_s = world.time_s
         for state in (left, right):
             if state.side in self._decided:
                 decision = self._decided.pop(state.side)
                 state.take(decision)
-                row = DecisionRow(state.number, world.time_s, state.side, decision, state.told)
+                row = DecisionRow(state.number, time_s, state.side, decision, state.told)
                 self._rows.append(row)
         if not self._failures:
             steps = min(left.steps_left, right.steps_left)
@@ -149,14 +150,11 @@ class _DriverState:
         if perception != PERFECT:
             observe = partial(world.observe, side)
             self._eyes = Eyes(perception, driver.seat.seed, scenario.step_s, observe)
+        self.number = 0  # of its last instant: they count from the start of the trial
         self.told: Observation | None = None
         self._driven: list[float] | None = None  # by step since the decision
         self._decided_at = 0
-
-    @property
-    def number(self) -> int:
-        """The number of its present instant: they count from the start of the trial."""
-        return self._world.step // self._interval
+        self._in_control = False
 
     @property
     def steps_left(self) -> int:
@@ -164,11 +162,13 @@ class _DriverState:
         return self._interval - self._world.step % self._interval
 
     def is_due(self) -> bool:
-        """Whether it decides now."""
-        return self._world.step % self._interval == 0 and self._world.in_control(self.side)
+        """Whether it decides now: it is in control, from some time on for good."""
+        self._in_control = self._in_control or self._world.in_control(self.side)
+        return self._in_control and self._world.step % self._interval == 0
 
     def ask(self) -> Decision | Question:
         """What the driver decides, or asks a model."""
+        self.number = self._world.step // self._interval
         self.told = self._eyes.told(self._world.step) if self._eyes else None
         observation = self.told or self._world.observe(self.side)
         asked = self.driver.decide(observation, self.number)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
-from merge_runner.records import SIDES, Observation, Side, StateRow, Status, other_side
+from merge_runner.records import SIDES, Observation, Side, StateRow, Status
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.conditions import Condition
 from merge_runner.scenarios.merge.geometry import Track
@@ -54,7 +54,8 @@ class World:
         }
         if max(positions) >= track.merge_point_m:
             raise UsageError(f"{condition}: a vehicle is at the merge point before both are driven")
-        self.status: Status | None = "collided" if self._collided() else None
+        together = collided(config, track, *self._positions())
+        self.status: Status | None = "collided" if together else None
 
     @property
     def time_s(self) -> float:
@@ -91,9 +92,10 @@ class World:
             stopped = velocity + acceleration * dt < 0
             vehicle.accelerations.append(-velocity / dt if stopped else acceleration)
         self.step += 1
-        if self._collided():
+        left_m, right_m = self._positions()
+        if collided(config, self._track, left_m, right_m):
             self.status = "collided"
-        elif max(self._positions()) >= self._track.end_m:
+        elif max(left_m, right_m) >= self._track.end_m:
             self.status = "finished"
         elif self.step >= config.timeout_steps:
             self.status = "timeout"
@@ -107,7 +109,9 @@ class World:
 
     def observe(self, side: Side, step: int | None = None) -> Observation:
         """What the driver of ``side`` sees, itself as ego, now or at an earlier step."""
-        own, other = self._vehicles[side], self._vehicles[other_side(side)]
+        own, other = self._vehicles["left"], self._vehicles["right"]
+        if side == "right":
+            own, other = other, own
         now = self.step if step is None else step
         position, other_position = own.positions[now], other.positions[now]
         by_own = self._config.straight_after == "own"
@@ -141,9 +145,6 @@ class World:
                 )
                 rows.append(row)
         return tuple(rows)
-
-    def _collided(self) -> bool:
-        return collided(self._config, self._track, *self._positions())
 
     def _positions(self) -> tuple[float, float]:
         """Where the left and the right vehicle are now."""
