@@ -1,4 +1,6 @@
 """Whoever decides how a vehicle accelerates: a language model or a plain program."""
 
-# The registry comes first, so that its order does not depend on which driver is imported first.
-from merge_runner.drivers import registry as registry
+# The built-in programs, each of which registers itself: the registry knows none of them.
+from merge_runner.drivers import constant, human_odds, idm, projected_order, quantal
+
+__all__ = ["constant", "human_odds", "idm", "projected_order", "quantal"]

@@ -6,12 +6,9 @@ import threading
 from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
-from importlib import import_module
 from math import inf, isfinite
-from pkgutil import iter_modules
 from typing import TYPE_CHECKING, Any, TypeGuard
 
-from merge_runner import drivers
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Driver, take_seat
 from merge_runner.drivers.pace import program_pace
@@ -180,7 +177,3 @@ def _is_number(value: object) -> TypeGuard[float]:
 
 
 PROGRAMS = Registry[Program]("driver")
-
-# Each program registers itself, in a module of this package that nobody else needs to name.
-for _module in iter_modules(drivers.__path__, f"{drivers.__name__}."):
-    import_module(_module.name)
