@@ -338,7 +338,7 @@ class TrialRecord:
     @property
     def calls(self) -> list[ChatReply | FailedCall]:
         """All calls of its drivers."""
-        replies = (row.decision.reply for row in self.decisions if row.decision.reply)
+        replies = [row.decision.reply for row in self.decisions if row.decision.reply]
         return [*replies, *self.failed_calls]
 
     @property

@@ -13,7 +13,7 @@ from collections.abc import (
 )
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import accumulate, chain
+from itertools import accumulate
 from pathlib import Path
 
 from merge_runner.drivers.language_model import Question
@@ -212,8 +212,8 @@ class Flusher:
 
     def add(self, record: TrialRecord) -> None:
         """Store this trial with the next batch, or drop it while storing fails."""
-        attempts = chain.from_iterable(call.attempts for call in record.calls)
-        bytes_of_replies = sum(sys.getsizeof(attempt.reply) for attempt in attempts)
+        attempts = [attempt for call in record.calls for attempt in call.attempts]
+        bytes_of_replies = sum([sys.getsizeof(attempt.reply) for attempt in attempts])
         size = bytes_of_replies + DECISION_BYTES * len(record.decisions)
         self._pending.append((record, size))
         if self._problem is not None:
