@@ -66,6 +66,8 @@ from merge_runner.run.trials import Player
 INTERRUPTED = 130
 GO_ON = "Run the same command again to go on."
 SHOWN = 5
+# Trials under way in a batch run.
+MOST_IN_ROUNDS = 10_000
 Stopping = Callable[
     [Callable[[], object] | None, Callable[[], object]], AbstractContextManager[None]
 ]
@@ -330,8 +332,8 @@ class Sweep:
         )
         if rounds is not None:
             stack.push_async_callback(rounds.close)
-        # A trial that waits for a round takes up nobody's time.
-        in_flight = len(self.todo) if options.batch else options.in_flight
+        # A trial that waits for a round takes up nobody's time, but memory.
+        in_flight = MOST_IN_ROUNDS if options.batch else options.in_flight
         return LocalRunner(plan, clients, in_flight, first, rounds)
 
     async def _play(self, progress: Progress, flusher: Flusher) -> bool:
