@@ -203,5 +203,9 @@ def _decided(deciding: Coroutine[Any, Any, Decision], side: Side) -> Decision:
     except StopIteration as end:
         decision: Decision = end.value
         return decision
+    except RuntimeError as error:
+        # Without an event loop, as in a replay, there is nothing to wait with.
+        if "no running event loop" not in str(error):
+            raise
     deciding.close()
     raise UsageError(f"the {side} driver waits while it decides: a program decides at once")

@@ -105,15 +105,16 @@ def test_a_program_decides_at_once_beside_a_driver_that_asks():
 
 
 class Waiting(Holding):
-    """A program that waits for something."""
+    """A program that waits, for its action in seconds: without an event loop there is no clock."""
 
     async def decide(self, observation, number):
-        await asyncio.sleep(0)
+        await asyncio.sleep(self.action)
 
 
-def test_a_program_that_waits_is_refused():
+@pytest.mark.parametrize("delay_s", [0.0, 0.5])
+def test_a_program_that_waits_is_refused(delay_s):
     with pytest.raises(UsageError, match=r"^the right driver waits .*: a program decides at once$"):
-        play(Holding(0.0), Waiting(0.0))
+        play(Holding(0.0), Waiting(delay_s))
 
 
 def test_both_drivers_observe_the_same_state():

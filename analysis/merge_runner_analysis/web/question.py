@@ -169,14 +169,16 @@ def answered(rows: Sequence[Row]) -> tuple[str, str]:
     """The answer in a sentence, and the rest; empty where no primary test was made.
 
     The claim is the surest of the primary tests whose corrected p is below 5 %; where there is
-    none it says so, and the rest what could have been seen.
+    none it says so, and the rest what could have been seen. It is of scripted stand-ins only where
+    there is no other driver, and then says so.
     """
+    unscripted = [row for row in rows if not row.values.get("drivers")]
+    rehearsed = "" if unscripted else "In a rehearsal with a scripted stand-in, "
+    rows = unscripted or rows
     tested = [row for row in rows if _tested(row)]
     primary = sorted(
         (row for row in tested if row.values.get("primary")), key=lambda row: _number(row, "p")
     )
-    posing = all(row.values.get("drivers") for row in rows)
-    rehearsed = "In a rehearsal with a scripted stand-in, " if posing else ""
     copied = [f"{_level(row)} is {row.note}" for row in rows if _copied(row)]
     if not primary:
         return capital(rehearsed + f"{'; '.join(copied)}.") if copied else "", ""
@@ -191,7 +193,7 @@ def answered(rows: Sequence[Row]) -> tuple[str, str]:
     if sure:
         first = sure[0]
         claim = f"{rehearsed}{first.values['factor']} changes {what}: {_both(first)}."
-        rest.append(f"In the same situations, {_apart(first)}, corrected p {_p(first)}.")
+        rest.append(f"The difference is {_apart(first)}, corrected p {_p(first)}.")
     else:
         claim = f"{rehearsed}no change of {what} is shown by {joined(_factors(primary))}."
     for row in primary:
@@ -252,13 +254,13 @@ def _factors(rows: Iterable[Row]) -> list[str]:
 
 
 def _both(row: Row) -> str:
-    """``with hurry=yes the driver goes first in 63.00 %, with hurry=no in 50.10 %``."""
+    """``in the same situations, the driver goes first in 63.00 % with hurry=yes and ...``."""
     factor, level, base = (row.values[name] for name in ("factor", "level", "reference"))
     of, reference = (_estimate(row, name) for name in ("estimate", "estimate_reference"))
     if metric_of(row) == LEFT_FIRST.name:
         return (
-            f"with {factor}={level} the driver goes first in {of} of trials, with {factor}={base} "
-            f"in {reference}"
+            f"in the same situations, the driver goes first in {of} with {factor}={level} and in "
+            f"{reference} with {factor}={base}"
         )
     name = f"{name_of(row)} " if unit_of(row) == "points" else ""
     return f"{name}{of} with {factor}={level}, {reference} with {factor}={base}"

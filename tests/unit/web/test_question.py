@@ -35,8 +35,11 @@ def copied(factor):
     return replace(row, values=values, note=SAME_TRIALS)
 
 
-HURRY = "Hurry changes who goes first: with hurry=yes the driver goes first in 63.00 % of trials, "
-SAME = "In the same situations, +13.00 points [6.00, 20.00], corrected "
+HURRY = (
+    "Hurry changes who goes first: in the same situations, the driver goes first in 63.00 % with "
+    "hurry=yes and in 50.00 % with hurry=no."
+)
+SAME = "The difference is +13.00 points [6.00, 20.00], corrected "
 SEEN = "A change of 10.00 points or more would have been seen in four of five studies."
 
 
@@ -47,7 +50,7 @@ SEEN = "A change of 10.00 points or more would have been seen in four of five st
         ([effect(p=None)], "", ""),
         (
             [effect("persona", 0.5, difference=1.0), effect()],
-            f"{HURRY}with hurry=no in 50.00 %.",
+            HURRY,
             f"{SAME}p = 0.001. Persona=yes is not shown to change it: +1.00 points [−6.00, 8.00], "
             "corrected p = 0.500.",
         ),
@@ -60,19 +63,29 @@ SEEN = "A change of 10.00 points or more would have been seen in four of five st
         ),
         (
             [effect(p=0.0001), effect("hurry × persona", 0.01, difference=-8.0)],
-            f"{HURRY}with hurry=no in 50.00 %.",
+            HURRY,
             f"{SAME}p < 0.001. Hurry and persona interact: −8.00 points [−15.00, −1.00], "
             "corrected p = 0.010.",
         ),
         (
             [effect(drivers="scripted"), copied("persona")],
-            f"In a rehearsal with a scripted stand-in, h{HURRY[1:]}with hurry=no in 50.00 %.",
+            f"In a rehearsal with a scripted stand-in, h{HURRY[1:]}",
             f"{SAME}p = 0.001. Persona=yes is {SAME_TRIALS}.",
         ),
         (
             [copied("hurry")],
             f"In a rehearsal with a scripted stand-in, hurry=yes is {SAME_TRIALS}.",
             "",
+        ),
+        (
+            [
+                effect("hurry", 0.0001, drivers="scripted"),
+                effect("hurry", 0.4, difference=2.0),
+                effect("persona × hurry", 0.01, difference=-8.0, drivers="scripted"),
+            ],
+            "No change of who goes first is shown by hurry.",
+            "Hurry=yes is not shown to change it: +2.00 points [−5.00, 9.00], "
+            f"corrected p = 0.400. {SEEN}",
         ),
         ([effect(n=12)], "Too few trials finished to say: hurry=yes 12.", ""),
     ],
