@@ -1,7 +1,8 @@
 """What is computed once: of a study in memory, tables and figures in a file beside the database.
 
-The file keeps a table as JSON, a figure as SVG in Base64, until the results change. Where it cannot
-be written, as on a read-only disk, nothing is kept, and the next run computes them again.
+The file keeps a table as JSON, a figure as SVG in Base64, and the digest, until the results change.
+Where it cannot be written, as on a read-only disk, nothing is kept, and the next run computes all
+again.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import merge_runner
 import merge_runner_analysis
 from merge_runner.errors import UsageError
 from merge_runner.registry import in_use, plugin_sources, plugins
+from merge_runner.results.store import results_digest
 
 KEPT = """
 CREATE TABLE IF NOT EXISTS finished (
@@ -86,6 +88,20 @@ def keep_finished(db: Path, made_of: str, options: str, contents: Mapping[str, s
     if present_state(db) == made_of:
         _run(db, "DELETE FROM finished WHERE state <> ?", [(made_of,)])
         _run(db, "INSERT INTO finished VALUES (?, ?, ?, ?)", rows)
+
+
+def kept(db: Path, made_of: str, options: str, name: str, make: Callable[[], str]) -> str:
+    """Return what is kept of this state under a name; else it is made, and kept."""
+    found = finished(db, made_of, options, [name])
+    if not found:
+        found = {name: make()}
+        keep_finished(db, made_of, options, found)
+    return found[name]
+
+
+def digest_of(db: Path, made_of: str) -> str:
+    """Return the digest of all results, for which all of them have to be read."""
+    return kept(db, made_of, "", "digest", lambda: results_digest(db)[0])
 
 
 def _run(db: Path, sql: str, rows: Sequence[tuple[str, ...]]) -> list[tuple[str, str]]:

@@ -21,7 +21,9 @@ from merge_runner_analysis.figures.style import (
 )
 from merge_runner_analysis.grouping import levels_of
 from merge_runner_analysis.metrics import LEFT_FIRST
-from merge_runner_analysis.stats.effects import Level, level_estimate, levels_by_factor, measured
+from merge_runner_analysis.stats.effects import measured
+from merge_runner_analysis.stats.levels import Level, levels_by_factor
+from merge_runner_analysis.stats.sides import level_estimate
 from merge_runner_analysis.study import Study
 
 ACROSS = 3  # panels
@@ -91,7 +93,8 @@ def _lines(study: Study) -> dict[str, list[tuple[str, Level]]]:
         for name in names
         if factor != MODEL and len(names) > 1
     }
-    for model in factors.get(MODEL, ()):
+    # In the order of other figures, so that a driver has one colour.
+    for model in dict.fromkeys(group.levels.get(MODEL, "") for group in study.models):
         for levels in levels_by_factor(study, MODEL, model, 1):
             for level in levels:
                 line = f"{level.factor}: {level.name}"

@@ -7,9 +7,8 @@ in the cells that all four have.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import chain, combinations, product
 
 import pandas as pd
@@ -31,47 +30,19 @@ from merge_runner_analysis.stats.contrasts import (
 )
 from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.intervals import difference
-from merge_runner_analysis.stats.measures import estimate, linear, undecided
+from merge_runner_analysis.stats.levels import (
+    DRIVER,
+    Level,
+    copied_cells,
+    levels_by_factor,
+)
+from merge_runner_analysis.stats.measures import linear, undecided
+from merge_runner_analysis.stats.sides import from_both_sides, one_sided
 from merge_runner_analysis.study import Study, in_one_study
 from merge_runner_analysis.wording import TIMES
 
-# Shown by this one, prompts are compared driver by driver; a driver has all other levels in it.
-DRIVER = "driver"
 PRIMARY = "goes_first"  # in a study's file, and where none is named
-Cell = tuple[str, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Level:
-    """A level of a factor: the ids of its groups, and their trials as one group without copies.
-
-    The trials have a column ``cell``: their condition and the levels of all other factors. Cells
-    in which programs play the same trials are one cell. ``pooled.whole`` has the copies, too.
-    ``posing`` is what is said of scripted stand-ins; the ``mark`` tells their level from others'.
-    ``at`` is the level of another factor that all of its trials have, if it is shown by that one.
-    """
-
-    factor: str
-    name: str
-    groups: tuple[str, ...]
-    pooled: Group
-    posing: str = ""
-    mark: str = ""
-    at: str = ""
-
-    @property
-    def id(self) -> str:
-        """``temperature=0.2``, or ``opponent=idm/temperature=0.2``."""
-        return f"{self.at}/" * bool(self.at) + f"{self.factor}={self.name}{self.mark}"
-
-    @cached_property
-    def copies(self) -> tuple[tuple[str, str], ...]:
-        """The trials of its groups that are left out as copies (trial_id, spec_hash)."""
-        copies = self.pooled.stored.trials.drop(index=self.pooled.trials.index)
-        if copies.empty:
-            return ()
-        left_out = copies.loc[copies["group"].isin(self.groups), KEYS]
-        return tuple(left_out.itertuples(index=False, name=None))
+Pair = tuple[pd.DataFrame, pd.DataFrame]
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,35 +217,29 @@ def _effect(
         unused = ~trials.index.isin(frame.index)
         if unused.any():
             left_out |= {*zip(*(trials[name].array[unused] for name in KEYS), strict=True)}
-    ordered = [frames[place] for place in (0, 2, 1, 3)] if turned and frames else frames
-    found = _difference(ordered, metric) or Estimate()
-    # Where nothing varies it is not known what could have been seen.
-    found = replace(found, detectable=found.detectable or None)
-    both = _of_both(frames[0], frames[1], metric) if frames else (Estimate(), Estimate())
-    if len(levels) > 2:
-        both = (replace(both[0], value=None), replace(both[1], value=None))
+    values: tuple[float | None, float | None] = (None, None)
+    found = None
+    if frames and len(frames[0]):
+        one, other, *across = frames
+        if not across:
+            values, found = _compared(one, other, metric)
+        elif turned:
+            found = _interaction((one, across[0]), (other, across[1]), metric)
+        else:
+            found = _interaction((one, other), (across[0], across[1]), metric)
+    counted = [_counted(frame, metric) for frame in frames] or [Estimate(), Estimate()]
+    found = found or Estimate()
     return Effect(
-        *(levels[0], levels[1], metric, *both),
-        difference=found.times(100 if metric.rate else 1),
+        level=levels[0],
+        reference=levels[1],
+        metric=metric,
+        at_level=replace(counted[0], value=values[0]),
+        at_reference=replace(counted[1], value=values[1]),
+        # Where nothing varies it is not known what could have been seen.
+        difference=replace(found, detectable=found.detectable or None),
         left_out=tuple(sorted(left_out)),
         across=(levels[2], levels[3]) if len(levels) > 2 else None,
     )
-
-
-def _of_both(
-    first: pd.DataFrame, second: pd.DataFrame, metric: Metric
-) -> tuple[Estimate, Estimate]:
-    """What both groups of trials come to, one less the other of which is their difference."""
-    one, other = (_counted(frame, metric) for frame in (first, second))
-    if not one.n:
-        return one, other
-    if metric.estimator == "median":
-        values = float(first["value"].median()), float(second["value"].median())
-    elif metric.rate and (cells := shared_cells(first, second, "value")):
-        values = 100 * cells.rates[0], 100 * cells.rates[1]
-    else:
-        values = means_within(first, second, "value")
-    return replace(one, value=values[0]), replace(other, value=values[1])
 
 
 def _counted(frame: pd.DataFrame, metric: Metric) -> Estimate:
@@ -284,20 +249,26 @@ def _counted(frame: pd.DataFrame, metric: Metric) -> Estimate:
     return Estimate(n=frame.index.nunique(), k=k)
 
 
-def _difference(frames: Sequence[pd.DataFrame], metric: Metric) -> Estimate | None:
-    """That of two groups of trials, or of two such differences; None where nothing is tested."""
-    if not frames or frames[0].empty:
-        return None
-    pairs = list(zip(frames[::2], frames[1::2], strict=True))
+def _compared(
+    one: pd.DataFrame, other: pd.DataFrame, metric: Metric
+) -> tuple[tuple[float, float], Estimate | None]:
+    """What two groups of trials come to, and their difference: None where that is not known."""
     if metric.estimator == "median":
-        return Estimate(float(frames[0]["value"].median() - frames[1]["value"].median()))
+        medians = float(one["value"].median()), float(other["value"].median())
+        return medians, Estimate(medians[0] - medians[1])
+    if metric.rate and (cells := shared_cells(one, other, "value")):
+        first, second = cells.rates
+        return (100 * first, 100 * second), contrast_rates(cells).times(100)
+    return means_within(one, other, "value"), contrast_means(one, other, "value")
+
+
+def _interaction(pair: Pair, twins: Pair, metric: Metric) -> Estimate | None:
+    """How far the difference of one pair is from the other's; None where one is not known."""
     if metric.rate:
-        cells = [rates for pair in pairs if (rates := shared_cells(*pair, "value"))]
-        return difference_of_contrasts(*cells) if len(cells) > 1 else contrast_rates(*cells)
-    means = [mean for pair in pairs if (mean := contrast_means(*pair, "value"))]
-    if len(means) < len(pairs):
-        return None
-    return difference(*means) if len(means) > 1 else means[0]
+        cells, others = shared_cells(*pair, "value"), shared_cells(*twins, "value")
+        return difference_of_contrasts(cells, others).times(100) if cells and others else None
+    mean, other = contrast_means(*pair, "value"), contrast_means(*twins, "value")
+    return difference(mean, other) if mean and other else None
 
 
 def _with_corrected(study: Study, found: list[Effect]) -> list[Effect]:
@@ -350,236 +321,7 @@ def trials_by_cell(study: Study, groups: Sequence[Group], metric: Metric) -> lis
         if metric.weight:
             frame["value"] = linear(frame["value"], frame["weight"], frame["condition"])
         elif metric is LEFT_FIRST and one_sided(study):
-            frame = _from_both_sides(study, frame, trials)
+            frame = from_both_sides(study, frame, trials)
         frames.append(frame)
     kept = set.intersection(*(set(one["condition"]) for one in frames))
     return [frame[frame["condition"].isin(kept)] for frame in frames]
-
-
-@remembered
-def one_sided(study: Study) -> bool:
-    """Whether in some trials one driver is given what the other, who is equal to it, is not."""
-    return any(
-        (group.trials["focal"].notna() & _of_equals(group.trials)).any() for group in study.models
-    )
-
-
-@remembered
-def level_estimate(study: Study, level: Level, metric: Metric) -> Estimate:
-    """A metric of all trials of a level, with its 95 % interval.
-
-    Who goes first is read from both sides where equal drivers are told the same: each of these
-    trials counts half for either, and has no variance.
-    """
-    group = level.pooled
-    trials = group.trials
-    same = trials[metric.column].notna() & _told_the_same(trials)
-    if metric is not LEFT_FIRST or not one_sided(study) or not same.any():
-        return estimate(group, metric)
-    own = estimate(replace(group, trials=trials[~same]), metric)
-    n = own.n + int(same.sum())
-    if own.value is None:
-        return Estimate(50.0, n=n)
-    value, low, high = (
-        None if of is None else 50 + (of - 50) * own.n / n for of in (own.value, own.low, own.high)
-    )
-    return Estimate(value, low, high, n)
-
-
-def cells_seen(study: Study, level: Level) -> set[Cell]:
-    """The cells of its trials that ended; where both drivers are told the same, of both sides."""
-    trials = level.pooled.ended
-    seen = {*trials["cell"]}
-    if one_sided(study):
-        same = trials.loc[_told_the_same(trials), "cell"].unique()
-        seen |= {(_image(study, condition), *others) for condition, *others in same}
-    return seen
-
-
-def _told_the_same(trials: pd.DataFrame) -> pd.Series:
-    return trials["focal"].isna() & _of_equals(trials)
-
-
-def _of_equals(trials: pd.DataFrame) -> pd.Series:
-    return trials["model_left"] == trials["model_right"]
-
-
-def _from_both_sides(study: Study, frame: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
-    """Who goes first, by cell and side; trials of two that are given the same read from both.
-
-    So whoever is given something on the left is compared with the left ones who are not, and on the
-    right with the right ones: no side is favoured. The readings of a trial are opposite, and the
-    sum of both does not vary.
-    """
-    trials = trials.loc[frame.index]
-    same = _told_the_same(trials)
-    sides = _with_side(frame["condition"], trials["ego"])
-    left = frame.assign(condition=sides, varies=~same)
-    images = {name: _image(study, name) for name in trials["condition"].unique()}
-    named = [(images[cell[0]], *cell[1:]) for cell in frame.loc[same, "condition"]]
-    cells = pd.Series(named, frame.index[same], dtype=object)
-    right = pd.DataFrame(
-        {
-            "condition": _with_side(cells, pd.Series("right", cells.index)),
-            "value": ~frame.loc[same, "value"].astype(bool),
-            "varies": False,
-        }
-    )
-    return pd.concat([left, right])
-
-
-def _with_side(cells: pd.Series, sides: pd.Series) -> pd.Series:
-    named = [(*cell, side) for cell, side in zip(cells, sides, strict=True)]
-    return pd.Series(named, cells.index, dtype=object)
-
-
-def _image(study: Study, condition: str) -> str:
-    """A condition as the driver on the right sees it."""
-    headway_m, velocity_mps = study.conditions[condition]
-    mirrored = (0 - headway_m, 0 - velocity_mps)
-    if mirrored == (headway_m, velocity_mps):
-        return condition
-    found = sorted(name for name, numbers in study.conditions.items() if numbers == mirrored)
-    return found[0] if found else f"{condition} mirrored"
-
-
-@remembered
-def copied_cells(study: Study, groups: tuple[Group, ...]) -> set[Cell]:
-    """The cells of programs that do not heed what the groups differ in.
-
-    With the same other levels, all trials of one of two groups are copies of the other's there, in
-    every condition that both have. What they differ by is how often each was drawn, so that nothing
-    can be tested. Conditions are never left out one by one: which of them stay would depend on
-    what happened there.
-    """
-    ways = [_ways(study, group) for group in groups]
-    copied: set[Cell] = set()
-    for one, other in combinations(ways, 2):
-        for others in one.keys() & other.keys():
-            if _are_copies(one[others], other[others]):
-                copied |= {(name, *others) for name in one[others].keys() & other[others].keys()}
-    return copied
-
-
-@remembered
-def _ways(study: Study, group: Group) -> dict[Cell, dict[str, set[object]]]:
-    """The ways in which trials went, by the levels of the other factors and by condition."""
-    ways: dict[Cell, dict[str, set[object]]] = {}
-    for (condition, *others), way in zip(group.ended["cell"], group.ended["way"], strict=True):
-        ways.setdefault((*others,), {}).setdefault(condition, set()).add(way)
-    return ways
-
-
-def _are_copies(one: Mapping[str, set[object]], other: Mapping[str, set[object]]) -> bool:
-    """Whether in every condition that both have all trials of one are among the other's."""
-    shared = one.keys() & other.keys()
-    return bool(shared) and all(
-        one[name] <= other[name] or other[name] <= one[name] for name in shared
-    )
-
-
-def copied_of_shared(study: Study, *levels: Level) -> tuple[int, int]:
-    """How many of the cells that levels share are copied ones, and how many they share."""
-    shared = set.intersection(*({*level.pooled.ended["cell"]} for level in levels))
-    return len(shared & copied_cells(study, tuple(level.pooled for level in levels))), len(shared)
-
-
-@remembered
-def levels_by_factor(study: Study, by: str = "", at: str = "", least: int = 2) -> list[list[Level]]:
-    """The levels of each factor that has so many of them at ``least``, the reference first.
-
-    Trials of scripted stand-ins are never pooled with others. With ``by``, the trials are those
-    ``at`` one of its levels.
-    """
-    chosen = [group for group in study.models if not by or _level_of(group, by) == at]
-    kinds = [[g for g in chosen if g.scripted == scripted] for scripted in (False, True)]
-    apart = any(g.scripted for g in study.models) and not all(g.scripted for g in study.models)
-    return [
-        _distinct(study, [_level(groups, factor, name, by, apart=apart) for name in levels])
-        for groups in kinds
-        for factor, levels in levels_of(groups, study.order).items()
-        if len(levels) >= least
-    ]
-
-
-def _level_of(group: Group, factor: str) -> str | None:
-    return group.driver if factor == DRIVER else group.levels.get(factor)
-
-
-def _level(every: list[Group], factor: str, name: str, by: str, *, apart: bool) -> Level:
-    groups = [group for group in every if group.levels.get(factor) == name]
-    said = {group.posing for group in groups}
-    posing = said.pop() if len(said) == 1 else "scripted stand-ins"
-    mark = " [scripted]" if apart and posing else ""
-    at = f"{by}={_level_of(groups[0], by)}" if by else ""
-    pooled = _with_cells(groups, {factor, by})
-    return Level(factor, name, tuple(group.id for group in groups), pooled, posing, mark, at)
-
-
-def _with_cells(groups: Sequence[Group], apart_from: set[str]) -> Group:
-    """Groups as one, whose trials have their cell: condition and levels of the other factors."""
-    parts = []
-    for group in groups:
-        others = [f"{n}={level}" for n, level in group.levels.items() if n not in apart_from]
-        others += [group.mark.strip()] * bool(group.mark)  # another setting of the task
-        cells = [(condition, *others) for condition in group.trials["condition"]]
-        cells_of = pd.Series(cells, group.trials.index, dtype=object)
-        parts.append(group.trials.assign(cell=cells_of, group=group.id))
-    return replace(groups[0], trials=pd.concat(parts, ignore_index=True))
-
-
-def crossing(study: Study, factors: Sequence[str], wanted: Mapping[str, str]) -> list[Level]:
-    """The trials at these levels of several factors, as a level of their crossing.
-
-    Those of scripted stand-ins are another one.
-    """
-    chosen = [g for g in study.models if all(_level_of(g, f) == at for f, at in wanted.items())]
-    found = []
-    for scripted in (False, True):
-        groups = [group for group in chosen if group.scripted == scripted]
-        if not groups:
-            continue
-        mark = " [scripted]" if scripted and len(groups) < len(chosen) else ""
-        name = ", ".join(wanted[factor] for factor in factors)
-        pooled = _with_cells(groups, {*wanted})
-        ids = tuple(group.id for group in groups)
-        found += _distinct(study, [Level(TIMES.join(factors), name, ids, pooled, mark=mark)])
-    return found
-
-
-def _distinct(study: Study, levels: list[Level]) -> list[Level]:
-    """The levels, each without copies of trials, and with the cells that share these as one."""
-    names: dict[Cell, Cell] = {}
-
-    def first(cell: Cell) -> Cell:
-        while (before := names.get(cell, cell)) != cell:
-            cell = before
-        return cell
-
-    for level in levels:
-        for cells in _with_copies(study, level.pooled):
-            same = sorted({first(cell) for cell in cells})
-            names |= dict.fromkeys(same[1:], same[0])
-    return [_without_copies(level, first) for level in levels]
-
-
-def _with_copies(study: Study, group: Group) -> Iterator[Iterable[Cell]]:
-    """Cells that have copies of each other's trials.
-
-    Of programs those of a condition in which any trials are equal. A stand-in plays with chance:
-    its trials of two levels that it reads may be equal here and there, which makes them no copies.
-    """
-    if not group.scripted:
-        yield from (cells for _, cells in group.trials.groupby(["condition", "way"])["cell"])
-        return
-    for (own, one), (its, other) in combinations(_ways(study, group).items(), 2):
-        if _are_copies(one, other):
-            yield from (((name, *own), (name, *its)) for name in one.keys() & other.keys())
-
-
-def _without_copies(level: Level, first: Callable[[tuple[str, ...]], tuple[str, ...]]) -> Level:
-    every = level.pooled.trials
-    every = every.assign(cell=pd.Series([first(cell) for cell in every["cell"]], dtype=object))
-    kept = every.drop_duplicates(["cell", "way"])
-    pooled = replace(level.pooled, trials=kept, whole=replace(level.pooled, trials=every))
-    return replace(level, groups=tuple(kept["group"].unique()), pooled=pooled)

@@ -7,21 +7,19 @@ from dataclasses import replace
 from math import isinf
 
 from merge_runner.study.crossing import PROMPT
-from merge_runner_analysis.metrics import INTERVALS, LEFT_FIRST, RULES_NOTE, shown_in
-from merge_runner_analysis.stats.effects import (
-    DRIVER,
-    Effect,
-    Level,
-    cells_seen,
-    copied_of_shared,
-    driver_effects,
-    effects,
-    level_estimate,
-    levels_by_factor,
-    primary,
+from merge_runner_analysis.metrics import (
+    INTERVALS,
+    JUDGED,
+    LEFT_FIRST,
+    RULES_NOTE,
+    Metric,
+    shown_in,
 )
+from merge_runner_analysis.stats.effects import Effect, driver_effects, effects, primary
 from merge_runner_analysis.stats.estimate import Estimate
+from merge_runner_analysis.stats.levels import DRIVER, Level, copied_of_shared, levels_by_factor
 from merge_runner_analysis.stats.measures import undecided_note
+from merge_runner_analysis.stats.sides import cells_seen, level_estimate
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Value, interval
 from merge_runner_analysis.wording import SAME_TRIALS, note_of
@@ -175,7 +173,21 @@ def problem(study: Study, one: Effect) -> str:
         )
     elif one.metric.rate and one.difference.p is not None and one.difference.detectable is None:
         said.append(f"{one.metric.heading}: so few trials can show no difference, however large")
+    if one.metric.trials == "ended" and one.metric.value not in JUDGED:
+        said += [_left_out(level, one.metric) for level in levels]
     return note_of(*dict.fromkeys(said))
+
+
+def _left_out(level: Level, metric: Metric) -> str:
+    """How many trials of a level have no value, as of calls whose price is not known."""
+    ended = level.pooled.ended
+    lacking = int(ended[metric.column].isna().sum())
+    if lacking in (0, len(ended)):
+        return ""
+    return (
+        f"{metric.heading}: {lacking} of {len(ended)} ended trials of {level.id} have no value and "
+        "are left out"
+    )
 
 
 def _notes(study: Study, by: str) -> Iterator[str]:

@@ -10,15 +10,10 @@ from itertools import product
 
 from merge_runner.study.crossing import MODEL, OPPONENT
 from merge_runner_analysis.metrics import COLLISIONS, GAP, LEFT_FIRST, RMSE, Metric
-from merge_runner_analysis.stats.effects import (
-    Level,
-    crossing,
-    level_estimate,
-    levels_by_factor,
-    one_sided,
-    primary,
-)
+from merge_runner_analysis.stats.effects import primary
+from merge_runner_analysis.stats.levels import Level, crossing, levels_by_factor
 from merge_runner_analysis.stats.measures import counts, estimate
+from merge_runner_analysis.stats.sides import level_estimate, one_sided
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.model import ENDED, Column, Optional, Row, Table, Value, interval
 

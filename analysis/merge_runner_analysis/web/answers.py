@@ -13,9 +13,8 @@ import duckdb
 
 from merge_runner.errors import UsageError
 from merge_runner.results.database import read_database
-from merge_runner.results.store import results_digest
 from merge_runner.text_safety import first_line
-from merge_runner_analysis.cache import finished, keep_finished, present_state, stamp_of
+from merge_runner_analysis.cache import digest_of, kept, present_state, stamp_of
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.tables.model import from_text, to_text
@@ -61,11 +60,9 @@ class Numbers:
             case ["cell", table, row, column, *part]:
                 found = self._cell(table, row, column, *part)
             case ["figure", name, "svg" | "png" as form]:
-                digest, _ = results_digest(self.db)
-                found = {"file": self._figure(name, form), "digest": digest}
+                found = {"file": self._figure(name, form), "digest": self._digest}
             case ["digest"]:
-                digest, _ = results_digest(self.db)
-                found = {"digest": digest}
+                found = {"digest": self._digest}
             case ["audit"]:
                 found = {"notes": json.loads(self._kept("audit", self._audit))}
             case _:
@@ -85,14 +82,12 @@ class Numbers:
     def _state(self) -> str:
         return present_state(self.db)
 
+    @property
+    def _digest(self) -> str:
+        return digest_of(self.db, self._state)
+
     def _kept(self, name: str, make: Callable[[], str], options: str = "") -> str:
-        """Return what is kept of the present state under a name; else it is made, and kept."""
-        options = options or Selection().key(self.db)
-        kept = finished(self.db, self._state, options, [name])
-        if not kept:
-            kept = {name: make()}
-            keep_finished(self.db, self._state, options, kept)
-        return kept[name]
+        return kept(self.db, self._state, options or Selection().key(self.db), name, make)
 
     def _table(self, name: str, sweep: str = "", condition: str = "") -> str:
         """Return a table of all trials, or of those of a sweep and a condition."""

@@ -21,8 +21,7 @@ from merge_runner.prompts.blocks import BASELINE, title_of
 from merge_runner.records import NO_DECISION
 from merge_runner.results.database import read_database
 from merge_runner.results.provenance import program
-from merge_runner.results.store import results_digest
-from merge_runner_analysis.cache import finished, keep_finished
+from merge_runner_analysis.cache import digest_of, finished, keep_finished
 from merge_runner_analysis.explain import Source, sources_of, sql_command
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.figures.gallery import rendered, write_figures
@@ -173,7 +172,7 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
         version=version("merge-runner"),
         made_at="",  # equal results give equal reports
         trials=sum(len(group.trials) for group in study.played),
-        digest=results_digest(study.db)[0],
+        digest=digest_of(study.db, study.state),
     )
 
 

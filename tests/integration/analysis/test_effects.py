@@ -137,6 +137,15 @@ def test_replies_of_a_trial_count_as_one_observation(tmp_path):
     assert found.difference.freedom < 110
 
 
+def test_trials_of_unknown_cost_are_left_out_with_a_word(tmp_path):
+    drives = [replace(d, said={}) for name in ("one", "two") for d in braking(name, 1.0)]
+    unknown = "UPDATE calls SET cost_usd = NULL WHERE trial_id LIKE 'two/%rep02%'"
+    study = changed(write_study(tmp_path / "t.duckdb", drives), unknown)
+    row = next(row for row in made(study, "effects").rows if row.id == "model=two/cost_usd")
+    assert (row.values["n"], row.values["n_reference"]) == (44, 55)
+    assert "11 of 55 ended trials of model=two have no value and are left out" in row.note
+
+
 HURRY = """
 models = ["emulator"]
 repetitions = 30

@@ -11,7 +11,7 @@ from merge_runner.errors import UsageError
 from merge_runner_analysis.commands import drivers
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.selection import Selection
-from merge_runner_analysis.stats.effects import levels_by_factor
+from merge_runner_analysis.stats.levels import levels_by_factor
 from merge_runner_analysis.study import Study
 from tests.support.crossed_study import PLUGIN
 from tests.support.studies import changed, write_study, yielding

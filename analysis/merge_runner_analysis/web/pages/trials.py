@@ -36,7 +36,7 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
         if named.content is None:
             return site.render("behind.html", here="trials", cell=cell["cell"], computed=named)
         wanted = {**chosen, "trials": named.content["trials"]}
-    totals = site.catalogue.counts(wanted, "model")
+    totals = site.catalogue.totals(wanted)
     trials = sum(part["trials"] for part in totals)
     last = max(1, -(-trials // PAGE))
     page = min(whole(asked.get("page", "")) or 1, last)

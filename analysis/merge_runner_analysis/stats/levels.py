@@ -1,0 +1,198 @@
+"""The levels of factors: which trials each has, and which of them are copies of others.
+
+Levels are compared within cells: a condition with one level of each other factor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations
+
+import pandas as pd
+
+from merge_runner_analysis.cache import remembered
+from merge_runner_analysis.frames import KEYS
+from merge_runner_analysis.grouping import Group, levels_of
+from merge_runner_analysis.study import Study
+from merge_runner_analysis.wording import TIMES
+
+# Shown by this one, prompts are compared driver by driver; a driver has all other levels in it.
+DRIVER = "driver"
+Cell = tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """A level of a factor: the ids of its groups, and their trials as one group without copies.
+
+    The trials have a column ``cell``: their condition and the levels of all other factors. Cells
+    in which programs play the same trials are one cell. ``pooled.whole`` has the copies, too.
+    ``posing`` is what is said of scripted stand-ins; the ``mark`` tells their level from others'.
+    ``at`` is the level of another factor that all of its trials have, if it is shown by that one.
+    """
+
+    factor: str
+    name: str
+    groups: tuple[str, ...]
+    pooled: Group
+    posing: str = ""
+    mark: str = ""
+    at: str = ""
+
+    @property
+    def id(self) -> str:
+        """``temperature=0.2``, or ``opponent=idm/temperature=0.2``."""
+        return f"{self.at}/" * bool(self.at) + f"{self.factor}={self.name}{self.mark}"
+
+    @cached_property
+    def copies(self) -> tuple[tuple[str, str], ...]:
+        """The trials of its groups that are left out as copies (trial_id, spec_hash)."""
+        copies = self.pooled.stored.trials.drop(index=self.pooled.trials.index)
+        if copies.empty:
+            return ()
+        left_out = copies.loc[copies["group"].isin(self.groups), KEYS]
+        return tuple(left_out.itertuples(index=False, name=None))
+
+
+@remembered
+def copied_cells(study: Study, groups: tuple[Group, ...]) -> set[Cell]:
+    """The cells of programs that do not heed what the groups differ in.
+
+    With the same other levels, all trials of one of two groups are copies of the other's there, in
+    every condition that both have. What they differ by is how often each was drawn, so that nothing
+    can be tested. Conditions are never left out one by one: which of them stay would depend on
+    what happened there.
+    """
+    ways = [_ways(study, group) for group in groups]
+    copied: set[Cell] = set()
+    for one, other in combinations(ways, 2):
+        for others in one.keys() & other.keys():
+            if _are_copies(one[others], other[others]):
+                copied |= {(name, *others) for name in one[others].keys() & other[others].keys()}
+    return copied
+
+
+@remembered
+def _ways(study: Study, group: Group) -> dict[Cell, dict[str, set[object]]]:
+    """The ways in which trials went, by the levels of the other factors and by condition."""
+    ways: dict[Cell, dict[str, set[object]]] = {}
+    for (condition, *others), way in zip(group.ended["cell"], group.ended["way"], strict=True):
+        ways.setdefault((*others,), {}).setdefault(condition, set()).add(way)
+    return ways
+
+
+def _are_copies(one: Mapping[str, set[object]], other: Mapping[str, set[object]]) -> bool:
+    """Whether in every condition that both have all trials of one are among the other's."""
+    shared = one.keys() & other.keys()
+    return bool(shared) and all(
+        one[name] <= other[name] or other[name] <= one[name] for name in shared
+    )
+
+
+def copied_of_shared(study: Study, *levels: Level) -> tuple[int, int]:
+    """How many of the cells that levels share are copied ones, and how many they share."""
+    shared = set.intersection(*({*level.pooled.ended["cell"]} for level in levels))
+    return len(shared & copied_cells(study, tuple(level.pooled for level in levels))), len(shared)
+
+
+@remembered
+def levels_by_factor(study: Study, by: str = "", at: str = "", least: int = 2) -> list[list[Level]]:
+    """The levels of each factor that has so many of them at ``least``, the reference first.
+
+    Trials of scripted stand-ins are never pooled with others. With ``by``, the trials are those
+    ``at`` one of its levels.
+    """
+    chosen = [group for group in study.models if not by or _level_of(group, by) == at]
+    kinds = [[g for g in chosen if g.scripted == scripted] for scripted in (False, True)]
+    apart = any(g.scripted for g in study.models) and not all(g.scripted for g in study.models)
+    return [
+        _distinct(study, [_level(groups, factor, name, by, apart=apart) for name in levels])
+        for groups in kinds
+        for factor, levels in levels_of(groups, study.order).items()
+        if len(levels) >= least
+    ]
+
+
+def _level_of(group: Group, factor: str) -> str | None:
+    return group.driver if factor == DRIVER else group.levels.get(factor)
+
+
+def _level(every: list[Group], factor: str, name: str, by: str, *, apart: bool) -> Level:
+    groups = [group for group in every if group.levels.get(factor) == name]
+    said = {group.posing for group in groups}
+    posing = said.pop() if len(said) == 1 else "scripted stand-ins"
+    mark = " [scripted]" if apart and posing else ""
+    at = f"{by}={_level_of(groups[0], by)}" if by else ""
+    pooled = _with_cells(groups, {factor, by})
+    return Level(factor, name, tuple(group.id for group in groups), pooled, posing, mark, at)
+
+
+def _with_cells(groups: Sequence[Group], apart_from: set[str]) -> Group:
+    """Groups as one, whose trials have their cell: condition and levels of the other factors."""
+    parts = []
+    for group in groups:
+        others = [f"{n}={level}" for n, level in group.levels.items() if n not in apart_from]
+        others += [group.mark.strip()] * bool(group.mark)  # another setting of the task
+        cells = [(condition, *others) for condition in group.trials["condition"]]
+        cells_of = pd.Series(cells, group.trials.index, dtype=object)
+        parts.append(group.trials.assign(cell=cells_of, group=group.id))
+    return replace(groups[0], trials=pd.concat(parts, ignore_index=True))
+
+
+def crossing(study: Study, factors: Sequence[str], wanted: Mapping[str, str]) -> list[Level]:
+    """The trials at these levels of several factors, as a level of their crossing.
+
+    Those of scripted stand-ins are another one.
+    """
+    chosen = [g for g in study.models if all(_level_of(g, f) == at for f, at in wanted.items())]
+    found = []
+    for scripted in (False, True):
+        groups = [group for group in chosen if group.scripted == scripted]
+        if not groups:
+            continue
+        mark = " [scripted]" if scripted and len(groups) < len(chosen) else ""
+        name = ", ".join(wanted[factor] for factor in factors)
+        pooled = _with_cells(groups, {*wanted})
+        ids = tuple(group.id for group in groups)
+        found += _distinct(study, [Level(TIMES.join(factors), name, ids, pooled, mark=mark)])
+    return found
+
+
+def _distinct(study: Study, levels: list[Level]) -> list[Level]:
+    """The levels, each without copies of trials, and with the cells that share these as one."""
+    names: dict[Cell, Cell] = {}
+
+    def first(cell: Cell) -> Cell:
+        while (before := names.get(cell, cell)) != cell:
+            cell = before
+        return cell
+
+    for level in levels:
+        for cells in _with_copies(study, level.pooled):
+            same = sorted({first(cell) for cell in cells})
+            names |= dict.fromkeys(same[1:], same[0])
+    return [_without_copies(level, first) for level in levels]
+
+
+def _with_copies(study: Study, group: Group) -> Iterator[Iterable[Cell]]:
+    """Cells that have copies of each other's trials.
+
+    Of programs those of a condition in which any trials are equal. A stand-in plays with chance:
+    its trials of two levels that it reads may be equal here and there, which makes them no copies.
+    """
+    if not group.scripted:
+        yield from (cells for _, cells in group.trials.groupby(["condition", "way"])["cell"])
+        return
+    for (own, one), (its, other) in combinations(_ways(study, group).items(), 2):
+        if _are_copies(one, other):
+            yield from (((name, *own), (name, *its)) for name in one.keys() & other.keys())
+
+
+def _without_copies(level: Level, first: Callable[[tuple[str, ...]], tuple[str, ...]]) -> Level:
+    every = level.pooled.trials
+    every = every.assign(cell=pd.Series([first(cell) for cell in every["cell"]], dtype=object))
+    kept = every.drop_duplicates(["cell", "way"])
+    pooled = replace(level.pooled, trials=kept, whole=replace(level.pooled, trials=every))
+    return replace(level, groups=tuple(kept["group"].unique()), pooled=pooled)
