@@ -154,7 +154,9 @@ def explain(
         str,
         typer.Argument(metavar="TABLE", autocompletion=_table_names, help="A table's name."),
     ],
-    cell: Annotated[str, typer.Argument(metavar="ROW", help="ROW, or ROW:COLUMN.")],
+    cell: Annotated[
+        str, typer.Argument(metavar="ROW", help="ROW, or ROW:COLUMN; without it rows are listed.")
+    ] = "",
     db: DbOption = DEFAULT_DB,
     where: WhereOption = None,
     run: RunOption = None,
@@ -175,6 +177,14 @@ def explain(
     from merge_runner_analysis.tables import finished_tables
 
     (made,) = finished_tables(db, [table], study)
+    if not cell:
+        names = {"rows": [row.id for row in made.rows], "columns": [c.name for c in made.columns]}
+        listed = [
+            *names["rows"],
+            f"columns, each after ROW and a colon: {', '.join(names['columns'])}",
+        ]
+        print_out(json.dumps(names, indent=2) if as_json else "\n".join(listed))
+        return
     found = explain_cell(study, made, cell)
     if as_json:
         sources = [source._asdict() for source in found.sources]

@@ -133,6 +133,16 @@ def test_explain_shows_the_trials_that_a_share_counts_and_with_all_the_others(ru
     assert {line.strip() for line in lines[-len(others) :]} == others
 
 
+def test_explain_without_a_row_lists_rows_and_columns(run):
+    of_table = ("explain", "ablation-quantitative", *DB)
+    names = json.loads(run(*of_table, "--json").out)
+    assert "smollm2/baseline" in names["rows"]
+    assert "collided_percent" in names["columns"]
+    *rows, columns = run(*of_table).out.splitlines()
+    assert rows == names["rows"]
+    assert columns.endswith(", ".join(names["columns"]))
+
+
 def test_a_driver_is_found_by_its_name_without_the_endpoint_where_one_has_it(golden_copy):
     elsewhere = "replace(spec::VARCHAR, '\"local\"', '\"http://localhost:8123/v1\"')::JSON"
     db = golden_copy / "golden.duckdb"
