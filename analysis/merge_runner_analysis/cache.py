@@ -21,7 +21,6 @@ import merge_runner
 import merge_runner_analysis
 from merge_runner.errors import UsageError
 from merge_runner.registry import in_use, plugin_sources, plugins
-from merge_runner.results.store import results_digest
 
 KEPT = """
 CREATE TABLE IF NOT EXISTS finished (
@@ -101,6 +100,9 @@ def kept(db: Path, made_of: str, options: str, name: str, make: Callable[[], str
 
 def digest_of(db: Path, made_of: str) -> str:
     """Return the digest of all results, for which all of them have to be read."""
+    # Here, since it imports duckdb, which no kept table needs.
+    from merge_runner.results.store import results_digest
+
     return kept(db, made_of, "", "digest", lambda: results_digest(db)[0])
 
 

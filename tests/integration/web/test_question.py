@@ -194,7 +194,7 @@ def test_the_first_screen_answers_a_study_of_two_factors(page, db, outcomes):
     every = readings(outcomes)
     slope = 100 * fitted(every, "hurry", ("persona", "opponent"))["C(hurry)[T.yes]"]
     beside = page.locator("main").inner_text().replace("\N{NO-BREAK SPACE}", " ")
-    assert f", +{slope:.2f} points" in beside
+    assert f"The difference is +{slope:.2f} points" in beside
     shares = [float(share) for share in re.findall(r"(\d+\.\d\d) %", said)]
     assert shares[0] - shares[1] == pytest.approx(slope, abs=0.011)
     none, taxi = (
