@@ -41,6 +41,7 @@ from merge_runner.llm.cache_file import (
     upgrade,
 )
 from merge_runner.llm.durable import BatchWriter, Execute, ModelLocks, Operation, Rows, connect
+from merge_runner.llm.kinds import ADD, TABLE, Kinds, kinds_in, kinds_of, rows_of
 from merge_runner.records import DAMAGED, Attempt, ChatRequest, check_body, check_call
 
 CHECKSUM_LENGTH = 32
@@ -60,9 +61,14 @@ _KEYS = """
 SELECT CAST(key AS BLOB) FROM Cache WHERE typeof(key) = 'text' AND key >= ? AND key < ? ORDER BY key
 """
 # A call's key has 64 characters, without a space; another type or a damaged key is told.
-_CALLS = """
-SELECT rowid FROM Cache NOT INDEXED WHERE typeof(key) != 'text' OR raw IS NOT 1
-OR length(CAST(key AS BLOB)) = 64 AND NOT instr(key, ' ')
+_IS_CALL = """(
+typeof(key) != 'text' OR raw IS NOT 1 OR length(CAST(key AS BLOB)) = 64 AND NOT instr(key, ' ')
+)"""
+_CALLS = f"SELECT rowid FROM Cache NOT INDEXED WHERE {_IS_CALL}"  # noqa: S608 # constants
+_NUMBER = f"SELECT count(*) FROM Cache WHERE {_IS_CALL}"  # noqa: S608 # constants
+_NEWER = """
+SELECT rowid, mode, filename, value FROM Cache WHERE rowid > ? AND raw = 1 AND length(key) = 64
+AND NOT instr(key, ' ') ORDER BY rowid LIMIT ?
 """
 _CALL = "SELECT key, raw, mode, filename, value FROM Cache WHERE rowid = ?"
 
@@ -97,6 +103,8 @@ class _Stored:
 
 
 _STORED: TypeAdapter[_Stored] = TypeAdapter(_Stored)
+Overlay = tuple[Mapping[str, CachedCall], Kinds]
+"""A recording: its entries by key, and how many there are of each kind."""
 
 
 class ResponseCache:
@@ -110,11 +118,11 @@ class ResponseCache:
         self,
         folder: Path,
         *,
-        overlay: Callable[[], AbstractContextManager[Mapping[str, CachedCall]]] | None = None,
+        overlay: Callable[[], AbstractContextManager[Overlay]] | None = None,
         read_only: bool = False,
         before: bool = False,
     ) -> None:
-        """Open or make the folder; ``overlay`` opens a recording, entries by key.
+        """Open or make the folder; ``overlay`` opens a recording.
 
         What the recording holds comes before what the folder holds; both are closed together.
         ``read_only`` changes nothing in the folder, which must be there, and may be of the format
@@ -149,9 +157,13 @@ class ResponseCache:
             raise UsageError(f"the cache {folder} cannot be used: {exc}. {NEW_CACHE}") from exc
 
     @cached_property
-    def _overlay(self) -> Mapping[str, CachedCall]:
+    def _recording(self) -> Overlay:
         opened = self._open_overlay
-        return self._with_overlay.enter_context(opened()) if opened else {}
+        return self._with_overlay.enter_context(opened()) if opened else ({}, {})
+
+    @property
+    def _overlay(self) -> Mapping[str, CachedCall]:
+        return self._recording[0]
 
     def get(self, key: str, request: ChatRequest | None = None) -> CachedCall | None:
         """Return the entry of a call, whose ``request`` is given where it is known.
@@ -294,20 +306,54 @@ class ResponseCache:
             raise self._failure("read", exc) from exc
         yield from self._overlay.values()
 
+    def kinds(self) -> tuple[Kinds, Kinds]:
+        """Return how many calls the recording and the folder have answered, by kind of request.
+
+        Those of the folder since it was last asked for are counted first.
+        """
+        if self._texts is None:
+            return self._recording[1], kinds_of(
+                (entry.request, entry.attempts[-1]) for entry in self.entries()
+            )
+        after = 0
+        while after := self.run_now([partial(self._count_newer, after)])[0]:
+            pass
+        return self._recording[1], kinds_in(self.rows("SELECT * FROM kinds"))
+
+    @property
+    def number(self) -> int:
+        """The number of calls in the folder, with damaged ones."""
+        return int(self.rows(_NUMBER)[0][0])
+
+    def _count_newer(self, after: int, execute: Execute) -> int:
+        """Count some calls that are not counted yet, and whose number is higher; an operation.
+
+        No call is ever removed, so that a newer one has a higher number than all before it. Returns
+        the number after which to go on, 0 where there are no more.
+        """
+        execute(TABLE)
+        ((last,),) = execute("SELECT coalesce(max(last), 0) FROM kinds").fetchall()
+        rows = execute(_NEWER, (max(last, after), BATCH)).fetchall()
+        calls = []
+        for _, *value in rows:
+            with contextlib.suppress(RecordingError, *DAMAGED):  # it is told where it is used
+                entry = CachedCall.from_json(self._text(*value))
+                calls.append((entry.request, entry.attempts[-1]))
+        newest = rows[-1][0] if rows else 0
+        for row in rows_of(kinds_of(calls), newest):
+            execute(ADD, row)
+        return newest if len(rows) == BATCH else 0
+
     def recorded(self, name: str, **fields: str) -> set[str]:
         """Return what ``name`` is in requests with a reply and these ``fields``.
 
         They are those of the recording, else of the folder.
         """
-
-        def values(entries: Iterable[CachedCall]) -> set[str]:
-            return {
-                getattr(entry.request, name)
-                for entry in entries
-                if all(getattr(entry.request, key) == value for key, value in fields.items())
-            }
-
-        return values(self._overlay.values()) or values(self.entries())
+        for kinds in self.kinds():
+            wanted = [k for k in kinds if all(getattr(k, f) == of for f, of in fields.items())]
+            if wanted:
+                return {getattr(kind, name) for kind in wanted}
+        return set()
 
     def close(self) -> None:
         """Close the folder and the recording before it, and free its locks."""

@@ -29,11 +29,13 @@ import duckdb
 from pydantic import BaseModel, ConfigDict, JsonValue, field_validator
 
 from merge_runner.errors import RecordingError, UsageError
-from merge_runner.llm.cache import ATTEMPTS, CachedCall, ResponseCache
+from merge_runner.llm.cache import ATTEMPTS, CachedCall, Overlay, ResponseCache
+from merge_runner.llm.kinds import kinds_of
 from merge_runner.paths import refuse_another_kind
 from merge_runner.records import (
     DAMAGED,
     KEY_VERSION,
+    Attempt,
     ChatRequest,
     canonical_json,
     check_body,
@@ -208,24 +210,31 @@ def read_recording(file: Path) -> Iterator[CachedCall]:
 
 
 @contextmanager
-def spilled(files: Iterable[Path]) -> Iterator[Mapping[str, CachedCall]]:
-    """Open recordings as their verified entries by key.
+def spilled(files: Iterable[Path]) -> Iterator[Overlay]:
+    """Open recordings as their verified entries by key, and count these.
 
     Raises RecordingError, also where two recordings hold different replies to one call.
     """
     with closing(sqlite3.connect("", check_same_thread=False)) as db:
         db.execute("CREATE TABLE entries (key TEXT PRIMARY KEY, entry TEXT)")
-        entries = Spilled(db)
-        for file in files:
-            for entry in read_recording(file):
-                key, before = entry.request.key, entries.get(entry.request.key)
-                if before and before.attempts[-1].reply != entry.attempts[-1].reply:
-                    raise RecordingError(
-                        f"{file} holds another reply to the call {key} than a recording named "
-                        "before it: replay them one by one, each into a --db of its own"
-                    )
-                db.execute("INSERT OR IGNORE INTO entries VALUES (?, ?)", (key, entry.to_json()))
-        yield entries
+        yield Spilled(db), kinds_of(_spill(files, db))
+
+
+def _spill(files: Iterable[Path], db: sqlite3.Connection) -> Iterator[tuple[ChatRequest, Attempt]]:
+    """Write recordings' entries, and yield the request and the answer of each."""
+    entries = Spilled(db)
+    for file in files:
+        for entry in read_recording(file):
+            key, last = entry.request.key, entry.attempts[-1]
+            before = entries.get(key)
+            if before is None:
+                db.execute("INSERT INTO entries VALUES (?, ?)", (key, entry.to_json()))
+                yield entry.request, last
+            elif before.attempts[-1].reply != last.reply:
+                raise RecordingError(
+                    f"{file} holds another reply to the call {key} than a recording named "
+                    "before it: replay them one by one, each into a --db of its own"
+                )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

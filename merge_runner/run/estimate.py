@@ -6,14 +6,15 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from statistics import fmean
+from itertools import chain
 
 from merge_runner.config import ModelEntry
 from merge_runner.llm.batch.providers import batch_terms
 from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.kinds import Answers
 from merge_runner.llm.prices import cost_usd
 from merge_runner.prompts.blocks import render_prompt
-from merge_runner.records import SIDES, Usage, canonical_json, is_scripted, without_prompt
+from merge_runner.records import SIDES, Usage, canonical_json
 from merge_runner.run.plan import Options, Plan, usual_prompts
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
@@ -35,25 +36,22 @@ def earlier_answers(plan: Plan, cache: ResponseCache) -> dict[str, Usage | None]
     for name, entry in plan.entries.items():
         sent = plan.parts.formats[entry.format].request(entry, "")
         like[name] = entry.id, plan.endpoints[name], sent.path, canonical_json(sent.body)
-    answers: defaultdict[str, list[tuple[int, int]]] = defaultdict(list)
-    for each in cache.entries():
-        request, last = each.request, each.attempts[-1]
-        asked = request.model, request.endpoint, request.path, without_prompt(request.body)
-        own = request.provider == "emulator" or not is_scripted(request, last)
-        read, written = last.usage.input_tokens, last.usage.output_tokens
+    sums: dict[str, Answers] = {}
+    for kind, answers in chain.from_iterable(kinds.items() for kinds in cache.kinds()):
+        asked = kind.model, kind.endpoint, kind.path, kind.body
         for name in (name for name, wanted in like.items() if wanted[:2] == asked[:2]):
-            tokens = answers[name]
-            if like[name] == asked and own and read is not None and written is not None:
-                tokens.append((read, written))
-    return {
-        name: Usage(
-            input_tokens=round(fmean(read for read, _ in tokens)),
-            output_tokens=round(fmean(written for _, written in tokens)),
-        )
-        if tokens
-        else None
-        for name, tokens in answers.items()
-    }
+            counts = kind.own and like[name] == asked
+            sums[name] = sums.get(name, Answers()).plus(answers if counts else Answers())
+    return {name: _mean(answers) for name, answers in sums.items()}
+
+
+def _mean(answers: Answers) -> Usage | None:
+    if not answers.measured:
+        return None
+    return Usage(
+        input_tokens=round(answers.input_tokens / answers.measured),
+        output_tokens=round(answers.output_tokens / answers.measured),
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -136,9 +136,9 @@ async def play(
 
 def _has_replies(cache: ResponseCache, plan: Plan) -> bool:
     """Whether a model of a plan is recorded, or it has none; what is damaged may be of it."""
-    models, damaged = {entry.id or UNNAMED for entry in plan.entries.values()}, list[str]()
-    recorded = any(entry.request.model in models for entry in cache.entries(damaged))
-    return recorded or bool(damaged) or not models
+    models, (_, kinds) = {entry.id or UNNAMED for entry in plan.entries.values()}, cache.kinds()
+    whole = sum(answers.answers for answers in kinds.values())
+    return any(kind.model in models for kind in kinds) or cache.number > whole or not models
 
 
 def _misses(record: TrialRecord) -> list[Miss]:

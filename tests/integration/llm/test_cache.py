@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from merge_runner.errors import MergeRunnerError, RecordingError, UsageError
 from merge_runner.llm.cache import CachedCall, ResponseCache, import_folder
 from merge_runner.llm.cache_file import TABLES, TextDisk
+from merge_runner.llm.kinds import kinds_of
 from merge_runner.llm.ledger import Ledger
 from merge_runner.records import Attempt, ChatRequest, Slot, Usage, make_request
 from tests.support.cases import cases
@@ -40,6 +41,15 @@ def said(text):
 
 def by_key(*entries):
     return {each.request.key: each for each in entries}
+
+
+def counted(entries):
+    """How many of these calls there are of each kind."""
+    return kinds_of((each.request, each.attempts[-1]) for each in entries)
+
+
+def overlaid(entries):
+    return entries, counted(entries.values())
 
 
 async def keep(cache, kept):
@@ -482,7 +492,7 @@ def test_an_overlay_answers_before_the_folder_is_read_once_where_needed_and_neve
     @contextlib.contextmanager
     def overlay():
         happened.append("opened")
-        yield recorded
+        yield overlaid(recorded)
         happened.append("closed")
 
     cache = ResponseCache(folder, overlay=overlay)
@@ -500,9 +510,35 @@ def test_an_overlay_answers_before_the_folder_is_read_once_where_needed_and_neve
     plain.close()
 
 
+def test_calls_are_counted_by_kind_once_whichever_process_kept_them(cache, other):
+    tokens = Usage(input_tokens=100, output_tokens=7)
+    first = [entry(n, endpoint=server, usage=tokens) for n in (1, 2) for server in "ab"]
+    cache.put_now(first, tried=[(entry(9).request.key, (Attempt(1, "timeout"),))])
+    assert other.kinds() == cache.kinds() == ({}, counted(first))
+    # A reply takes the place of what was tried last, which no longer has a row.
+    later = [entry(9), entry(3, usage=tokens), entry(4, scripted=True)]
+    for each in later:
+        cache.put_now([each])
+    assert cache.kinds() == other.kinds() == ({}, counted([*first, *later]))
+    assert [kind.own for kind in counted(later)] == [True, True, False]
+
+
+@pytest.mark.parametrize("batch", [1, 2, 1000])
+def test_all_calls_are_counted_but_damaged_ones(cache, folder, monkeypatch, batch):
+    monkeypatch.setattr("merge_runner.llm.cache.BATCH", batch)
+    kept = [entry(number) for number in range(1, 6)]
+    cache.put_now(kept)
+    with contextlib.closing(sqlite3.connect(folder / "cache.db")) as database, database:
+        damaged = "UPDATE Cache SET value = 'damaged' WHERE key = ?"
+        database.execute(damaged, [kept[3].request.key])
+    assert cache.kinds()[1] == counted([*kept[:3], kept[4]])
+
+
 def test_endpoints_are_listed_per_model_the_folders_where_the_overlay_has_none(folder):
     recorded = [entry(8, model="a", endpoint="http://o"), entry(9, model="c", endpoint="http://o")]
-    cache = ResponseCache(folder, overlay=lambda: contextlib.nullcontext(by_key(*recorded)))
+    cache = ResponseCache(
+        folder, overlay=lambda: contextlib.nullcontext(overlaid(by_key(*recorded)))
+    )
     named = [entry(1, model="a"), *(entry(number, model="b") for number in (2, 3))]
     cache.put_now([*named, entry(4, model="b", endpoint="http://b")])
     found = {model: endpoints(cache, model) for model in "abcd"}
