@@ -4,7 +4,8 @@ An entry is the JSON of a request and every attempt, the answering one last, beh
 It is durable before anyone sees it: each batch of writes is one synchronous SQLite transaction.
 Beside the entries lie the attempts of calls that have no answer yet, the notes of batches, and
 damaged entries in quarantine. Two tables of our own in the same file hold the money of all sweeps
-(``ledger``), so that a reply and its cost are kept together or not at all.
+(``ledger``), so that a reply and its cost are kept together or not at all; a third one counts the
+calls by kind (``kinds``).
 """
 
 from __future__ import annotations

@@ -510,7 +510,7 @@ def test_an_overlay_answers_before_the_folder_is_read_once_where_needed_and_neve
     plain.close()
 
 
-def test_calls_are_counted_by_kind_once_whichever_process_kept_them(cache, other):
+def test_calls_are_counted_by_kind_once_whichever_process_kept_them(cache, other, monkeypatch):
     tokens = Usage(input_tokens=100, output_tokens=7)
     first = [entry(n, endpoint=server, usage=tokens) for n in (1, 2) for server in "ab"]
     cache.put_now(first, tried=[(entry(9).request.key, (Attempt(1, "timeout"),))])
@@ -521,6 +521,8 @@ def test_calls_are_counted_by_kind_once_whichever_process_kept_them(cache, other
         cache.put_now([each])
     assert cache.kinds() == other.kinds() == ({}, counted([*first, *later]))
     assert [kind.own for kind in counted(later)] == [True, True, False]
+    monkeypatch.setattr(CachedCall, "from_json", lambda text: pytest.fail("it is read again"))
+    assert cache.kinds() == ({}, counted([*first, *later]))
 
 
 @pytest.mark.parametrize("batch", [1, 2, 1000])
