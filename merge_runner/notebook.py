@@ -157,7 +157,7 @@ class Study:
         meaning: str,
         **more: Any,  # noqa: ANN401 # fields of Program
     ) -> None:
-        """Add a driver, with fields of ``Program``. Where its source is edited, it is another."""
+        """Add a driver, with fields of ``Program``. Another ``revision`` is another one."""
         self.register(PROGRAMS, name, Program(driver, meaning, **more))
 
     def plan(self, *, first: bool = False, grid: str | None = None) -> Plan:

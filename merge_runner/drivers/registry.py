@@ -1,4 +1,4 @@
-"""The programs that drive; one whose source is edited is another driver."""
+"""The programs that drive; one of another revision is another driver."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from merge_runner.drivers.program_seat import Parameter, ProgramSeat
 from merge_runner.errors import UsageError
 from merge_runner.records import SIDES, Side, TrialSpec, other_side
 from merge_runner.registry import Registry, require
-from merge_runner.source import source_digest
 
 if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
@@ -32,6 +31,8 @@ _making = threading.Lock()
 class Program:
     """A class whose instances drive, made with a ProgramSeat.
 
+    The class may name its ``revision``, a whole number, which is 1 where it does not: whoever
+    changes what it decides raises it, so that its trials are played anew.
     ``meaning`` says in a few words what it does, and ``parameters`` are those of its rule. It
     decides ``rate_hz`` times a second; None: at the prompt rate of the scenario. A ``settable``
     program reads its parameters from its seat, so that a study can set them. ``sets`` are named
@@ -63,8 +64,10 @@ class Program:
     def __post_init__(self) -> None:
         """Raises UsageError for what can be no driver, or could not be told apart from another."""
         if not isinstance(self.driver, type):
-            raise UsageError(f"the driver {self.driver!r} is no class: its source is not known")
+            raise UsageError(f"the driver {self.driver!r} is no class")
         name = self.driver.__qualname__
+        if not isinstance(self.revision, int) or self.revision < 1:
+            raise UsageError(f"the revision of the driver {name} is a whole number from 1 on")
         if self.rate_hz is not None and not 0 < self.rate_hz < inf:
             raise UsageError(f"the driver {name} needs a rate_hz above 0")
         if self.sets:
@@ -75,6 +78,12 @@ class Program:
             self.check(self.values)
         if self.check_clock is not None and self.rate_hz is not None:
             self.check_clock(self.values, 1 / self.rate_hz)
+
+    @property
+    def revision(self) -> int:
+        """Which revision of its rule the class is."""
+        revision: int = getattr(self.driver, "revision", 1)
+        return revision
 
     @property
     def values(self) -> dict[str, Parameter]:
@@ -157,12 +166,11 @@ class Program:
         )
 
     def in_spec(self, name: str) -> dict[str, object]:
-        """What the spec of its trials says of it; its version covers what all drivers share."""
-        assert isinstance(self.driver, type)
+        """What the spec of its trials says of it."""
         said = {
             "program": name,
             "parameters": self.values,
-            "source": source_digest(self.driver),
+            "revision": self.revision,
             "chance": self.chance or None,
             "rate_hz": self.rate_hz,
             "data": self.data and self.data.digest,

@@ -17,7 +17,7 @@ from typing import Any
 import duckdb
 
 from merge_runner.audit.checks import Audit, Finding, audited_database, check_rest, check_sweep
-from merge_runner.errors import MergeRunnerError, RecordingError
+from merge_runner.errors import MergeRunnerError, RecordingError, UsageError
 from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.formats import WireFormat
 from merge_runner.llm.http_outcome import RawReply, judge
@@ -35,6 +35,7 @@ from merge_runner.records import (
     make_request,
 )
 from merge_runner.registry import Catalogue, in_use, require, using
+from merge_runner.results.database import read_database
 from merge_runner.results.recording import leaves
 from merge_runner.results.rows import Stored, in_order, rows_of
 from merge_runner.run.plan import Plan, find_parts
@@ -63,7 +64,7 @@ NOT_REPLAYED = (
 OF_THE_PROGRAM = (
     "spec_version",
     "prompt_blocks",
-    *(f"{side}.{name}" for side in SIDES for name in ("source", "data")),
+    *(f"{side}.{name}" for side in SIDES for name in ("source", "revision", "data")),
 )
 HINT = "install the package that registers it, or name the study: --study FILE"
 SWEEPS = """
@@ -94,6 +95,31 @@ def audit_database(
         ]
         rest = [check_rest(connection, path)] if sweep_ids is None else []
         return [*reversed(audits), *rest]
+
+
+def refuse_changed_programs(path: Path, plan: Plan, stored: Sequence[TrialSpec]) -> None:
+    """Raise UsageError where a program drives otherwise than in a stored trial of its revision.
+
+    Of each spec with a program one trial is played, by the stored replies.
+    """
+    arms = plan.by_label()
+    programs = {name: sorted({*arm.asked.values()} - {*arm.entries}) for name, arm in arms.items()}
+    firsts = {spec.spec_hash: spec for spec in reversed(stored) if programs[spec.arm]}
+    by_key = {(spec.trial_id, spec.spec_hash): spec for spec in firsts.values()}
+    if not by_key:
+        return
+    replies = StoredReplies(plan, arms)
+    replay = Replay(plan, replies)
+    with read_database(path) as connection:
+        for key, tables in in_order(connection, by_key):
+            replies.spec, replies.rows = by_key[key], [*tables["calls"].named(key)]
+            record = replay.play_one(replies.spec)
+            for found in () if record.failed_calls else _findings(record, tables, "replay", ""):
+                raise UsageError(
+                    f"{' or '.join(programs[record.spec.arm])} drives otherwise than in the trial "
+                    f"{key[0]} of {path} ({found.text}): give its class another `revision`, so "
+                    "that its trials are played anew, or name another --db"
+                )
 
 
 def _audit(

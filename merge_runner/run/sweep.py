@@ -61,6 +61,7 @@ from merge_runner.run.local_runner import (
 from merge_runner.run.plan import Options, Plan, usual_prompts
 from merge_runner.run.progress import Progress, as_dict, first_of, show_progress, write_standing
 from merge_runner.run.replay import Replay
+from merge_runner.run.stored_replay import refuse_changed_programs
 from merge_runner.run.trials import Player
 
 INTERRUPTED = 130
@@ -492,7 +493,8 @@ async def open_sweep(
         # A replay derives everything from the recorded replies alone, so it plays every trial.
         with unreadable_is_usage():
             ended = set() if options.replay else Store(options.db).ended_trials(specs)
-        stored = [spec for key, spec in specs.items() if key in ended]
+            stored = [spec for key, spec in specs.items() if key in ended]
+            refuse_changed_programs(options.db, plan, stored)
         todo = [spec for key, spec in specs.items() if key not in ended]
         others: list[str] = []
         if todo and not options.sends_nothing:

@@ -43,7 +43,6 @@ from merge_runner.prompts.blocks import (
 from merge_runner.records import canonical_json
 from merge_runner.registry import FAULTS, NAME, Catalogue, collecting, installing, require
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.source import STUDY_PLUGINS, parsed
 from merge_runner.study.crossing import OPPONENT, chosen_models, level_text
 from merge_runner.study.file import (
     PLUGIN,
@@ -59,6 +58,9 @@ from merge_runner.text_safety import one_line, printable, say
 # Who answers, where, with which key, at what price: the rest is how the same model is asked.
 IDENTITY = {"provider", "format", "id", "base_url", "path", "key_env", "auth", "price"}
 _importing = threading.RLock()
+_parsing = threading.Lock()  # Python 3.11 counts the depth of a tree for all threads
+STUDY_PLUGINS = "study_plugins"
+"""The package of a study's plug-ins, with a hash behind it: those of two studies are two."""
 
 
 def load_study(
@@ -222,7 +224,9 @@ def _import_others(source: str) -> None:
     """Import what a plug-in imports from elsewhere: what that registers is no part of the study."""
     names: list[str] = []
     with suppress(*FAULTS):  # it is told, with its line, when the plug-in runs
-        for node in parsed(source).body:
+        with _parsing:
+            body = ast.parse(source).body
+        for node in body:
             if isinstance(node, ast.Import):
                 names += [alias.name for alias in node.names]
             elif isinstance(node, ast.ImportFrom) and node.module and not node.level:

@@ -1,4 +1,4 @@
-"""What this study adds. An edited driver is another one: its trials are played anew."""
+"""What this study adds. Raise a driver's revision when you edit its rule: it is played anew."""
 
 from merge_runner.drivers.base import Seat
 from merge_runner.drivers.registry import PROGRAMS, Program
@@ -8,6 +8,8 @@ from merge_runner_analysis.metrics import Metric, register
 
 class HesitantDriver:
     """Brakes a little before the merge point, and keeps its speed behind it."""
+
+    revision = 1
 
     def __init__(self, seat: Seat) -> None:
         self.seat = seat

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from merge_runner.drivers.registry import Program
 from merge_runner.prompts.blocks import Prompt
 from merge_runner.results.database import in_memory, schema_sql
 from merge_runner.results.store import query
@@ -186,12 +187,12 @@ def test_an_answer_that_is_said_to_have_come_with_an_error_is_found(db):
 
 
 def test_trials_of_another_program_or_other_prompts_are_a_note(db, monkeypatch):
-    monkeypatch.setattr("merge_runner.drivers.registry.source_digest", lambda *_, **__: "edited")
+    monkeypatch.setattr(Program, "revision", 2)
     monkeypatch.setattr(Prompt, "digests", {"C0": "older"})
     (audit, _) = audit_database(db)
     assert audit.findings == []
     assert audit.notes[-1].startswith("not replayed: 1 trials, since they were made by another ")
-    for part in ("right.source", "prompt_blocks.C0"):
+    for part in ("right.revision", "prompt_blocks.C0"):
         assert part in audit.notes[-1]
 
 

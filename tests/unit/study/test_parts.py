@@ -1,18 +1,16 @@
 """The prompts, conditions and plug-ins that a study adds."""
 
 import sys
-from importlib import import_module
 
 import pytest
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.prompts.blocks import blocks_of, prompt_of, render_prompt
-from merge_runner.registry import Catalogue, Registry, collecting, using
+from merge_runner.registry import Registry, using
 from merge_runner.run.plan import make_plan
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
-from merge_runner.source import STUDY_PLUGINS, source_digest
 
 HEAD = 'repetitions = 1\nconditions = ["N_0_0"]\n'
 DRIVER = """
@@ -112,16 +110,15 @@ def test_an_own_condition_is_played_and_another_mean_speed_is_another_spec(plan_
     assert specs[0].spec_hash == plain  # its headway and velocity stand in the trial's row
 
 
-def test_a_plug_in_beside_the_study_drives_and_an_edit_of_it_is_another_driver(plan_of):
+def test_a_plug_in_beside_the_study_drives_and_another_revision_is_another_driver(plan_of):
     text = '[plugins]\nfiles = ["mine.py"]\n'
-    hashes = []
-    for action in (-0.1, -0.1, -0.2):
-        plan = plan_of(text, ["braking"], plugin=DRIVER.format(action=action))
+    hashes, plain = [], DRIVER.format(action=-0.2)
+    revised = plain.replace("class Braking:\n", "class Braking:\n    revision = 2\n")
+    for plugin in (plain, f"# why\n{plain}", revised):
+        plan = plan_of(text, ["braking"], plugin=plugin)
         hashes.append(plan.trial_specs()[0].spec_hash)
     assert hashes[0] == hashes[1] != hashes[2]
-    assert plan.model_dump(mode="json")["study"]["plugins"] == {
-        "mine.py": DRIVER.format(action=-0.2)
-    }
+    assert plan.model_dump(mode="json")["study"]["plugins"] == {"mine.py": revised}
 
 
 def test_what_a_plug_in_imports_is_no_part_of_its_study(plan_of, tmp_path, monkeypatch):
@@ -138,24 +135,3 @@ def test_what_a_plug_in_imports_is_no_part_of_its_study(plan_of, tmp_path, monke
     with using(plan.parts.catalogue):
         assert {*colours} == {"elsewhere", "own"}
     assert [*colours] == ["elsewhere"]
-
-
-def test_the_hash_of_a_plug_in_is_that_of_a_package_of_its_name(plan_of, tmp_path, monkeypatch):
-    """However many others there are: what was stored of it stays its own."""
-    study = tmp_path / "study.toml"
-    driver = "from .gains import GAIN\n" + DRIVER.format(action="GAIN")
-    study.write_text(HEAD + '[plugins]\nfiles = ["gains.py", "mine.py", "other.py"]\n')
-    for folder in (tmp_path, tmp_path / STUDY_PLUGINS):
-        folder.mkdir(exist_ok=True)
-        (folder / "gains.py").write_text("GAIN = -0.1\n")
-        (folder / "other.py").write_text("")
-        (folder / "mine.py").write_text(driver)
-    hashed = []
-    for text in ("", "X = 1\n"):
-        (tmp_path / "other.py").write_text(text)
-        plan = make_plan(str(study), ["braking"], trust=True)
-        hashed.append(plan.parts.programs["braking"].in_spec("braking")["source"])
-    monkeypatch.syspath_prepend(tmp_path)
-    with collecting(Catalogue()):
-        package = import_module(f"{STUDY_PLUGINS}.mine")
-    assert hashed == [source_digest(package.Braking)] * 2
