@@ -64,7 +64,7 @@ def words_of(prompt: str, digests: Mapping[str, str]) -> list[tuple[str, str]]:
     return [
         (name, text)
         for name, text in _blocks(prompt, tuple(digests.items()))
-        if name and name not in BLOCKS
+        if name and text and name not in BLOCKS
     ]
 
 

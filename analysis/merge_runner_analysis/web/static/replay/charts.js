@@ -23,7 +23,7 @@ replay.charts = (scene, ribbons, seek) => {
       ...rows.map((value) => svg("line", { x2: "100%", y1: `${y(value)}%`, y2: `${y(value)}%` })),
       ...rows.map((value) => svg("text", { x: -6, y: `${y(value)}%`, dy: 4 }, minus(value))),
       ...ticks(scene.begin, scene.end, 9).map((t) =>
-        svg("text", { class: "second", x: percent(t), y: "100%", dy: 13 }, `${minus(t)} s`),
+        svg("text", { class: "second", x: percent(t), y: "100%", dy: 16 }, `${minus(t)} s`),
       ),
       svg(
         "svg",
