@@ -82,17 +82,20 @@ LEFT JOIN images ON turned AND headway_m = 0 - projected_headway_m
     AND images.mean_mps IS NOT DISTINCT FROM placed.mean_mps
 ORDER BY trial_id, spec_hash
 """  # noqa: S608 # constants
-# Of each driven trial that ended a hash of its states, as its ego sees them, and of what its
-# outcome and its gap depend on beside these: equal ones went the same way.
+# Of each driven trial that ended hashes of its states, as its ego sees them and as they are, and
+# of what its outcome and its gap depend on beside these: equal ones went the same way.
 TRACES = """
-SELECT trial_id, spec_hash, concat_ws(' ', trace, status, spec->>'$.scenario.vehicle_length_m',
-    spec->>'$.scenario.vehicle_width_m') AS trace
+SELECT trial_id, spec_hash, concat_ws(' ', seen, beside) AS trace, concat_ws(' ', driven, beside)
+    AS drive
 FROM (
     SELECT trial_id, spec_hash, sum(hash(step, if(side = ego, 'left', 'right'), position_m,
-        velocity_mps)) AS trace
+        velocity_mps)) AS seen, sum(hash(step, side, position_m, velocity_mps)) AS driven
     FROM states JOIN trial_drivers USING (trial_id, spec_hash) GROUP BY ALL
-) JOIN trials USING (trial_id, spec_hash) LEFT JOIN specs USING (spec_hash)
-WHERE source <> 'human' AND status <> 'failed'
+) JOIN (
+    SELECT trial_id, spec_hash, concat_ws(' ', status, spec->>'$.scenario.vehicle_length_m',
+        spec->>'$.scenario.vehicle_width_m') AS beside
+    FROM trials LEFT JOIN specs USING (spec_hash) WHERE source <> 'human' AND status <> 'failed'
+) USING (trial_id, spec_hash)
 """
 # One row a vehicle: its speeds under control, and whether the simulator slowed it by itself. It
 # cruises until its first decision; those of humans are not on record.
@@ -176,7 +179,7 @@ class Frames(NamedTuple):
     """What a study reads of its database: nobody writes there until all of it is read."""
 
     trials: pd.DataFrame
-    """TRIALS with a column for each metric and ``trace``, and whether they collided."""
+    """TRIALS and TRACES with a column for each metric, and whether they collided."""
     asked: pd.DataFrame
     """First situations that were only asked: of equal columns, of trials that end there."""
     specs: Mapping[str, dict[str, Any]]

@@ -62,8 +62,8 @@ class Group:
     trials: pd.DataFrame
     """Rows of a study's trials, of programs the distinct ones.
 
-    ``way`` is equal in trials of programs and of stand-ins that went alike: copies, where the
-    groups differ only in words that nobody reads.
+    ``way`` is equal in trials of programs and of stand-ins that went alike, whichever of two equal
+    drivers is the ego: copies, where the groups differ only in words that nobody reads.
 
     Humans before an import have the published outcomes alone."""
     whole: Group | None = None
@@ -333,11 +333,14 @@ def _distinct(group: Group, *, programs: bool, scripted: bool) -> Group:
     ended = rows[rows["trace"].notna()].sort_values(["rep", "ego"], kind="stable")
     again = ended.index[ended.duplicated(["condition", "trace"])]
     way = rows["trial_id"] + " " + rows["spec_hash"]
+    drive = ended["drive"] + (" " + ended["ego"]).where(
+        ended["model_left"] != ended["model_right"], ""
+    )
     if programs:
-        way = rows["trace"].fillna(way)
+        way = drive.reindex(rows.index).fillna(way)
     elif scripted:
-        times = ended.groupby(["condition", "trace"]).cumcount().astype(str)
-        way = (ended["trace"] + " " + times).reindex(rows.index).fillna(way)
+        times = drive.groupby([drive, ended["condition"], ended["ego"]]).cumcount().astype(str)
+        way = (drive + " " + times).reindex(rows.index).fillna(way)
     whole = replace(group, trials=rows.assign(way=way))
     if not programs:
         return replace(whole, equal=len(again))

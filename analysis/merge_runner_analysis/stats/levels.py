@@ -187,12 +187,23 @@ def _with_copies(study: Study, group: Group) -> Iterator[Iterable[Cell]]:
         return
     for (own, one), (its, other) in combinations(_ways(study, group).items(), 2):
         if _are_copies(one, other):
-            yield from (((name, *own), (name, *its)) for name in one.keys() & other.keys())
+            yield from (((name, *own), (name, *its)) for name in one.keys() | other.keys())
 
 
 def _without_copies(level: Level, first: Callable[[tuple[str, ...]], tuple[str, ...]]) -> Level:
+    """The level with each trial once.
+
+    Where the copies of one have their ego on both sides, nobody was given anything that he reads:
+    it is a trial of two that are told the same, and read from both sides (``sides``).
+    """
     every = level.pooled.trials
     every = every.assign(cell=pd.Series([first(cell) for cell in every["cell"]], dtype=object))
-    kept = every.drop_duplicates(["cell", "way"])
+    way = every["way"]
+    if level.pooled.scripted:
+        way = way + [" " + " ".join(others) for _, *others in every["cell"]]
+    from_left = every.assign(way=way).sort_values("ego", kind="stable")
+    kept = every.loc[from_left.drop_duplicates("way").index.sort_values()]
+    both = every.groupby(way)["ego"].transform("nunique")[kept.index] > 1
+    kept = kept.assign(focal=kept["focal"].mask(both))
     pooled = replace(level.pooled, trials=kept, whole=replace(level.pooled, trials=every))
     return replace(level, groups=tuple(kept["group"].unique()), pooled=pooled)

@@ -175,7 +175,7 @@ speed_sd_mps = 0.3
         ("baseline", ["o3"], "2f49f4958817cf47"),
         ("baseline", ["emulator", "smollm2"], "037a1a6f3984b776"),
         ("ablations", ["emulator"], "02ffefe1ca1ae59d"),
-        ("mine", [], "f76cb83c248ef614"),
+        ("mine", [], "5496432ce6ba4563"),
     ],
 )
 def test_studies_without_words_keep_their_trials_and_specs(plan_of, study, model, digest):
