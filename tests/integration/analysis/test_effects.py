@@ -191,6 +191,31 @@ def test_the_one_in_a_hurry_is_compared_with_the_one_on_the_same_side(prepare, t
     )
 
 
+PERSONA = """
+[texts.persona.taxi]
+add = [{ after = "C3.human", text = "You are a taxi driver." }]
+given_to = "ego"
+"""
+
+
+def test_words_that_nobody_reads_change_no_effect_of_others(prepare, tmp_path):
+    """Their trials are copies, in which the one with the words sits on either side."""
+    study = HURRY.replace("[factors]", '[factors]\npersona = ["none", "taxi"]') + PERSONA
+    (tmp_path / "both.toml").write_text(study.replace("repetitions = 30", "repetitions = 8"))
+    assert prepare(tmp_path, "sweep", "both.toml", "--db", "t.duckdb", *FAST).code == 0
+    every, alone = (
+        {name: row for name, row in values_of(study, "effects").items() if "hurry=yes/" in name}
+        for study in (
+            Study(tmp_path / "t.duckdb"),
+            Study(tmp_path / "t.duckdb", Selection(where={"persona": ["none"]})),
+        )
+    )
+    same = ("estimate", "estimate_reference", "difference", "ci", "p", "n", "n_reference")
+    for name, row in alone.items():
+        assert {of: every[name][of] for of in same} == {of: row[of] for of in same}
+    assert alone["hurry=yes/left_first_percent"]["estimate_reference"] == pytest.approx(50)
+
+
 def test_a_study_without_factors_says_so(tmp_path):
     study = Study(write_study(tmp_path / "t.duckdb", yielding("o3", reps=1)))
     table = made(study, "effects")
