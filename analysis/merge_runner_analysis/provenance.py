@@ -62,6 +62,7 @@ FROM calls LEFT JOIN sweep_trials USING (trial_id, spec_hash)
 WHERE http_status = 200 AND {others}
 GROUP BY ALL ORDER BY ALL
 """
+RULE = "collision_rule"
 MODEL_COSTS = """
 SELECT driver, count(*) AS trials,
     sum(calls) AS calls, sum(attempts) AS attempts,
@@ -78,8 +79,8 @@ WHERE source <> 'human' GROUP BY ALL ORDER BY ALL
 class Provenance(NamedTuple):
     """What the report says about the origin of its numbers: rows of the queries here.
 
-    By driver, variant and spec_hash ``settings`` are those of the driving task that differ from the
-    defaults, and what was sent to the models beside the prompt.
+    By driver, variant and spec_hash ``settings`` are the collision rule, what else of the driving
+    task differs from the defaults, and what was sent to the models beside the prompt.
     """
 
     sweeps: pd.DataFrame
@@ -131,17 +132,22 @@ def tally(study: Study, group: Group) -> Counter[str]:
 
 
 def _settings(spec: Mapping[str, Any]) -> Iterator[str]:
-    """What is unusual of a driving task, and the parameters of the models on each side of it.
+    """The settings of a driving task, and the parameters of the models on each side of it.
 
     A spec is made with an empty prompt, by which that is known in any format.
     """
-    defaults = ScenarioConfig().model_dump()
-    task = spec.get("scenario", {})
-    yield from _leaves({k: v for k, v in task.items() if defaults.get(k) != v})
+    yield from task_settings(spec.get("scenario", {}))
     for side in SIDES:
         body = spec.get(side, {}).get("body", {})
         sent = {k: v for k, v in body.items() if k != "model" and '""' not in json.dumps(v)}
         yield from _leaves(sent)
+
+
+def task_settings(scenario: Mapping[str, Any]) -> Iterator[str]:
+    """The collision rule of a driving task, and what else of it differs from the defaults."""
+    defaults = ScenarioConfig().model_dump()
+    unusual = {name: value for name, value in scenario.items() if defaults.get(name) != value}
+    return _leaves({RULE: scenario.get(RULE, defaults[RULE]), **unusual})
 
 
 def _leaves(values: Mapping[str, Any]) -> Iterator[str]:

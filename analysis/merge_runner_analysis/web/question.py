@@ -186,8 +186,10 @@ def answered(rows: Sequence[Row]) -> tuple[str, str]:
     if few := [
         row for row in primary if min(_count(row, "n"), _count(row, "n_reference")) < ENOUGH
     ]:
-        counts = [f"{_level(row)} {row.values['n']}" for row in few]
-        return capital(f"{rehearsed}too few trials finished to say: {joined(counts)}."), ""
+        counts = sorted(_count(row, name) for row in few for name in ("n", "n_reference"))
+        trials = " to ".join(dict.fromkeys(map(str, (counts[0], counts[-1]))))
+        asked = f"whether {joined(_factors(few))} changes {what}"
+        return capital(f"{rehearsed}too few trials finished to say {asked}: {trials} a level."), ""
     sure = [row for row in primary if _shown(row)]
     rest = []
     if sure:

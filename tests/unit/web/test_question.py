@@ -87,7 +87,11 @@ SEEN = "A change of 10.00 points or more would have been seen in four of five st
             "Hurry=yes is not shown to change it: +2.00 points [−5.00, 9.00], "
             f"corrected p = 0.400. {SEEN}",
         ),
-        ([effect(n=12)], "Too few trials finished to say: hurry=yes 12.", ""),
+        (
+            [effect(n=12)],
+            "Too few trials finished to say whether hurry changes who goes first: 12 a level.",
+            "",
+        ),
     ],
 )
 def test_the_answer_is_the_primary_test_and_else_what_could_have_been_seen(rows, claim, rest):

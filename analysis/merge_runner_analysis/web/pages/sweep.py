@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from merge_runner.llm.ledger import APART
+from merge_runner_analysis.provenance import task_settings
 from merge_runner_analysis.web.computed import computed
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.listing import MISSING
@@ -86,6 +87,13 @@ def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
         audit=audit_of(site, [run]),
         arms=site.catalogue.counts({"sweep": sweep_id}, "model", "variant"),
         trust=TRUST,
+        task=", ".join(
+            dict.fromkeys(
+                one
+                for arm in run["config"].get("arms") or ()
+                for one in task_settings(arm.get("scenario") or {})
+            )
+        ),
         sums_apart=APART,
         causes=site.catalogue.ask(CAUSES, sweep_id),
         duration=duration,
