@@ -114,7 +114,10 @@ def refuse_changed_programs(path: Path, plan: Plan, stored: Sequence[TrialSpec])
         for key, tables in in_order(connection, by_key):
             replies.spec, replies.rows = by_key[key], [*tables["calls"].named(key)]
             record = replay.play_one(replies.spec)
-            for found in () if record.failed_calls else _findings(record, tables, "replay", ""):
+            if record.failed_calls:
+                continue
+            driven = rows_of(record)["states"]
+            for found in tables["states"].differences(key, driven, ignored=(), tolerance=TOLERANCE):
                 raise UsageError(
                     f"{' or '.join(programs[record.spec.arm])} drives otherwise than in the trial "
                     f"{key[0]} of {path} ({found.text}): give its class another `revision`, so "

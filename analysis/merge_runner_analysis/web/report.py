@@ -171,7 +171,7 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
         program=program(),
         version=version("merge-runner"),
         made_at="",  # equal results give equal reports
-        trials=sum(len(group.trials) for group in study.played),
+        trials=len(study.frames.trials),
         digest=digest_of(study.db, study.state),
     )
 

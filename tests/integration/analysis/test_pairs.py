@@ -66,7 +66,7 @@ def both(play):
 
 def pooled(study):
     """The trials as their egos see them, without what says where they sat."""
-    columns = ["trial_id", "spec_hash", "ego"]
+    columns = ["drive", "way", "trial_id", "spec_hash", "ego"]
     return [
         (group.id, group.levels, group.trials.drop(columns=columns)
          .sort_values("condition").astype(str).to_numpy().tolist())
