@@ -12,6 +12,7 @@ from itertools import combinations
 
 import pandas as pd
 
+from merge_runner.records import SIDES
 from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.frames import KEYS
 from merge_runner_analysis.grouping import Group, levels_of
@@ -194,13 +195,17 @@ def _without_copies(level: Level, first: Callable[[tuple[str, ...]], tuple[str, 
     """The level with each trial once.
 
     Where the copies of one have their ego on both sides, nobody was given anything that he reads:
-    it is a trial of two that are told the same, and read from both sides (``sides``).
+    it is a trial of two that are told the same, and read from both sides (``sides``). That is so
+    where all trials of one side are among the other's: here and there a stand-in's are by chance.
     """
     every = level.pooled.trials
     every = every.assign(cell=pd.Series([first(cell) for cell in every["cell"]], dtype=object))
-    way = every["way"]
-    if level.pooled.scripted:
-        way = way + [" " + " ".join(others) for _, *others in every["cell"]]
+    others = pd.Series([" ".join(others) for _, *others in every["cell"]], every.index)
+    way = every["way"] + (" " + others if level.pooled.scripted else "")
+    for _, rows in every.groupby(others):
+        left, right = ({*rows.loc[rows["ego"] == side, "way"]} for side in SIDES)
+        if not (left <= right or right <= left):
+            way = way.where(~way.index.isin(rows.index), way + " " + every["ego"])
     from_left = every.assign(way=way).sort_values("ego", kind="stable")
     kept = every.loc[from_left.drop_duplicates("way").index.sort_values()]
     both = every.groupby(way)["ego"].transform("nunique")[kept.index] > 1
