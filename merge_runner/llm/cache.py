@@ -67,9 +67,10 @@ typeof(key) != 'text' OR raw IS NOT 1 OR length(CAST(key AS BLOB)) = 64 AND NOT 
 )"""
 _CALLS = f"SELECT rowid FROM Cache NOT INDEXED WHERE {_IS_CALL}"  # noqa: S608 # constants
 _NUMBER = f"SELECT count(*) FROM Cache WHERE {_IS_CALL}"  # noqa: S608 # constants
+# As bytes, since a damaged text may be none.
 _NEWER = """
-SELECT rowid, mode, filename, value FROM Cache WHERE rowid > ? AND raw = 1 AND length(key) = 64
-AND NOT instr(key, ' ') ORDER BY rowid LIMIT ?
+SELECT rowid, mode, filename, CAST(value AS BLOB) FROM Cache WHERE rowid > ? AND raw = 1
+AND length(key) = 64 AND NOT instr(key, ' ') AND typeof(value) = 'text' ORDER BY rowid LIMIT ?
 """
 _CALL = "SELECT key, raw, mode, filename, value FROM Cache WHERE rowid = ?"
 
@@ -336,9 +337,9 @@ class ResponseCache:
         ((last,),) = execute("SELECT coalesce(max(last), 0) FROM kinds").fetchall()
         rows = execute(_NEWER, (max(last, after), BATCH)).fetchall()
         calls = []
-        for _, *value in rows:
+        for _, mode, filename, value in rows:
             with contextlib.suppress(RecordingError, *DAMAGED):  # it is told where it is used
-                entry = CachedCall.from_json(self._text(*value))
+                entry = CachedCall.from_json(self._text(mode, filename, value.decode()))
                 calls.append((entry.request, entry.attempts[-1]))
         newest = rows[-1][0] if rows else 0
         for row in rows_of(kinds_of(calls), newest):
