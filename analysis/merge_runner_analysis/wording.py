@@ -31,6 +31,7 @@ HUMANS, LANGUAGE_MODEL, PROGRAM, MOCK = "humans", "language model", "program", "
 SHOWN, WEAKER, STRONGER, UNLIKE, OPEN = "shown", "weaker", "stronger", "unlike", "inconclusive"
 DIFFERS = frozenset({WEAKER, STRONGER, UNLIKE})
 ENOUGH = 20  # trials with an outcome; with fewer of them a headline says nothing of likeness
+TOO_FEW = f"Too few trials finished to say ({ENOUGH}, and half of all, are needed)"
 ALPHA = 0.05  # that of all tests: to import it would take pandas, which no page needs
 # What metrics are called in sentences and pages; others keep the label of the table.
 METRIC_NAMES = {
@@ -319,7 +320,7 @@ def sentence(verdicts: Mapping[str, Values]) -> str:
         if verdicts[name].get("state") == OPEN
     ]
     if unclear:
-        parts.append(f"cannot tell yet: {joined(unclear)}")
+        parts.append(f"cannot tell yet: {'; '.join(unclear)}")
     text = ". ".join(capital(part) for part in parts if part)
     return f"{text or 'Nothing can be compared with people'}."
 
@@ -529,7 +530,7 @@ def _too_few(drivers: Mapping[str, Mapping[str, Values]], *, alone: bool) -> str
         f"{'' if alone else name} {_finished(of)} of {_ended(of['collisions'])}".strip()
         for name, of in drivers.items()
     ]
-    return f"Too few trials finished to say: {joined(counts)}."
+    return f"{TOO_FEW}: {joined(counts)}."
 
 
 def _count(drivers: Mapping[str, Mapping[str, Values]]) -> str:

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from math import ceil, floor, log10
 from typing import Any
 
-from merge_runner.study.crossing import MODEL
+from merge_runner.prompts.blocks import title_of
+from merge_runner.study.crossing import MODEL, PROMPT
 from merge_runner_analysis.metrics import COLLISIONS, GAP, LEFT_FIRST, RMSE
 from merge_runner_analysis.tables.model import Row, Table
 from merge_runner_analysis.web.marks import Mark
@@ -155,7 +156,7 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
         unbroken(rest),
         capital(name_of(primary)),
         [*shapes.items()],
-        sum(_count(row, "n") for row in _of_one_factor(known)),
+        sum(_count(row, "n") for row in _of_one_factor(known, drawn)),
         any(row.values["k"] is None for row in known) and metric == LEFT_FIRST.name,
         [chart for chart in charts if chart],
         unbroken(_interactions(tested, {str(row.values["factor"]) for row in known})),
@@ -351,6 +352,7 @@ def _changes(rows: Sequence[Row], sides: dict[str, Row], primary: str) -> list[C
 
 def _change(row: Row, sides: dict[str, Row], end: float, primary: str) -> Change:
     of, base, metric = row.values["level"], row.values["reference"], metric_of(row)
+    named = title_of if row.values["factor"] == PROMPT else str
     mark = " [scripted]" if str(of).endswith(" [scripted]") else ""
     is_own = metric == primary
     reference, level = (
@@ -361,7 +363,7 @@ def _change(row: Row, sides: dict[str, Row], end: float, primary: str) -> Change
         )
         for name, side in (("estimate_reference", f"{base}{mark}"), ("estimate", of))
     )
-    said = f"{of} against {base}"
+    said = f"{named(str(of))} against {named(str(base))}"
     if is_own and row.values.get("primary"):
         said += ", primary"
     return Change(
@@ -406,10 +408,14 @@ def _crossing_of(levels: Sequence[Row]) -> str:
     return f"In combination: {', '.join(names[0].split(TIMES))}" if names else ""
 
 
-def _of_one_factor(levels: Sequence[Row]) -> list[Row]:
-    """The rows of the first factor's levels, of all drivers together: every trial once."""
-    pooled = [row for row in levels if not row.values["driver"]]
-    return [row for row in pooled if row.values["factor"] == pooled[0].values["factor"]]
+def _of_one_factor(levels: Sequence[Row], drivers: Sequence[str]) -> list[Row]:
+    """The rows of the first drawn factor's levels, of all ``drivers``: every trial once."""
+    drawn = [
+        row
+        for row in levels
+        if row.values["factor"] != MODEL and (row.values["driver"] or "") in (drivers or [""])
+    ]
+    return [row for row in drawn if row.values["factor"] == drawn[0].values["factor"]]
 
 
 def _chart(title: str, rows: Sequence[Row], shapes: dict[str, str], metric: str) -> Chart | None:
@@ -455,7 +461,8 @@ def _chart(title: str, rows: Sequence[Row], shapes: dict[str, str], metric: str)
                 )
             )
         head = "" if factor in heads or TIMES in factor else factor
-        lines.append(Line(y + APART * (len(points) - 1) / 2, head, name, points))
+        title = title_of(name) if factor == PROMPT else name
+        lines.append(Line(y + APART * (len(points) - 1) / 2, head, title, points))
         heads.add(factor)
         y += APART * (len(points) - 1)
     ticks = [low + step * place for place in range(round((high - low) / step) + 1)]

@@ -11,6 +11,7 @@ from merge_runner_analysis.wording import (
     MEASURES,
     OPEN,
     SHOWN,
+    TOO_FEW,
     crashes,
     headline,
     sentence,
@@ -116,13 +117,11 @@ def test_where_no_language_model_drove_the_headline_says_who_did(kinds, says):
 )
 def test_of_few_outcomes_a_headline_says_the_counts_alone(of, counts):
     claim, because = headline({"gpt": of})
-    assert claim == f"Too few trials finished to say: {counts}."
+    assert claim == f"{TOO_FEW}: {counts}."
     assert because == f"gpt {crashes(of['collisions'])}."
     claim, because = headline({"wild": WILD, "gpt": of})
     assert claim == headline({"wild": WILD})[0]
-    assert because == (
-        f"Too few trials finished to say: gpt {counts}. gpt {crashes(of['collisions'])}."
-    )
+    assert because == (f"{TOO_FEW}: gpt {counts}. gpt {crashes(of['collisions'])}.")
 
 
 @pytest.mark.parametrize("of", [(20, 0), (16, 4), (0, 20)])
@@ -133,7 +132,7 @@ def test_who_collides_has_an_outcome_too(of):
 
 def test_several_drivers_are_told_together():
     few = {"gpt": driver(7, undecided=15), "o4": driver(2)}
-    assert headline(few)[0] == "Too few trials finished to say: gpt 7 of 22 and o4 2 of 2."
+    assert headline(few)[0] == f"{TOO_FEW}: gpt 7 of 22 and o4 2 of 2."
     both = {"a": WILD, "b": WILD}
     crashed = "like people: a crashed in 24 of 110 trials, people in 28 of 990."
     assert headline(both)[0] == f"No language model here drives {crashed}"
@@ -182,7 +181,7 @@ def test_an_interval_beside_a_margin_names_its_level_where_that_is_not_95_percen
             "Crashed in 0 of 110 trials; people in 28 of 990. The one ahead goes first, as with "
             "people (the one ahead in 75 of 78 trials, people in 675 of 704). The faster one "
             "yields, as with people (side by side, the slower one in 16 of 19 trials, people in "
-            "158 of 173). Cannot tell yet: crashes and mean gap.",
+            "158 of 173). Cannot tell yet: crashes; mean gap.",
         ),
         (
             driver(headway="weaker"),

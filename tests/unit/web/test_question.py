@@ -136,7 +136,7 @@ def test_a_side_has_its_count_and_the_chart_the_axis_of_its_data():
     assert (change.reference.k, change.level.k, change.level.n) == (50, 63, 100)
     assert (change.mark.shape, crashes.mark.shape) == ("like", "open")
     assert (crashes.level.k, crashes.level.n, crashes.level.text[:4]) == (3, 103, "63.0")
-    assert answer.trials == 200
+    assert answer.trials == 400  # of both drivers, which are drawn
     (chart,) = answer.charts
     assert [line.name for line in chart.lines] == ["no", "yes"]
     assert [point.shape for point in chart.lines[0].points] == ["dot", "square"]

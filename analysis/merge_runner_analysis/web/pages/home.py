@@ -66,6 +66,7 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         middle=MIDDLE,
         linked=True,
         titles=dict(bar.prompts),
+        pair=[one.name for one in shown][:2],
         notes=noted(shown),
         conditions=conditions,
     )
