@@ -5,6 +5,8 @@ import re
 import pytest
 
 from merge_runner.results.store import query
+from merge_runner_analysis.web.computed import computed_table
+from merge_runner_analysis.web.pages import home
 from tests.support.harness import FAST
 from tests.support.serving import Page, client_of
 
@@ -37,6 +39,20 @@ def db(prepare, tmp_path_factory):
     done = prepare(folder, "sweep", "study.toml", "--db", "t.duckdb", *FAST)
     assert done.code == 0, done.err
     return folder / "t.duckdb"
+
+
+def test_an_answer_that_comes_while_its_page_is_made_is_awaited_and_not_left_out(db, monkeypatch):
+    """Else the page would say what is said of a study without a question, and stay so."""
+
+    def computed_meanwhile(*asked):
+        job, _ = computed_table(*asked)
+        assert job.content
+        return job, None
+
+    with client_of(db) as client:
+        assert 'id="by-level"' in client.get("/").text
+        monkeypatch.setattr(home, "computed_table", computed_meanwhile)
+        assert 'data-parts="#home"' in client.get("/").text
 
 
 def test_what_each_driver_is_told_is_shown_where_the_two_differ(db):

@@ -17,13 +17,17 @@ from merge_runner_analysis.wording import LANGUAGE_MODEL, headline
 TABLES = ("effects", "levels")  # of what a study's factors change
 
 
-def _question(site: Site, bar: Bar) -> tuple[list[Job], Answer | None]:
-    """What the study's factors change, where it has any, and the computations behind that."""
+def _question(site: Site, bar: Bar) -> tuple[list[Job], list[Job], Answer | None]:
+    """The computations of what the study's factors change, if any, those awaited, the answer.
+
+    A computation may end meanwhile: whether it is awaited is what its table was.
+    """
     if len(bar.prompts) < 2 and not site.catalogue.factors():
-        return [], None
+        return [], [], None
     part = bar.scope.sweep, bar.scope.condition
-    jobs, tables = zip(*(computed_table(site, name, *part) for name in TABLES), strict=True)
-    return [*jobs], answer_of(*tables)
+    found = [computed_table(site, name, *part) for name in TABLES]
+    jobs, tables = zip(*found, strict=True)
+    return [*jobs], [job for job, table in found if table is None], answer_of(*tables)
 
 
 def home_page(site: Site, asked: Mapping[str, str]) -> str:
@@ -32,8 +36,8 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
     bar = scope_of(site, asked)
     scope = bar.scope
     drivers, values = judged(site, bar, asked)
-    asking, question = _question(site, bar)
-    older = [job.older for job in (values["computed"], *asking)]
+    jobs, asking, question = _question(site, bar)
+    older = [job.older for job in (values["computed"], *jobs)]
     now = standing, site.catalogue.state, site.catalogue.held, older
     seen = news_of(now, asked.get("seen", ""))
     shown = [
@@ -62,7 +66,7 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         kinds=by_kind(shown),
         headline=headline(models, [one.kind for one in shown]),
         question=question,
-        asking=[job for job in asking if job.content is None],
+        asking=asking,
         middle=MIDDLE,
         linked=True,
         titles=dict(bar.prompts),
