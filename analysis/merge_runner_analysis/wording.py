@@ -59,13 +59,12 @@ COMPARED = {
 # The collision rules that trials may be played by, as sentences name them.
 PLAYED_RULES = {
     "euclid2d": "the paper's rule",
-    "rectangle": "people's rule at its steps",
+    "rectangle": "people's rule, looked for at each step",
     "shared_lane": "the rule of its scenario",
 }
 # Of levels that nobody reads.
 SAME_TRIALS = "not tested: the same trials at both levels, since no driver reads what differs"
 MISSING, MINUS = "–", "−"
-SAME_TRIALS = "not tested: the same trials at both levels, since no driver reads what differs"
 TIMES = " × "  # between the factors of an interaction
 
 Values = Mapping[str, Any]
@@ -356,8 +355,9 @@ def crashes(values: Values) -> str:
     seen = values.get("counted") or f"{k} of {ended}"
     text = f"crashed in {seen} trials"
     if undecided or seen != f"{k} of {ended}":
-        text += f" by {values.get('counted_by') or PLAYED_RULES['shared_lane']}"
-        text += f"; by people's rule {k} are certain"
+        rule = values.get("counted_by") or PLAYED_RULES["shared_lane"]
+        finer = "looked for at 20 Hz" if rule == PLAYED_RULES["rectangle"] else "by people's rule"
+        text += f" by {rule}; {finer} {k} are certain"
         text += f", {undecided} cannot be told" if undecided else ""
     people = values.get("human_counted")
     if differs(values):

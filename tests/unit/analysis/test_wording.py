@@ -10,6 +10,7 @@ from merge_runner_analysis.wording import (
     DIFFERS,
     MEASURES,
     OPEN,
+    PLAYED_RULES,
     SHOWN,
     TOO_FEW,
     crashes,
@@ -128,6 +129,14 @@ def test_of_few_outcomes_a_headline_says_the_counts_alone(of, counts):
 def test_who_collides_has_an_outcome_too(of):
     claim, _ = headline({"gpt": driver(of[0], collided=of[1], collisions="unlike")})
     assert claim.startswith("gpt does not drive like people: it crashed in")
+
+
+def test_crashes_by_one_rule_looked_for_at_each_step_and_more_often():
+    of = row("collisions", "inconclusive", n=10, k=2, counted="1 of 10", human_counted="5 of 90")
+    assert crashes(of | {"counted_by": PLAYED_RULES["rectangle"]}) == (
+        "crashed in 1 of 10 trials by people's rule, looked for at each step; looked for at 20 Hz "
+        "2 are certain; people in 5 of 90"
+    )
 
 
 def test_several_drivers_are_told_together():
