@@ -1,6 +1,5 @@
 """What a simulation is summed up by is what the analysis says of the same trials."""
 
-import asyncio
 from itertools import product
 
 import numpy as np
@@ -25,7 +24,7 @@ def both(tmp_path_factory):
     task = scenario()
     db = tmp_path_factory.mktemp("cei") / "merge.duckdb"
 
-    records = [asyncio.run(played(*trial, task, cei(set="K0"))) for trial in TRIALS]
+    records = [played(*trial, task, cei(set="K0")) for trial in TRIALS]
     spec = canonical_json({"scenario": task.model_dump()})
     Store(db).add_recorded(records, {records[0].spec.spec_hash: spec})
     trials = [simulated(*trial, task) for trial in TRIALS]
