@@ -200,8 +200,15 @@ def _without_copies(level: Level, first: Callable[[tuple[str, ...]], tuple[str, 
     """
     every = level.pooled.trials
     every = every.assign(cell=pd.Series([first(cell) for cell in every["cell"]], dtype=object))
+    kept = every if every["way"].is_unique else _once(every, scripted=level.pooled.scripted)
+    pooled = replace(level.pooled, trials=kept, whole=replace(level.pooled, trials=every))
+    return replace(level, groups=tuple(kept["group"].unique()), pooled=pooled)
+
+
+def _once(every: pd.DataFrame, *, scripted: bool) -> pd.DataFrame:
+    """The trials without copies; a stand-in's are so at the same levels of other factors alone."""
     others = pd.Series([" ".join(others) for _, *others in every["cell"]], every.index)
-    way = every["way"] + (" " + others if level.pooled.scripted else "")
+    way = every["way"] + (" " + others if scripted else "")
     for _, rows in every.groupby(others):
         left, right = ({*rows.loc[rows["ego"] == side, "way"]} for side in SIDES)
         if not (left <= right or right <= left):
@@ -209,6 +216,4 @@ def _without_copies(level: Level, first: Callable[[tuple[str, ...]], tuple[str, 
     from_left = every.assign(way=way).sort_values("ego", kind="stable")
     kept = every.loc[from_left.drop_duplicates("way").index.sort_values()]
     both = every.groupby(way)["ego"].transform("nunique")[kept.index] > 1
-    kept = kept.assign(focal=kept["focal"].mask(both))
-    pooled = replace(level.pooled, trials=kept, whole=replace(level.pooled, trials=every))
-    return replace(level, groups=tuple(kept["group"].unique()), pooled=pooled)
+    return kept.assign(focal=kept["focal"].mask(both))
