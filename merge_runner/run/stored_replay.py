@@ -117,11 +117,12 @@ def refuse_changed_programs(path: Path, plan: Plan, stored: Sequence[TrialSpec])
             if record.failed_calls:
                 continue
             driven = rows_of(record)["states"]
-            for found in tables["states"].differences(key, driven, ignored=(), tolerance=TOLERANCE):
+            found = tables["states"].differences(key, driven, ignored=(), tolerance=TOLERANCE)
+            if difference := next(iter(found), None):
                 raise UsageError(
                     f"{' or '.join(programs[record.spec.arm])} drives otherwise than in the trial "
-                    f"{key[0]} of {path} ({found.text}): give its class another `revision`, so "
-                    "that its trials are played anew, or name another --db"
+                    f"{key[0]} of {path} ({difference.text}): give its class another `revision`, "
+                    "so that its trials are played anew, or name another --db"
                 )
 
 

@@ -194,7 +194,7 @@ def _with_copies(study: Study, group: Group) -> Iterator[Iterable[Cell]]:
 def _without_copies(level: Level, first: Callable[[tuple[str, ...]], tuple[str, ...]]) -> Level:
     """The level with each trial once.
 
-    Where the copies of one have their ego on both sides, nobody was given anything that he reads:
+    Where the copies of one have their ego on both sides, nobody was given anything that is read:
     it is a trial of two that are told the same, and read from both sides (``sides``). That is so
     where all trials of one side are among the other's: here and there a stand-in's are by chance.
     """

@@ -176,7 +176,7 @@ def assessment_of(run: Row) -> tuple[str, str]:
             return "doubtful", f"{text}; but another model gave {others} answers."
         return "finished", f"{text}."
     if state == "lost":
-        gone = "The run stopped by itself: its process is gone, or frozen."
+        gone = "The run was cut off: its process is gone, or frozen."
         return "stopped", f"{gone} {counted} are stored{failures}."
     if code in REASONS:
         return "stopped", f"Stopped: {REASONS[code]}. {counted} have an outcome{failures}."

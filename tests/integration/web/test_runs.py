@@ -227,7 +227,7 @@ def test_a_page_follows_a_sweep_to_its_end_and_has_each_state_read_out_once(stud
     running(study, updated_at=datetime(2026, 1, 1, tzinfo=UTC))
     client = client_of(study)
     shown = client.get(URL).text
-    assert "The run stopped by itself" in shown
+    assert "The run was cut off" in shown
     hostile = "<script>alert(1)</script>\u202e<img src=x>"
     rows = (("WARNING", f"another model answers: {hostile}"), ("cost", "1.50 USD"))
     running(study, ended={"finished": 1, "failed": 1}, rows=rows)  # it had slept
@@ -252,7 +252,7 @@ def test_a_page_follows_a_sweep_to_its_end_and_has_each_state_read_out_once(stud
     with held(study):  # its end cannot be read: it is not said to be lost
         remove_standing(study, "sweep-1")
         assert client.get(look).status_code == 204
-    assert "The run stopped by itself" in client.get(look).text
+    assert "The run was cut off" in client.get(look).text
     Store(study).end_sweep("sweep-1", END, 130)
     assert "<span>Stopped: it was interrupted" in client.get(look).text
 
