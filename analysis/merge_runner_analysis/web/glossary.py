@@ -36,3 +36,8 @@ def sections() -> dict[str, list[tuple[str, Markup]]]:
                 meaning = pattern.sub(html, meaning)
             words.append((row[1], Markup(meaning)))  # noqa: S704 # escaped above
     return found
+
+
+def meaning(term: str) -> Markup:
+    """What a word means; raises KeyError for one that the glossary lacks."""
+    return {word: said for words in sections().values() for word, said in words}[term]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil, floor, log10
 from typing import Any
 
@@ -80,6 +80,7 @@ class Side:
     """The value of a level in the shared situations; counts of all its trials, and their cells."""
 
     text: str
+    name: str = ""
     k: int | None = None
     n: int | None = None
     row: str = ""
@@ -146,9 +147,10 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
     )
     drawn = drivers if len(drivers) <= len(SHAPES) else []
     shapes = dict(zip(drawn, SHAPES, strict=False))
+    shown = [row for row in known if not _untested(effects.rows) & _names(row)]
     charts = [
-        _chart("By factor", [r for r in known if _is_level(r)], shapes, metric),
-        _chart(_crossing_of(known), [r for r in known if not _is_level(r)], shapes, metric),
+        _chart("By factor", [r for r in shown if len(_names(r)) == 1], shapes, metric),
+        _chart(_crossing_of(shown), [r for r in shown if len(_names(r)) > 1], shapes, metric),
     ]
     tested = [row for row in own if _tested(row)]
     return Answer(
@@ -156,7 +158,7 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
         unbroken(rest),
         capital(name_of(primary)),
         [*shapes.items()],
-        sum(_count(row, "n") for row in _of_one_factor(known, drawn)),
+        sum(_count(row, "n") for row in _of_one_factor(shown, drawn)),
         any(row.values["k"] is None for row in known) and metric == LEFT_FIRST.name,
         [chart for chart in charts if chart],
         unbroken(_interactions(tested, {str(row.values["factor"]) for row in known})),
@@ -359,7 +361,10 @@ def _change(row: Row, sides: dict[str, Row], end: float, primary: str) -> Change
         None
         if _crossed(row)
         else _side(
-            _estimate(row, name), sides.get(f"{row.values['factor']}={side}"), is_own, metric
+            Side(unbroken(_estimate(row, name)), named(str(side))),
+            sides.get(f"{row.values['factor']}={side}"),
+            is_own,
+            metric,
         )
         for name, side in (("estimate_reference", f"{base}{mark}"), ("estimate", of))
     )
@@ -389,23 +394,30 @@ def difference_mark(row: Row, end: float) -> Mark:
     return Mark(shape, at, (ends[0], ends[1]) if ends else None, zero=50.0)
 
 
-def _side(text: str, counts: Row | None, is_own: bool, metric: str) -> Side:
+def _side(side: Side, counts: Row | None, is_own: bool, metric: str) -> Side:
     """One side of an effect, with its counts by a row of ``levels``."""
     columns = ("k", "n") if is_own else ("crashed", "ended")
     if counts is None or not (is_own or metric == COLLISIONS.name):
-        return Side(unbroken(text))
+        return side
     values: Any = counts.values
-    return Side(unbroken(text), values[columns[0]], values[columns[1]], counts.id, columns)
+    return replace(side, k=values[columns[0]], n=values[columns[1]], row=counts.id, columns=columns)
 
 
-def _is_level(row: Row) -> bool:
-    return TIMES not in str(row.values["factor"])
+def _names(row: Row) -> set[str]:
+    """The factor of a level, or those of a crossing."""
+    return {*str(row.values["factor"]).split(TIMES)}
+
+
+def _untested(effects: Sequence[Row]) -> set[str]:
+    """The factors of which every level has the trials of its reference."""
+    asked = [row for row in effects if row.values.get("primary")]
+    return {*_factors(asked)} - {*_factors(row for row in asked if not _copied(row))}
 
 
 def _crossing_of(levels: Sequence[Row]) -> str:
     """``In combination: hurry, persona``."""
-    names = [str(row.values["factor"]) for row in levels if not _is_level(row)]
-    return f"In combination: {', '.join(names[0].split(TIMES))}" if names else ""
+    crossed = [str(row.values["factor"]) for row in levels if len(_names(row)) > 1]
+    return f"In combination: {', '.join(crossed[0].split(TIMES))}" if crossed else ""
 
 
 def _of_one_factor(levels: Sequence[Row], drivers: Sequence[str]) -> list[Row]:
@@ -461,8 +473,8 @@ def _chart(title: str, rows: Sequence[Row], shapes: dict[str, str], metric: str)
                 )
             )
         head = "" if factor in heads or TIMES in factor else factor
-        title = title_of(name) if factor == PROMPT else name
-        lines.append(Line(y + APART * (len(points) - 1) / 2, head, title, points))
+        named = title_of(name) if factor == PROMPT else name
+        lines.append(Line(y + APART * (len(points) - 1) / 2, head, named, points))
         heads.add(factor)
         y += APART * (len(points) - 1)
     ticks = [low + step * place for place in range(round((high - low) / step) + 1)]

@@ -13,6 +13,7 @@ from jinja2.bccache import Bucket
 from markupsafe import Markup
 
 from merge_runner_analysis.web.display_text import visible, with_minus
+from merge_runner_analysis.web.glossary import meaning
 from merge_runner_analysis.web.phrases import plain
 from merge_runner_analysis.web.urls import Links
 from merge_runner_analysis.wording import MINUS, number, p_value
@@ -80,6 +81,7 @@ def environment(
         whole="{:,}".format,
         minus=lambda text: with_minus(str(text)),
         plain=plain,
+        meaning=meaning,
     )
     made.globals.update(at=at, policy=policy, inlined=inlined or {}, style=STYLE, **shared)
     for name in MACROS:

@@ -24,6 +24,11 @@ WHERE description <> '' GROUP BY ALL ORDER BY min(started_at)
 """
 
 
+def descriptions_of(site: Site) -> list[str]:
+    """What the studies that were played ask, each once, the first one first."""
+    return [row["description"] for row in site.catalogue.ask(DESCRIPTIONS)]
+
+
 @dataclass(frozen=True, slots=True)
 class Scope:
     """A part of the trials; what is empty leaves nothing out."""

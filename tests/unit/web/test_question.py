@@ -115,32 +115,51 @@ def test_no_change_is_claimed_that_no_corrected_p_carries(found):
     assert "no effect" not in (claim + rest).lower()
 
 
-def test_a_side_has_its_count_and_the_chart_the_axis_of_its_data():
-    columns = (Column("factor", "factor"),)
-    sides = [
+def levels_of(factor, drivers=("",)):
+    """The two levels of a factor, of all drivers and of each."""
+    return [
         Row(
-            f"{driver}hurry={level}",
+            f"{driver}{factor}={level}",
             (),
-            {"factor": "hurry", "level": level, "driver": driver.rstrip("/") or None, "k": k,
+            {"factor": factor, "level": level, "driver": driver.rstrip("/") or None, "k": k,
              "n": 100, "value": k, "ci": (k - 8.0, k + 8.0), "crashed": 3, "ended": 103,
              "gap_m": None, "rmse_mps": 1.0},
         )
-        for driver in ("", "o3/", "o4/")
+        for driver in drivers
         for level, k in (("no", 50), ("yes", 63))
     ]  # fmt: skip
-    answer = answer_of(
-        Table("effects", columns, [effect(), effect(measure="coll. (%)", p=0.3)]),
-        Table("levels", columns, sides),
+
+
+def answer(effects, levels):
+    columns = (Column("factor", "factor"),)
+    return answer_of(Table("effects", columns, effects), Table("levels", columns, levels))
+
+
+def test_a_side_has_its_count_and_the_chart_the_axis_of_its_data():
+    made = answer(
+        [effect(), effect(measure="coll. (%)", p=0.3)], levels_of("hurry", ("", "o3/", "o4/"))
     )
-    (change,), (crashes,) = answer.changes, answer.others
+    (change,), (crashes,) = made.changes, made.others
     assert (change.reference.k, change.level.k, change.level.n) == (50, 63, 100)
+    assert (change.reference.name, change.level.name) == ("no", "yes")
     assert (change.mark.shape, crashes.mark.shape) == ("like", "open")
     assert (crashes.level.k, crashes.level.n, crashes.level.text[:4]) == (3, 103, "63.0")
-    assert answer.trials == 400  # of both drivers, which are drawn
-    (chart,) = answer.charts
+    assert made.trials == 400  # of both drivers, which are drawn
+    (chart,) = made.charts
+    assert chart.title == "By factor"
     assert [line.name for line in chart.lines] == ["no", "yes"]
     assert [point.shape for point in chart.lines[0].points] == ["dot", "square"]
     places = [tick[0] for tick in chart.ticks]
     for line in chart.lines:
         for point in line.points:
             assert min(places) <= point.ends[0] < point.x < point.ends[1] <= max(places)
+
+
+def test_levels_that_are_not_tested_are_not_drawn():
+    made = answer(
+        [effect(drivers="scripted"), copied("persona")],
+        [*levels_of("persona"), *levels_of("hurry"), *levels_of("hurry × persona")],
+    )
+    (chart,) = made.charts
+    assert [line.head for line in chart.lines] == ["hurry", ""]
+    assert made.trials == 200

@@ -10,7 +10,7 @@ from merge_runner_analysis.web.judged import by_condition, by_kind, judged, note
 from merge_runner_analysis.web.people import HEADINGS, likeness_of, people_of
 from merge_runner_analysis.web.question import MIDDLE, Answer, answer_of
 from merge_runner_analysis.web.runs import standing_of
-from merge_runner_analysis.web.scope import DESCRIPTIONS, Bar, scope_of, unmarked
+from merge_runner_analysis.web.scope import Bar, descriptions_of, scope_of, unmarked
 from merge_runner_analysis.web.site import Site, news_of
 from merge_runner_analysis.wording import LANGUAGE_MODEL, headline
 
@@ -62,7 +62,7 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         part=scope.part,
         standing=standing,
         seen=seen,
-        descriptions=[row["description"] for row in site.catalogue.ask(DESCRIPTIONS)],
+        descriptions=descriptions_of(site),
         kinds=by_kind(shown),
         headline=headline(models, [one.kind for one in shown]),
         question=question,

@@ -14,7 +14,7 @@ from merge_runner_analysis.tables import TABLES
 from merge_runner_analysis.tables.formats import render, shown_columns, table_view
 from merge_runner_analysis.tables.model import from_text
 from merge_runner_analysis.web.computed import awaited, computed, computed_table
-from merge_runner_analysis.web.scope import every
+from merge_runner_analysis.web.scope import descriptions_of, every
 from merge_runner_analysis.web.site import NotThere, Site, download
 
 TABLE_FILES = {"csv": TableFormat.CSV, "tex": TableFormat.LATEX}
@@ -70,6 +70,7 @@ def figure_page(site: Site, name: str, _: Mapping[str, str]) -> str:
         about=about,
         computed=found,
         image=b64encode(found.content["file"]).decode() if found.content else "",
+        descriptions=descriptions_of(site),
         version=metadata.version("merge-runner"),
     )
 
@@ -81,6 +82,7 @@ def cite_page(site: Site, _: Mapping[str, str]) -> str:
         here="cite",
         computed=computed(site, ("digest",)),
         cited_as="Results",
+        descriptions=descriptions_of(site),
         version=metadata.version("merge-runner"),
     )
 
