@@ -7,7 +7,7 @@ Nothing here is tested or estimated: sentences, rows and charts are of the finis
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import ceil, floor, log10
 from typing import Any
@@ -35,10 +35,12 @@ from merge_runner_analysis.wording import (
 CHANGED = {LEFT_FIRST.name: "who goes first", RMSE.name: "how far it departs from its speed"}
 NO_BREAK = "\N{NO-BREAK SPACE}"
 MIDDLE = Mark("", None, None, zero=50.0)  # no difference, on the axis of differences
+# More levels that show nothing are counted, not listed.
+FEW = 3
 # The shapes that tell drivers apart in a chart, and more of them are not drawn.
 SHAPES = ("dot", "square", "ring", "triangle")
-# Of a chart, in units of its drawing.
-LEFT, WIDTH, HEAD, ROW, APART, INDENT = 170.0, 480.0, 12, 20, 14, 84.0
+# Of a chart, in units of its drawing: its parts, and a letter of a name.
+LEFT, WIDTH, HEAD, ROW, APART, INDENT, LETTER = 90.0, 480.0, 12, 20, 14, 84.0, 7.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,8 +108,12 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The claim, what else there is to say, charts, and the effects behind them."""
+    """The claim, what else there is to say, charts, and the effects behind them.
 
+    ``asked`` is the question in words, for a study that has none of its own.
+    """
+
+    asked: str
     claim: str
     rest: str
     measure: str
@@ -153,7 +159,9 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
         _chart(_crossing_of(shown), [r for r in shown if len(_names(r)) > 1], shapes, metric),
     ]
     tested = [row for row in own if _tested(row)]
+    names = _factors(asked)
     return Answer(
+        f"{'Does' if len(names) == 1 else 'Do'} {joined(names)} change {_changed(primary)}?",
         unbroken(claim),
         unbroken(rest),
         capital(name_of(primary)),
@@ -185,7 +193,7 @@ def answered(rows: Sequence[Row]) -> tuple[str, str]:
     copied = [f"{_level(row)} is {row.note}" for row in rows if _copied(row)]
     if not primary:
         return capital(rehearsed + f"{'; '.join(copied)}.") if copied else "", ""
-    what = CHANGED.get(metric_of(primary[0]), name_of(primary[0]))
+    what = _changed(primary[0])
     if few := [
         row for row in primary if min(_count(row, "n"), _count(row, "n_reference")) < ENOUGH
     ]:
@@ -201,10 +209,11 @@ def answered(rows: Sequence[Row]) -> tuple[str, str]:
         rest.append(f"The difference is {_apart(first)}, corrected p {_p(first)}.")
     else:
         claim = f"{rehearsed}no change of {what} is shown by {joined(_factors(primary))}."
-    for row in primary:
-        if row not in sure[:1]:
-            shown = "changes it, too" if _shown(row) else "is not shown to change it"
-            rest.append(f"{capital(_level(row))} {shown}: {_apart(row)}, corrected p {_p(row)}.")
+    rest += [
+        f"{capital(_level(row))} changes it, too: {_apart(row)}, corrected p {_p(row)}."
+        for row in sure[1:]
+    ]
+    rest += _not_shown([row for row in primary if row not in sure])
     rest += [f"{capital(said)}." for said in copied]
     if not sure:
         rest.append(_seen(primary))
@@ -218,9 +227,23 @@ def answered(rows: Sequence[Row]) -> tuple[str, str]:
     also = [row for row in also if row.values["factor"] != MODEL and metric_of(row) in METRIC_NAMES]
     if not sure and also:
         row = min(also, key=lambda row: _number(row, "p"))
-        what = CHANGED.get(metric_of(row), name_of(row))
-        rest.append(f"{capital(str(row.values['factor']))} changes {what}: {_both(row)}.")
+        rest.append(f"{capital(str(row.values['factor']))} changes {_changed(row)}: {_both(row)}.")
     return capital(claim), " ".join(filter(None, rest))
+
+
+def _not_shown(rows: Sequence[Row]) -> Iterator[str]:
+    """The primary tests that show nothing, by their p; of more than FEW the first one alone."""
+    if len(rows) > FEW:
+        yield (
+            f"{len(rows)} levels are not shown to change it; {_level(rows[0])} comes nearest: "
+            f"{_apart(rows[0])}, corrected p {_p(rows[0])}."
+        )
+        return
+    for row in rows:
+        yield (
+            f"{capital(_level(row))} is not shown to change it: {_apart(row)}, "
+            f"corrected p {_p(row)}."
+        )
 
 
 def unbroken(text: str) -> str:
@@ -313,6 +336,11 @@ def name_of(row: Row) -> str:
     return METRIC_NAMES.get(metric_of(row), str(row.values["measure"]).rpartition(" (")[0])
 
 
+def _changed(row: Row) -> str:
+    """``who goes first``: an effect's measure as a claim names it."""
+    return CHANGED.get(metric_of(row), name_of(row))
+
+
 def unit_of(row: Row) -> str:
     """The unit of a difference."""
     return str(row.values["measure"]).rpartition("(")[2].rstrip(")").replace("%", "points")
@@ -368,12 +396,14 @@ def _change(row: Row, sides: dict[str, Row], end: float, primary: str) -> Change
         )
         for name, side in (("estimate_reference", f"{base}{mark}"), ("estimate", of))
     )
-    said = f"{named(str(of))} against {named(str(base))}"
+    # Of an interaction the id has both levels.
+    said = row.id.partition("/interaction/")[0].replace("/", ", ") if _crossed(row) else ""
+    said = said or (named(str(of)) if is_own else f"{row.values['factor']}: {named(str(of))}")
     if is_own and row.values.get("primary"):
         said += ", primary"
     return Change(
         capital(str(row.values["factor"])) if is_own else capital(name_of(row)),
-        said if is_own else f"{row.values['factor']}: {said}",
+        said,
         reference,
         level,
         f"{_difference(row)} {unit_of(row)}",
@@ -447,14 +477,17 @@ def _chart(title: str, rows: Sequence[Row], shapes: dict[str, str], metric: str)
     ends = [end for row in drawn for end in (_interval(row) or (_number(row, "value"),))]
     low, high, step = _axis(min(ends), max(ends))
 
+    levels = dict.fromkeys((str(row.values["factor"]), str(row.values["level"])) for row in drawn)
+    names = {(f, name): title_of(name) if f == PROMPT else name for f, name in levels}
+    indent = 0.0 if TIMES in next(iter(levels))[0] else INDENT
+    left = min(WIDTH / 2, indent + max(LEFT, LETTER * max(map(len, names.values()))))
+
     def x(value: float) -> float:
-        return round(LEFT + (WIDTH - LEFT) * (value - low) / (high - low), 1)
+        return round(left + (WIDTH - left) * (value - low) / (high - low), 1)
 
     lines: list[Line] = []
     y, heads = float(HEAD), set[str]()
-    for factor, name in dict.fromkeys(
-        (str(r.values["factor"]), str(r.values["level"])) for r in drawn
-    ):
+    for factor, name in levels:
         points: list[Point] = []
         y += ROW if factor in heads or not lines else 1.5 * ROW
         for row in drawn:
@@ -473,8 +506,7 @@ def _chart(title: str, rows: Sequence[Row], shapes: dict[str, str], metric: str)
                 )
             )
         head = "" if factor in heads or TIMES in factor else factor
-        named = title_of(name) if factor == PROMPT else name
-        lines.append(Line(y + APART * (len(points) - 1) / 2, head, named, points))
+        lines.append(Line(y + APART * (len(points) - 1) / 2, head, names[factor, name], points))
         heads.add(factor)
         y += APART * (len(points) - 1)
     ticks = [low + step * place for place in range(round((high - low) / step) + 1)]
@@ -486,7 +518,7 @@ def _chart(title: str, rows: Sequence[Row], shapes: dict[str, str], metric: str)
         [(x(tick), f"{tick:g} %" if percent else f"{tick:g}") for tick in ticks],
         None if even is None else x(even),
         y + ROW + 16,
-        INDENT if any(line.head for line in lines) else 0.0,
+        indent,
     )
 
 

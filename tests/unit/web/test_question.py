@@ -73,6 +73,12 @@ SEEN = "A change of 10.00 points or more would have been seen in four of five st
             f"{SAME}p = 0.001. Persona=yes is {SAME_TRIALS}.",
         ),
         (
+            [effect(f"words{n}", 0.9 - n / 10, difference=1.0) for n in range(4)],
+            "No change of who goes first is shown by words3, words2, words1 and words0.",
+            "4 levels are not shown to change it; words3=yes comes nearest: +1.00 points "
+            f"[−6.00, 8.00], corrected p = 0.600. {SEEN}",
+        ),
+        (
             [copied("hurry")],
             f"In a rehearsal with a scripted stand-in, hurry=yes is {SAME_TRIALS}.",
             "",
@@ -140,6 +146,7 @@ def test_a_side_has_its_count_and_the_chart_the_axis_of_its_data():
         [effect(), effect(measure="coll. (%)", p=0.3)], levels_of("hurry", ("", "o3/", "o4/"))
     )
     (change,), (crashes,) = made.changes, made.others
+    assert made.asked == "Does hurry change who goes first?"
     assert (change.reference.k, change.level.k, change.level.n) == (50, 63, 100)
     assert (change.reference.name, change.level.name) == ("no", "yes")
     assert (change.mark.shape, crashes.mark.shape) == ("like", "open")
