@@ -8,15 +8,15 @@ from typing import Any
 
 from merge_runner_analysis.metrics import COLLISIONS, LEFT_FIRST
 from merge_runner_analysis.tables.model import Row, Table
-from merge_runner_analysis.web.judged import Driver
-from merge_runner_analysis.web.marks import Mark
-from merge_runner_analysis.web.question import (
+from merge_runner_analysis.web.effect_rows import (
     difference_mark,
     metric_of,
     name_of,
     unbroken,
     unit_of,
 )
+from merge_runner_analysis.web.judged import Driver
+from merge_runner_analysis.web.marks import Mark
 from merge_runner_analysis.web.scope import Scope
 from merge_runner_analysis.wording import apart, brackets, capital, number, p_value
 

@@ -8,9 +8,9 @@ from typing import Any
 
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner_analysis.stats.score_interval import wilson
+from merge_runner_analysis.web.effect_rows import unbroken
 from merge_runner_analysis.web.judged import Driver
 from merge_runner_analysis.web.marks import Cell
-from merge_runner_analysis.web.question import unbroken
 from merge_runner_analysis.wording import (
     OPEN,
     SHOWN,

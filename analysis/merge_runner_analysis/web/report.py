@@ -38,9 +38,10 @@ from merge_runner_analysis.tables.formats import render, table_view
 from merge_runner_analysis.tables.model import Column, Row, Table
 from merge_runner_analysis.tables.verdicts import verdicts
 from merge_runner_analysis.web.comparison import Comparison, comparison_of, no_trials
+from merge_runner_analysis.web.effect_rows import MIDDLE
 from merge_runner_analysis.web.listing import judged_collisions
 from merge_runner_analysis.web.phrases import plain
-from merge_runner_analysis.web.question import MIDDLE, answer_of
+from merge_runner_analysis.web.question import answer_of
 from merge_runner_analysis.web.rendering import STYLE, environment, inlined_texts, policy_of
 from merge_runner_analysis.web.scope import DESCRIPTIONS
 from merge_runner_analysis.web.urls import Links

@@ -14,6 +14,7 @@ from merge_runner_analysis.web.comparison import Comparison, comparison_of, tria
 from merge_runner_analysis.web.computed import computed, computed_table
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.display_text import with_minus
+from merge_runner_analysis.web.effect_rows import MIDDLE
 from merge_runner_analysis.web.judged import (
     Driver,
     by_condition,
@@ -23,7 +24,6 @@ from merge_runner_analysis.web.judged import (
     noted,
 )
 from merge_runner_analysis.web.marks import rate
-from merge_runner_analysis.web.question import MIDDLE
 from merge_runner_analysis.web.scope import Scope, scope_of, unmarked
 from merge_runner_analysis.web.site import NotThere, Site
 from merge_runner_analysis.wording import DIFFERS, OPEN, SHOWN, UNLIKE

@@ -6,9 +6,10 @@ from collections.abc import Mapping
 
 from merge_runner_analysis.web.computed import computed_table
 from merge_runner_analysis.web.computing import Job
+from merge_runner_analysis.web.effect_rows import MIDDLE
 from merge_runner_analysis.web.judged import by_condition, by_kind, judged, noted
 from merge_runner_analysis.web.people import HEADINGS, likeness_of, people_of
-from merge_runner_analysis.web.question import MIDDLE, Answer, answer_of
+from merge_runner_analysis.web.question import Answer, answer_of
 from merge_runner_analysis.web.runs import standing_of
 from merge_runner_analysis.web.scope import Bar, descriptions_of, scope_of, unmarked
 from merge_runner_analysis.web.site import Site, news_of

@@ -1,0 +1,113 @@
+"""Rows of the tables ``effects``, ``levels`` and ``comparison``, as texts and marks of a page."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from merge_runner_analysis.tables.model import Row
+from merge_runner_analysis.web.marks import Mark
+from merge_runner_analysis.wording import (
+    ALPHA,
+    METRIC_NAMES,
+    SAME_TRIALS,
+    TIMES,
+    brackets,
+    equal_p,
+    number,
+)
+
+NO_BREAK = "\N{NO-BREAK SPACE}"
+MIDDLE = Mark("", None, None, zero=50.0)  # no difference, on the axis of differences
+
+
+def unbroken(text: str) -> str:
+    """The text, of which no number stands apart from its unit or within its interval."""
+    return re.sub(r"(?<=\d) (?=[%m]|points)|(?<=\d,) (?=[−\d])|(?<=[<=]) (?=\d)|^ ", NO_BREAK, text)
+
+
+def value_of(row: Row, name: str) -> float:
+    """A value that is there, as a number."""
+    value: Any = row.values[name]
+    return float(value)
+
+
+def count_of(row: Row, name: str) -> int:
+    """A count that is there."""
+    return int(value_of(row, name))
+
+
+def interval_of(row: Row) -> tuple[float, float] | None:
+    """Both ends of the interval, if there is one."""
+    ends = row.values.get("ci")
+    return ends if isinstance(ends, tuple) else None
+
+
+def metric_of(row: Row) -> str:
+    """The metric of an effect, by its name."""
+    return row.id.rpartition("/")[2]
+
+
+def name_of(row: Row) -> str:
+    """What an effect's measure is called."""
+    return METRIC_NAMES.get(metric_of(row), str(row.values["measure"]).rpartition(" (")[0])
+
+
+def unit_of(row: Row) -> str:
+    """The unit of a difference."""
+    return str(row.values["measure"]).rpartition("(")[2].rstrip(")").replace("%", "points")
+
+
+def estimate_text(row: Row, name: str) -> str:
+    """``63.00 %``: the value of a level."""
+    return f"{number(value_of(row, name))} {unit_of(row).replace('points', '%')}"
+
+
+def test_text(row: Row) -> str:
+    """``+12.84 points [6.06, 19.60], corrected p = 0.012``."""
+    apart = f"{difference_text(row)} {unit_of(row)} {brackets(interval_of(row))}".rstrip()
+    return f"{apart}, corrected p {equal_p(value_of(row, 'p_corrected'))}"
+
+
+def difference_text(row: Row) -> str:
+    """``+12.84``."""
+    value = value_of(row, "difference")
+    return f"{'+' if value > 0 else ''}{number(value)}"
+
+
+def level_text(row: Row) -> str:
+    """``hurry=yes``."""
+    return f"{row.values['factor']}={row.values['level']}"
+
+
+def is_interaction(row: Row) -> bool:
+    """Whether it is a difference of differences."""
+    return "/interaction/" in row.id
+
+
+def is_copied(row: Row) -> bool:
+    """Whether it is a test of the study's own that could not be made, of equal trials."""
+    return bool(row.values.get("primary")) and row.note == SAME_TRIALS
+
+
+def is_tested(row: Row) -> bool:
+    """Whether it has a p."""
+    return row.values.get("p_corrected") is not None
+
+
+def is_shown(row: Row) -> bool:
+    """Whether its corrected p is below 5 %."""
+    return is_tested(row) and value_of(row, "p_corrected") < ALPHA
+
+
+def factors_of(row: Row) -> set[str]:
+    """The factor of a level, or those of a crossing."""
+    return {*str(row.values["factor"]).split(TIMES)}
+
+
+def difference_mark(row: Row, end: float) -> Mark:
+    """A difference on an axis with 0 in its middle; filled where its corrected p is below 5 %."""
+    values = (value_of(row, "difference"), *(interval_of(row) or ()))
+    at, *ends = (round(50 + 48 * value / (end or 1.0), 2) for value in values)
+    shape = "like" if is_shown(row) else "open"
+    return Mark(shape, at, (ends[0], ends[1]) if ends else None, zero=50.0)

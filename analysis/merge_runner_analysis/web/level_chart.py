@@ -1,0 +1,127 @@
+"""A chart of levels: a line for each, and on it a point with its interval for each driver."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import ceil, floor, log10
+
+from merge_runner.prompts.blocks import title_of
+from merge_runner.study.crossing import MODEL, PROMPT
+from merge_runner_analysis.metrics import LEFT_FIRST
+from merge_runner_analysis.tables.model import Row
+from merge_runner_analysis.web.effect_rows import interval_of, value_of
+from merge_runner_analysis.wording import TIMES, brackets, number
+
+# The shapes that tell drivers apart in a chart, and more of them are not drawn.
+SHAPES = ("dot", "square", "ring", "triangle")
+# Of a chart, in units of its drawing: its parts, and a letter of a name.
+LEFT, WIDTH, HEAD, ROW, APART, INDENT, LETTER = 90.0, 480.0, 12, 20, 14, 84.0, 7.5
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """A value of a driver in a chart, with its interval."""
+
+    shape: str
+    x: float
+    ends: tuple[float, float] | None
+    y: float
+    says: str
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A level of a chart; the first one of a factor is headed by it."""
+
+    y: float
+    head: str
+    name: str
+    points: list[Point]
+
+
+@dataclass(frozen=True, slots=True)
+class Chart:
+    """Levels below each other, and the drivers of each by their shapes."""
+
+    title: str
+    lines: list[Line]
+    ticks: list[tuple[float, str]]
+    even: float | None
+    height: float
+    indent: float
+    width: float = WIDTH
+
+
+def level_chart(
+    title: str, rows: Sequence[Row], shapes: dict[str, str], metric: str
+) -> Chart | None:
+    """The levels of these rows, each with a point for each driver, on one axis from the data."""
+    of_model = [row for row in rows if row.values["factor"] != MODEL]
+    drawn = [
+        row
+        for row in of_model
+        if row.values["driver"] in shapes and row.values["value"] is not None
+    ]
+    if not shapes:
+        drawn = [
+            row for row in of_model if not row.values["driver"] and row.values["value"] is not None
+        ]
+    if not drawn:
+        return None
+    ends = [end for row in drawn for end in (interval_of(row) or (value_of(row, "value"),))]
+    low, high, step = _axis(min(ends), max(ends))
+
+    levels = dict.fromkeys((str(row.values["factor"]), str(row.values["level"])) for row in drawn)
+    names = {(f, name): title_of(name) if f == PROMPT else name for f, name in levels}
+    indent = 0.0 if TIMES in next(iter(levels))[0] else INDENT
+    left = min(WIDTH / 2, indent + max(LEFT, LETTER * max(map(len, names.values()))))
+
+    def x(value: float) -> float:
+        return round(left + (WIDTH - left) * (value - low) / (high - low), 1)
+
+    lines: list[Line] = []
+    y, heads = float(HEAD), set[str]()
+    for factor, name in levels:
+        points: list[Point] = []
+        y += ROW if factor in heads or not lines else 1.5 * ROW
+        for row in drawn:
+            if (row.values["factor"], row.values["level"]) != (factor, name):
+                continue
+            ci = interval_of(row)
+            driver, value = row.values["driver"] or "all drivers", number(value_of(row, "value"))
+            k, n = (row.values.get(name) for name in ("k", "n"))
+            counts = "" if k is None else f"{k} of {n}, "
+            says = f"{driver}: {counts}{value} {brackets(ci)}".rstrip()
+            points.append(
+                Point(
+                    shapes.get(str(row.values["driver"]), SHAPES[0]),
+                    x(value_of(row, "value")),
+                    None if ci is None else (x(ci[0]), x(ci[1])),
+                    y + APART * len(points),
+                    says,
+                )
+            )
+        head = "" if factor in heads or TIMES in factor else factor
+        lines.append(Line(y + APART * (len(points) - 1) / 2, head, names[factor, name], points))
+        heads.add(factor)
+        y += APART * (len(points) - 1)
+    ticks = [low + step * place for place in range(round((high - low) / step) + 1)]
+    percent = metric.endswith("_percent")
+    even = 50.0 if metric == LEFT_FIRST.name and low < 50 < high else None
+    return Chart(
+        title,
+        lines,
+        [(x(tick), f"{tick:g} %" if percent else f"{tick:g}") for tick in ticks],
+        None if even is None else x(even),
+        y + ROW + 16,
+        indent,
+    )
+
+
+def _axis(low: float, high: float) -> tuple[float, float, float]:
+    """Round ends around these values, and the step of four or so ticks between."""
+    width = (high - low) or 1.0
+    power = 10 ** floor(log10(width / 4))
+    step = next(power * of for of in (1, 2, 5, 10) if power * of >= width / 5)
+    return step * floor(low / step), step * ceil(high / step), step
