@@ -61,3 +61,9 @@ def first_line(exc: BaseException) -> str:
 def quoted(text: object) -> str:
     """A text as a literal of SQL."""
     return "'" + str(text).replace("'", "''") + "'"
+
+
+def first_of(texts: list[str], others: str, shown: int = 10) -> list[str]:
+    """The first texts, and how many ``others`` there are."""
+    left_out = len(texts) - shown
+    return [*texts[:shown], f"{left_out} {others}"] if left_out > 0 else texts

@@ -226,18 +226,18 @@ def _estimate(plan: Plan, options: Options, *, show_prompts: bool, as_json: bool
     """Print what it would take to play a plan; return the exit code."""
     import asyncio
 
-    from merge_runner.run import progress
+    from merge_runner.run import estimate_lines as lines
     from merge_runner.run.sweep import unsent
 
     _say_shutdowns(plan, options)
     expected = asyncio.run(unsent(plan, options, say=say))
     if as_json:
-        prompts = {"prompts": progress.shown_prompts(plan)} if show_prompts else {}
+        prompts = {"prompts": lines.shown_prompts(plan)} if show_prompts else {}
         print_out(json.dumps(asdict(expected) | prompts, ensure_ascii=False))
         return 0
-    blocks = progress.shown_prompt_lines if show_prompts else progress.prompt_lines
+    blocks = lines.shown_prompt_lines if show_prompts else lines.prompt_lines
     sent = ["Nothing was sent."] if expected.trials else []
-    print_out("\n".join([*progress.estimate_lines(expected), *blocks(plan), *sent]))
+    print_out("\n".join([*lines.estimate_lines(expected), *blocks(plan), *sent]))
     return 0
 
 
@@ -245,13 +245,14 @@ def _play(plan: Plan, options: Options, *, whole: bool, yes: bool, as_json: bool
     """Play a plan; return the exit code."""
     import asyncio
 
-    from merge_runner.run import progress
     from merge_runner.run import sweep as running
+    from merge_runner.run.estimate_lines import estimate_lines
+    from merge_runner.run.summary import as_lines
 
     _say_shutdowns(plan, options)
 
     def leave(expected: Estimate) -> None:
-        lines = "\n".join(progress.estimate_lines(expected))
+        lines = "\n".join(estimate_lines(expected))
         agree(lines, "Go ahead?", otherwise="nothing was sent", yes=yes)
 
     try:
@@ -260,9 +261,7 @@ def _play(plan: Plan, options: Options, *, whole: bool, yes: bool, as_json: bool
     except KeyboardInterrupt:  # before the trials began or after they ended
         say("interrupted: run the same command again to go on")
         return running.INTERRUPTED
-    as_text = (
-        json.dumps(facts, ensure_ascii=False) if as_json else "\n".join(progress.as_lines(facts))
-    )
+    as_text = json.dumps(facts, ensure_ascii=False) if as_json else "\n".join(as_lines(facts))
     print_out(as_text)
     for message in facts["messages"]:
         say(f"error: {message}")
@@ -371,7 +370,7 @@ def forget(
     Example: merge-runner forget "baseline-*"
     """
     from merge_runner.results import store
-    from merge_runner.run.progress import running
+    from merge_runner.run.progress_file import running
 
     for busy in running(db):
         raise UsageError(
@@ -483,7 +482,7 @@ def ledger(
     from merge_runner.llm.cache import ResponseCache
     from merge_runner.llm.cache_file import require
     from merge_runner.llm.ledger import APART, Ledger, scopes
-    from merge_runner.run.progress import as_table
+    from merge_runner.run.summary import as_table
 
     require(cache)
     with closing(ResponseCache(cache, read_only=release is None)) as opened:
@@ -536,7 +535,7 @@ def models(as_json: cli.JsonOption = False) -> None:
     from merge_runner.llm.models import load_models, shutdown_notes
     from merge_runner.llm.prices import cost_usd
     from merge_runner.records import Usage
-    from merge_runner.run.progress import as_table
+    from merge_runner.run.summary import as_table
 
     entries = load_models()
     rows: list[dict[str, Any]] = []

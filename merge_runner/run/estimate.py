@@ -211,3 +211,8 @@ def prompts_of(plan: Plan, arm: Arm) -> dict[str, str]:
         name: render_prompt(seen, rest, prompt=plan.parts.prompts[name], scenario=scenario)
         for name in sorted(names)
     }
+
+
+def usd_text(cost_usd: float | None) -> str:
+    """``about 1.20 USD``."""
+    return "an unknown price" if cost_usd is None else f"about {cost_usd:.2f} USD"

@@ -59,10 +59,13 @@ from merge_runner.run.local_runner import (
     LocalRunner,
 )
 from merge_runner.run.plan import Options, Plan, usual_prompts
-from merge_runner.run.progress import Progress, as_dict, first_of, show_progress, write_standing
+from merge_runner.run.progress import REASONS_SHOWN, Progress, show_progress
+from merge_runner.run.progress_file import write_snapshot
 from merge_runner.run.replay import Replay
 from merge_runner.run.stored_replay import refuse_changed_programs
+from merge_runner.run.summary import as_dict
 from merge_runner.run.trials import Player
+from merge_runner.text_safety import first_of
 
 INTERRUPTED = 130
 GO_ON = "Run the same command again to go on."
@@ -107,7 +110,7 @@ async def play(
     agree: Callable[[Estimate], None],
     stopping: Stopping = NEVER,
 ) -> dict[str, Any]:
-    """Play what is not stored yet of a plan, and return the summary (``progress.as_dict``).
+    """Play what is not stored yet of a plan, and return the summary (``summary.as_dict``).
 
     A replay without a recording, or replies of the models in the cache, is of the recording that
     ships with the program; one that is not ``whole`` plays what its recordings hold. ``agree`` gets
@@ -214,7 +217,7 @@ class Sweep:
                 await stack.enter_async_context(shown)
                 is_stored = await self._play(progress, Flusher(store, sweep_id, self._say))
                 progress.doing = "checking"
-                write_standing(db, progress.standing(sweep_id))
+                write_snapshot(db, progress.snapshot(sweep_id))
                 if is_stored:
                     self._end(store, sweep_id)
                     checked = await self._check(store, sweep_id, progress.runner.first)
@@ -602,7 +605,9 @@ def _unbalanced(waiting: Counter[str]) -> str:
     """How many trials of each arm wait, where they are not as many of each."""
     if len({*waiting.values()}) <= 1:
         return ""
-    parts = first_of([f"{number} of {name}" for name, number in waiting.items()], "others")
+    parts = first_of(
+        [f"{number} of {name}" for name, number in waiting.items()], "others", REASONS_SHOWN
+    )
     return f" ({', '.join(parts)}: what has ended is not balanced)"
 
 

@@ -12,7 +12,7 @@ from typing import Any
 from merge_runner.audit.checks import not_judged
 from merge_runner.config import both_sides, pair_name
 from merge_runner.paths import DEFAULT_DB, command_at
-from merge_runner.run.progress import Standing, read_standing
+from merge_runner.run.progress_file import ProgressSnapshot, read_snapshot
 from merge_runner_analysis.web.catalogue import Catalogue, Wanted
 from merge_runner_analysis.web.phrases import called
 from merge_runner_analysis.web.reading import Row
@@ -46,12 +46,12 @@ def list_runs(catalogue: Catalogue) -> list[Row]:
         counted, newest, runs = numbers_of(catalogue, {}), dict[Any, str](), []
         for row in catalogue.ask("FROM sweeps ORDER BY started_at DESC, sweep_id DESC"):
             sweep_id, config = row["sweep_id"], json.loads(row["config"])
-            standing = None if row["ended_at"] else read_standing(catalogue.db, sweep_id)
+            snapshot = None if row["ended_at"] else read_snapshot(catalogue.db, sweep_id)
             # The newest run of the same trials went on with those before it.
             same = row["name"], config.get("model"), config.get("sample_set")
             later = newest.setdefault(same, sweep_id).replace(sweep_id, "")
             row_of = {**row, **counted[sweep_id], "db": catalogue.db}
-            runs.append(run_of(row_of, config, standing, later))
+            runs.append(run_of(row_of, config, snapshot, later))
         if all(run["state"] != "lost" for run in runs):
             break
     return runs
@@ -85,11 +85,11 @@ def standing_of(catalogue: Catalogue) -> list[Row]:
     return news or runs[:1]
 
 
-def run_of(row: Row, config: Row, standing: Standing | None, later: str = "") -> Row:
+def run_of(row: Row, config: Row, snapshot: ProgressSnapshot | None, later: str = "") -> Row:
     """A run of a sweep: how far it is, and in a ``text`` whether it can be trusted.
 
     ``row`` has what is stored of it and what its trials come to, ``config`` what it planned, and
-    ``standing`` what its process says, None: no file does. It is ``running``, ``checking`` what is
+    ``snapshot`` what its process says, None: no file does. It is ``running``, ``checking`` what is
     stored, ``lost``, ``finished`` or ``stopped``. ``command``, as it was typed, goes on with it,
     unless a ``later`` run already did. One that is ``followed`` may have news: it may have slept,
     and go on.
@@ -99,12 +99,12 @@ def run_of(row: Row, config: Row, standing: Standing | None, later: str = "") ->
     state, last_word = "stopped" if row["exit_code"] else "finished", row["ended_at"]
     if last_word is None:
         state = "lost"
-        if standing:
+        if snapshot:
             # As the database has it: UTC, without saying so.
-            last_word = standing.updated_at.astimezone(UTC).replace(tzinfo=None)
-            if standing.alive:
-                state = "running" if standing.doing == "playing" else "checking"
-    live = standing if state in {"running", "checking"} else None
+            last_word = snapshot.updated_at.astimezone(UTC).replace(tzinfo=None)
+            if snapshot.alive:
+                state = "running" if snapshot.doing == "playing" else "checking"
+    live = snapshot if state in {"running", "checking"} else None
     drivers, endpoints = config.get("model", "").split(","), config.get("endpoints", {})
     part = f", in {row['scripted']} of {row['trials']} trials"
     run = {
@@ -117,7 +117,7 @@ def run_of(row: Row, config: Row, standing: Standing | None, later: str = "") ->
         and f"{row['stand_in']}{part if row['scripted'] < row['trials'] else ''}",
         "state": state,
         "live": live,
-        "followed": row["ended_at"] is None and standing is not None,
+        "followed": row["ended_at"] is None and snapshot is not None,
         "planned": sum(arm["repetitions"] for arm in config.get("arms", ()))
         * len(config.get("conditions", ())),
         "ended": live.ended if live else row["ended"],

@@ -19,7 +19,8 @@ from merge_runner.results.store import Store
 from merge_runner.run import local_runner, sweep
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import Options, make_plan
-from merge_runner.run.progress import Progress, read_standing
+from merge_runner.run.progress import Progress
+from merge_runner.run.progress_file import read_snapshot
 from tests.support.crossed_study import MODEL
 from tests.support.gate import HANGS_S
 from tests.support.harness import PROJECT, run_sweep
@@ -108,8 +109,8 @@ async def test_ctrl_c_ends_the_audit_at_the_end(merge_runner, tmp_path, what):
     async with asyncio.timeout(HANGS_S):
         await program.said("the audit begins")
         (told,) = tmp_path.glob("results/merge.duckdb.progress/*.json")
-        standing = read_standing(db, told.stem)
-        assert (standing.doing, standing.ended, standing.failed) == ("checking", 1, 0)
+        snapshot = read_snapshot(db, told.stem)
+        assert (snapshot.doing, snapshot.ended, snapshot.failed) == ("checking", 1, 0)
         with contextlib.ExitStack() as held:
             if what == "WAITS":
                 held.enter_context(duckdb.connect(str(db)))
@@ -124,17 +125,17 @@ async def test_ctrl_c_ends_the_audit_at_the_end(merge_runner, tmp_path, what):
 
 
 async def test_what_breaks_in_the_progress_is_not_lost(options, monkeypatch):
-    standing, tasks = Progress.standing, []
+    snapshot, tasks = Progress.snapshot, []
 
     def broken(self, sweep_id):
         tasks.append(asyncio.current_task())
         if tasks[-1] is not tasks[0]:  # the run itself writes the first
             raise ZeroDivisionError("a fault of ours")
-        return standing(self, sweep_id)
+        return snapshot(self, sweep_id)
 
     monkeypatch.setattr("merge_runner.run.progress.PULSE_S", 0.0)
     monkeypatch.setattr("merge_runner.run.progress.PUBLISHED_EVERY", 1)
-    monkeypatch.setattr(Progress, "standing", broken)
+    monkeypatch.setattr(Progress, "snapshot", broken)
     with pytest.raises(ZeroDivisionError):
         await run(options)
 
@@ -178,7 +179,7 @@ async def test_a_sweep_says_where_it_stands_until_it_is_killed_and_the_next_one_
             while not (found and any("rate limits" in text for _, text in found.rows)):
                 await asyncio.sleep(0.1)
                 for path in tmp_path.glob("*.progress/*.json"):
-                    found = read_standing(db, path.stem)
+                    found = read_snapshot(db, path.stem)
         text, alive = path.read_text(), found.alive
     finally:
         process.kill()
@@ -186,6 +187,6 @@ async def test_a_sweep_says_where_it_stands_until_it_is_killed_and_the_next_one_
     assert (found.pid, found.doing) == (process.pid, "playing")
     assert dict(found.rows)["trials"] == "0/10 ended, 10 running"
     assert str(tmp_path) not in text
-    assert (alive, read_standing(db, found.sweep_id).alive) == (True, False)
+    assert (alive, read_snapshot(db, found.sweep_id).alive) == (True, False)
     assert (await merge_runner("sweep", "baseline", "--model", "constant", "--db", db)).code == 0
     assert not path.parent.exists()

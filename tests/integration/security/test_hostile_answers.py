@@ -9,7 +9,7 @@ from rich.console import Console
 from merge_runner.llm.call import Meter, Wait
 from merge_runner.run.progress import terminal_text
 from tests.support.harness import watched
-from tests.support.standings import progress, runner
+from tests.support.snapshots import progress, runner
 
 ESCAPE = "\x1b]0;owned\x07\x1b[2J\u202e"
 ONE = ("sweep", "baseline", "--reps", 1, "--conditions", "L_4_0")

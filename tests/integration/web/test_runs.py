@@ -14,7 +14,7 @@ import pytest
 from merge_runner.errors import UsageError
 from merge_runner.results.database import write_database
 from merge_runner.results.store import Store, query, sweep_facts
-from merge_runner.run.progress import remove_standing, write_standing
+from merge_runner.run.progress_file import remove_snapshot, write_snapshot
 from merge_runner.run.stored_replay import audit_database
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.selection import Selection
@@ -25,7 +25,7 @@ from merge_runner_analysis.web.runs import list_runs, numbers_of, standing_of
 from merge_runner_analysis.web.scope import scope_of
 from merge_runner_analysis.web.site import Site
 from tests.support.serving import Page, client_of, held
-from tests.support.standings import progress, runner
+from tests.support.snapshots import progress, runner
 from tests.support.studies import Said, write_study, yielding
 
 URL = "/sweeps/sweep-1"
@@ -103,7 +103,7 @@ def running(db, ended=None, **changes):
     """Say that the sweep runs, in this process."""
     shown = progress(runner(), planned=3 * len(CONDITIONS))
     shown.outcome_counts = Counter(ended or {"finished": 2})
-    write_standing(db, shown.standing("sweep-1").model_copy(update={"left_s": 20.0, **changes}))
+    write_snapshot(db, shown.snapshot("sweep-1").model_copy(update={"left_s": 20.0, **changes}))
 
 
 def test_the_page_has_the_numbers_of_the_database_and_every_rate_leads_to_its_trials(written):
@@ -250,7 +250,7 @@ def test_a_page_follows_a_sweep_to_its_end_and_has_each_state_read_out_once(stud
     assert '<span aria-live="off">Running: 3 of 33' in told
     look = news_of(client, told)
     with held(study):  # its end cannot be read: it is not said to be lost
-        remove_standing(study, "sweep-1")
+        remove_snapshot(study, "sweep-1")
         assert client.get(look).status_code == 204
     assert "The run was cut off" in client.get(look).text
     Store(study).end_sweep("sweep-1", END, 130)

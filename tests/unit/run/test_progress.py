@@ -8,9 +8,10 @@ import pytest
 from merge_runner.llm.call import Meter
 from merge_runner.records import Attempt, Usage
 from merge_runner.run.estimate import Estimate
+from merge_runner.run.estimate_lines import estimate_lines
 from merge_runner.run.plan import make_plan
-from merge_runner.run.progress import Log, estimate_lines
-from tests.support.standings import progress, runner
+from merge_runner.run.progress import Log
+from tests.support.snapshots import progress, runner
 
 
 def ago(seconds):
@@ -24,7 +25,7 @@ def times(text):
 
 
 def rows(shown):
-    return shown.standing("").rows
+    return shown.snapshot("").rows
 
 
 def test_every_figure_is_that_of_the_meters():
@@ -48,8 +49,8 @@ def test_every_figure_is_that_of_the_meters():
     # 3 of 10 trials have ended but only 46 of 210 calls are made: the larger share tells.
     spent_s, left_s = times(fields["time"])
     assert left_s == pytest.approx(spent_s * 7 / 3, abs=3)
-    standing = shown.standing("s")
-    assert (standing.ended, standing.failed) == (9, 1)  # of 17, with those stored before
+    snapshot = shown.snapshot("s")
+    assert (snapshot.ended, snapshot.failed) == (9, 1)  # of 17, with those stored before
 
 
 def test_the_calls_tell_the_time_left_while_no_trial_has_ended():

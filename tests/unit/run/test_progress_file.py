@@ -9,12 +9,12 @@ import pytest
 from merge_runner.llm.ledger import Spending
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import make_plan
-from merge_runner.run.progress import (
-    Progress,
+from merge_runner.run.progress import Progress
+from merge_runner.run.progress_file import (
     clear_dead,
-    read_standing,
-    remove_standing,
-    write_standing,
+    read_snapshot,
+    remove_snapshot,
+    write_snapshot,
 )
 
 NO_PROCESS = 2**22 + 1  # above the largest that Linux gives
@@ -22,9 +22,9 @@ LONG_AGO = datetime(2026, 1, 1, tzinfo=UTC)
 LEDGER = SimpleNamespace(spending=Spending())
 
 
-def standing(sweep_id="s", **changes):
+def snapshot(sweep_id="s", **changes):
     plan = make_plan("baseline", "constant", repetitions=2, conditions=["N_0_0"])
-    plain = Progress(plan, 2, LocalRunner(plan, {}, 0), LEDGER).standing(sweep_id)
+    plain = Progress(plan, 2, LocalRunner(plan, {}, 0), LEDGER).snapshot(sweep_id)
     return plain.model_copy(update=changes)
 
 
@@ -40,13 +40,13 @@ def standing(sweep_id="s", **changes):
 )
 def test_a_sweep_is_dead_when_its_process_is_gone_or_silent(changes, age_s, alive):
     updated_at = datetime.now(UTC) - timedelta(seconds=age_s)
-    assert standing(updated_at=updated_at, **changes).alive == alive
+    assert snapshot(updated_at=updated_at, **changes).alive == alive
 
 
 def test_only_what_a_killed_sweep_wrote_is_tidied_up(tmp_path):
     """A folder from elsewhere may lead to one of the user's, or hold files of other programs."""
     db, documents = tmp_path / "m.duckdb", tmp_path / "documents"
-    write_standing(db, standing("a", updated_at=LONG_AGO))
+    write_snapshot(db, snapshot("a", updated_at=LONG_AGO))
     (tmp_path / "m.duckdb.progress").rename(documents)
     for name in ("notes.json", "thesis.tmp"):
         (documents / name).write_text("{}")
@@ -64,20 +64,20 @@ def test_only_what_a_killed_sweep_wrote_is_tidied_up(tmp_path):
 
 def test_the_name_of_a_sweep_leads_out_of_no_folder_and_one_that_lives_keeps_its_file(tmp_path):
     db, name = tmp_path / "m.duckdb", "../outside"
-    write_standing(db, standing("a"))
-    write_standing(db, standing("b", updated_at=LONG_AGO))
+    write_snapshot(db, snapshot("a"))
+    write_snapshot(db, snapshot("b", updated_at=LONG_AGO))
     clear_dead(db)
-    assert (read_standing(db, "a").alive, read_standing(db, "b")) == (True, None)
-    (tmp_path / "outside.json").write_text(standing(name).model_dump_json())
-    assert read_standing(db, name) is None
-    remove_standing(db, name)
+    assert (read_snapshot(db, "a").alive, read_snapshot(db, "b")) == (True, None)
+    (tmp_path / "outside.json").write_text(snapshot(name).model_dump_json())
+    assert read_snapshot(db, name) is None
+    remove_snapshot(db, name)
     assert (tmp_path / "outside.json").exists()
 
 
 def test_a_disk_that_takes_no_file_fails_nothing(tmp_path):
     (tmp_path / "m.duckdb.progress").write_text("a file where the folder should be")
-    write_standing(tmp_path / "m.duckdb", standing())
-    remove_standing(tmp_path / "m.duckdb", "s")
+    write_snapshot(tmp_path / "m.duckdb", snapshot())
+    remove_snapshot(tmp_path / "m.duckdb", "s")
     clear_dead(tmp_path / "m.duckdb")
 
 
@@ -85,4 +85,4 @@ def test_a_disk_that_takes_no_file_fails_nothing(tmp_path):
 def test_a_file_that_is_none_of_ours_says_nothing(tmp_path, text):
     (tmp_path / "m.duckdb.progress").mkdir()
     (tmp_path / "m.duckdb.progress/s.json").write_text(text)
-    assert read_standing(tmp_path / "m.duckdb", "s") is None
+    assert read_snapshot(tmp_path / "m.duckdb", "s") is None

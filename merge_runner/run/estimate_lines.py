@@ -1,0 +1,97 @@
+"""What a run will take, and the prompts that it will ask, for a reader."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from merge_runner.prompts.blocks import decomposed
+from merge_runner.records import SIDES
+from merge_runner.run.estimate import Estimate, prompts_of, usd_text
+from merge_runner.run.plan import Plan
+from merge_runner.text_safety import first_of
+
+
+def _output_caps(expected: Estimate) -> Iterator[str]:
+    """The most tokens that a reply may have, by which a longer one is cut off."""
+    caps = expected.output_caps
+    if caps:
+        same = len({*caps.values()}) == 1
+        most = [f"{n}{'' if same else f' with {model}'}" for model, n in caps.items()]
+        each = ", ".join(most[:1] if same else most)
+        yield f"        a reply is cut off at {each} output tokens (max_output_tokens)"
+
+
+def _by_model(expected: Estimate) -> Iterator[str]:
+    """What each of several models costs."""
+    if len(expected.usd_by_model) > 1:
+        yield from (
+            f"        {name}: {usd_text(usd)}" for name, usd in expected.usd_by_model.items()
+        )
+
+
+def _by_cap(expected: Estimate) -> Iterator[str]:
+    """How far the money goes, where it will not do for all."""
+    left_usd, cost_usd = expected.left_usd, expected.cost_usd
+    if left_usd is not None and cost_usd and left_usd < cost_usd:
+        yield (
+            f"        stops at {left_usd:.2f} USD, about {100 * left_usd / cost_usd:.0f} % of it: "
+            "what --max-cost, or the study's budget, leaves"
+        )
+
+
+def prompt_lines(plan: Plan) -> Iterator[str]:
+    """The blocks, in order, of each prompt that has words of the study's factors."""
+    for name, prompt in plan.parts.prompts.items():
+        if decomposed(name)[1]:
+            yield f"prompt  {name}: {', '.join(prompt.blocks)}"
+
+
+def shown_prompts(plan: Plan) -> list[dict[str, Any]]:
+    """The text of each prompt that a language model reads in a plan, and by whom it is read."""
+    readers: dict[tuple[str, str], list[str]] = {}
+    for arm in plan.arms:
+        for name, text in prompts_of(plan, arm).items():
+            sides = [s for s in SIDES if arm.asked[s] in arm.entries and arm.prompt(s) == name]
+            who = "both drivers" if len(sides) == len(SIDES) else f"the {sides[0]} driver"
+            readers.setdefault((name, text), []).append(f"{who} of {arm.label}")
+    return [{"prompt": name, "read_by": who, "text": text} for (name, text), who in readers.items()]
+
+
+def shown_prompt_lines(plan: Plan) -> Iterator[str]:
+    """The same for a reader, with the numbers of one situation."""
+    for each in shown_prompts(plan):
+        who = "; ".join(first_of(each["read_by"], "others"))
+        yield f"\nprompt  {each['prompt']}, read by {who}:\n{each['text']}"
+
+
+def estimate_lines(expected: Estimate) -> Iterator[str]:
+    """What a run will take, for a reader."""
+    measured = ", as measured before" if expected.measured else ""
+    tokens = f"about {expected.input_tokens} in, {expected.output_tokens} out{measured}"
+    if not expected.trials:
+        if recorded := expected.planned - expected.stored:
+            stored = f"{expected.stored} trials are stored"
+            yield f"Nothing left to ask: {stored}, and {recorded} are played from recorded replies."
+        else:
+            yield f"Nothing left to play: all {expected.planned} trials are stored."
+        return
+    yield f"driver  {expected.driver}"
+    yield f"trials  {expected.trials} that have not ended yet"
+    yield f"calls   about {expected.calls} that are not recorded yet"
+    yield f"tokens  {tokens}"
+    yield from _output_caps(expected)
+    if not expected.rounds:
+        yield f"cost    {usd_text(expected.cost_usd)}"
+        yield from _by_model(expected)
+        yield from _by_cap(expected)
+        yield f"time    about {expected.minutes} minutes"
+        return
+    singly = f"{usd_text(expected.singly_usd)} and {expected.minutes} minutes if asked singly"
+    yield f"cost    {usd_text(expected.cost_usd)} in batches; {singly}"
+    yield from _by_model(expected)
+    yield from _by_cap(expected)
+    yield (
+        f"time    about {expected.rounds} rounds; each takes as long as its slowest batch: "
+        "minutes, an hour, a day at most"
+    )

@@ -1,0 +1,222 @@
+"""The summary of a sweep: as JSON values, and as lines for a reader."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from io import StringIO
+from typing import TYPE_CHECKING, Any, get_args
+
+from merge_runner.audit.checks import Audit
+from merge_runner.drivers.registry import EMULATOR
+from merge_runner.llm.ledger import APART
+from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, command_at
+from merge_runner.records import ReplayMiss, Status
+from merge_runner.results.export import write_table
+from merge_runner.run.estimate import Estimate, usd_text
+from merge_runner.run.plan import Options
+from merge_runner.text_safety import first_of
+
+if TYPE_CHECKING:
+    from merge_runner.run.progress import Progress
+
+
+def underpriced(tier: str) -> str:
+    """Return the warning about replies whose service tier has no price in the registry."""
+    return (
+        f"replies are of the service tier {tier!r}, which is billed at about twice the price that "
+        "is counted, and --max-cost knows nothing of that: leave that tier out, or give the model "
+        f"a price with tiers = {{ {tier} = 2.0 }}"
+    )
+
+
+def as_dict(
+    options: Options,
+    progress: Progress,
+    expected: Estimate | None,
+    checked: tuple[dict[str, Any], Audit] | None,
+    **told: object,
+) -> dict[str, Any]:
+    """The summary as JSON values; ``expected`` is the estimate made before the run, if any.
+
+    ``checked`` is what the database holds of the sweep. From ``decisions`` on, values are there
+    where anything is stored. ``told`` goes into it.
+    """
+    plan, spending, meter = progress.plan, progress.ledger.spending, progress.meter()
+    playing_s = ((progress.ended_at or progress.began_at) - progress.began_at).total_seconds()
+    summary: dict[str, Any] = {
+        **told,
+        "name": plan.name,
+        "run_name": options.name,
+        "model": plan.model,
+        "driver": plan.driver,
+        "scripted": plan.scripted,
+        "db": str(options.db),
+        "cache": str(options.cache),
+        "trials": {
+            "planned": plan.trials,
+            "stored_before": progress.stored,
+            "suspended": progress.outcome_counts["suspended"],
+        },
+        "calls": {"live": meter.calls_live, "cached": meter.calls_cached},
+        "calls_shared": meter.calls_shared,
+        "calls_recorded": meter.calls_recorded,
+        "attempts": meter.outcomes,
+        "cost_usd": round(meter.cost_usd, 6),
+        "calls_of_unknown_cost": meter.cost_unknown,
+        "estimate": None if expected is None else asdict(expected),
+        "sweep_cost_usd": round(spending.spent_usd, 6),
+        "set_aside_usd": round(spending.reserved_usd, 6),
+        "attempts_of_unknown_cost": spending.open_attempts,
+        "over_the_worst_case_usd": round(spending.overrun_usd, 6),
+        "dearest": spending.dearest,
+        "underpriced": meter.underpriced,
+        "damaged_entries": meter.damaged,
+        "open_batches": progress.batches(),
+        "playing_s": round(playing_s, 3),
+        "worst_stall_s": round(progress.worst_stall_s, 3),
+        "audit": None,
+    }
+    if checked is None:
+        return summary
+    facts, audit = checked
+    summary["trials"] |= dict.fromkeys(get_args(Status), 0) | dict(facts["outcomes"])
+    shown = {"condition": [*plan.conditions, "all"], **plan.levels}
+    order = [(factor, level) for factor, levels in shown.items() for level in levels]
+    by_level = {(row["factor"], row["level"]): row for row in facts["levels"]}
+    return summary | {
+        "scripted": bool(facts["stand_ins"]),
+        "audit": audit.as_dict(),
+        "decisions": facts["decisions"],
+        "invalid_decisions": facts["invalid"],
+        "fallbacks": facts["fallbacks"],
+        "no_decision": facts["no_decision"],
+        "model_mismatches": {f"{asked} -> {served}": n for asked, served, n in facts["others"]},
+        "stand_ins": [row[:3] for row in facts["stand_ins"]],
+        "same_prompts": [variants for (variants,) in facts["same_prompts"]],
+        "failed": dict(facts["failed"]),
+        "outcomes_by_level": [by_level[place] for place in order if place in by_level],
+        "first_looks": facts["first_looks"],
+    }
+
+
+def as_lines(summary: dict[str, Any]) -> Iterator[str]:
+    """The summary by ``as_dict`` for a reader."""
+    is_stored = summary["audit"] is not None
+    if summary["run_name"]:
+        yield f"run: {summary['run_name']}"
+    if is_stored:
+        yield from _results(summary)
+    yield from _costs(summary)
+    yield from (f"open batch: {text}" for text in summary["open_batches"])
+    for key in summary["damaged_entries"]:
+        yield f"WARNING: a recorded reply was damaged, set aside and asked again: {key}"
+    if is_stored:
+        yield from _faults(summary)
+
+
+def _results(summary: dict[str, Any]) -> Iterator[str]:
+    """How the trials ended, or what drivers do first."""
+    if looks := summary["first_looks"]:
+        yield as_table(looks)
+    else:
+        yield _outcomes(summary)
+    decisions, invalid = summary["decisions"], summary["invalid_decisions"]
+    share = f" ({invalid / decisions:.1%})" if invalid else ""
+    missing = summary["no_decision"]
+    yield (
+        f"decisions: {decisions}, {invalid} invalid{share}, {summary['fallbacks']} fallbacks"
+        + (f", {missing} without the tactical decision asked for" if missing else "")
+    )
+
+
+def _outcomes(summary: dict[str, Any]) -> str:
+    """How the trials ended that are stored, in one line."""
+    rows = {(row["factor"], row["level"]): row for row in summary["outcomes_by_level"]}
+    whole = dict(rows.get(("condition", "all"), {"trials": 0}))
+    trials, planned = whole.pop("trials"), summary["trials"]["planned"]
+    of = f" of {planned}" if trials < planned else ""
+    stored = summary["trials"]["stored_before"]
+    before = f", {stored} of them stored before this run" if stored else ""
+    ways = [
+        f"{number} {way}" for way, number in whole.items() if isinstance(number, int) and number
+    ]
+    return f"trials: {trials}{of}" + (f" ({', '.join(ways)})" if ways else "") + before
+
+
+def calls_text(live: int, cached: int, shared: int, recorded: int) -> str:
+    """How many calls were asked, and how many had an answer.
+
+    Of these ``shared`` ones got it in this run, and ``recorded`` ones from a recording that was
+    named.
+    """
+    parts = {
+        "from recordings": recorded,
+        "from the cache": cached - shared - recorded,
+        "shared with another trial": shared,
+    }
+    had = [f"{number} {how}" for how, number in parts.items() if number]
+    return ", ".join([f"{live} asked"] * bool(live or not had) + had)
+
+
+def _costs(summary: dict[str, Any]) -> Iterator[str]:
+    number = summary["calls_of_unknown_cost"]
+    unknown = f" and {number} calls of unknown cost" if number else ""
+    made = (*summary["calls"].values(), summary["calls_shared"], summary["calls_recorded"])
+    calls = calls_text(*made)
+    spent_usd, aside_usd = summary["sweep_cost_usd"], summary["set_aside_usd"]
+    apart = bool(aside_usd) or round(spent_usd, 4) != round(summary["cost_usd"], 4)
+    alone = " in this run" if apart else ""
+    text = f"calls: {calls}; cost {summary['cost_usd']:.4f} USD{alone}{unknown}"
+    if (expected := summary["estimate"]) is not None:
+        text += f"; estimated before: {expected['calls']} calls, {usd_text(expected['cost_usd'])}"
+    yield text
+    if apart:
+        ledger = command_at("merge-runner ledger", "--cache", summary["cache"], DEFAULT_CACHE)
+        why = f", and {aside_usd:.4f} set aside (`{ledger}` says why)"
+        yield f"this sweep over all its runs: {spent_usd:.4f} USD{why if aside_usd else ''}"
+        yield APART
+    if over_usd := summary["over_the_worst_case_usd"]:
+        yield (
+            f"WARNING: replies cost {over_usd:.4f} USD more than their worst case "
+            f"({summary['dearest']}): the server does not keep to the output cap"
+        )
+    for tier, answers in summary["underpriced"].items():
+        yield f"WARNING: {answers} {underpriced(tier)}"
+
+
+def _faults(summary: dict[str, Any]) -> Iterator[str]:
+    """Who answered in whose place, what the audit says, and which trials failed."""
+    for pair, answers in summary["model_mismatches"].items():
+        yield f"WARNING: another model answered than was asked for: {pair} ({answers} answers)"
+    for driver, model, provider in summary["stand_ins"]:
+        if provider == EMULATOR:
+            yield f"The model `{model}` is a scripted stand-in, no language model."
+        else:
+            yield f"{driver}: a scripted stand-in answered, not {model}"
+    if same := summary["same_prompts"]:
+        prompts = "; ".join(map(", ".join, same))
+        yield (
+            f"the same trials with these prompts: {prompts}. The emulator reads no words: plant an "
+            "effect to rehearse (docs/how-to/run-a-study.md#words-that-cross)"
+        )
+    audit = summary["audit"]
+    audit_it = command_at("merge-runner audit", "--db", summary["db"], DEFAULT_DB)
+    found = f"{len(audit['findings'])} findings, which `{audit_it}` lists"
+    checked = found if audit["findings"] else "no problems"
+    yield f"checked: {checked}; database: {summary['db']}"
+    notes = [f"note: {each}" for each in audit["notes"]]
+    yield from first_of(notes, f"more notes: `{audit_it}`")
+    failed = [f"failed: {trial_id}: {error}" for trial_id, error in summary["failed"].items()]
+    yield from first_of(failed, "more, in the table trials")
+    if failed and summary["exit_code"] != ReplayMiss.exit_code:
+        yield "Run the same command again to play the failed trials anew."
+
+
+def as_table(rows: Sequence[dict[str, Any]]) -> str:
+    """The table of a few rows, numbers shortened; empty without a row."""
+    text = StringIO()
+    if rows:
+        cells = ([f"{v:g}" if isinstance(v, float) else v for v in r.values()] for r in rows)
+        write_table([*rows[0]], map(tuple, cells), text)
+    return text.getvalue()
