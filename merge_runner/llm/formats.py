@@ -300,14 +300,14 @@ def usage_of(counts: object, *, total: str = "", **places: str) -> Usage:
             count = as_count(at(counts, path))
             if count is not None:
                 sums[name] = sums.get(name, 0) + count
-    usage = Usage(**sums)
-    read, written, reasoned = usage.input_tokens, usage.output_tokens, usage.reasoning_tokens or 0
+    read, written = sums.get("input_tokens"), sums.get("output_tokens")
+    reasoned = sums.get("reasoning_tokens", 0)
     if written is not None and reasoned > written:
         written = min(written + reasoned, MOST_TOKENS)
     in_all = as_count(at(counts, total)) if total else None
     if in_all is not None and read is not None and in_all > read:
         written = max(written or 0, in_all - read)
-    return replace(usage, output_tokens=written)
+    return Usage(**sums | {"output_tokens": written})
 
 
 def plain(*names: str) -> dict[str, tuple[str, ...]]:
