@@ -9,7 +9,7 @@ from merge_runner.results.export import tables
 from tests.support.harness import PROJECT, asked_to_write
 
 PAGE = PROJECT / "docs/tables.md"
-MARK = "<!-- from schema.sql and measures.sql, by tests/integration/results/test_tables_page.py -->\n"
+MARK = "<!-- from schema.sql and measures.sql: test_tables_page.py --write -->\n"
 
 
 def test_the_page_lists_the_tables_of_a_database():
