@@ -81,7 +81,7 @@ COMMENT ON COLUMN trials.source IS 'llm, driver, human; seat: first decisions al
     'closed loop';
 COMMENT ON COLUMN trials.model_left IS 'left driver: a model of the registry or a program';
 COMMENT ON COLUMN trials.model_right IS 'right driver';
-COMMENT ON COLUMN trials.variant IS 'prompt variant, with the levels of words that it has';
+COMMENT ON COLUMN trials.variant IS 'prompt variant, with its levels of text factors';
 COMMENT ON COLUMN trials.condition IS 'initial condition, such as L_4_-8';
 COMMENT ON COLUMN trials.projected_headway_m IS 'projected headway of the condition, left minus '
     'right';
@@ -97,7 +97,7 @@ COMMENT ON COLUMN trials.error IS 'why it failed';
 COMMENT ON COLUMN trials.scripted IS 'whether a mock model answered on either side, whatever '
     'model was requested';
 COMMENT ON COLUMN trials.focal IS 'left, right: side of the ego, if the two drivers have '
-    'different words, parameters or perceptions; NULL: they have the same';
+    'different texts, parameters or perceptions; NULL: they have the same';
 
 CREATE TABLE trial_factors (
     trial_id VARCHAR NOT NULL,
@@ -111,8 +111,8 @@ COMMENT ON COLUMN trial_factors.trial_id IS 'as in trials';
 COMMENT ON COLUMN trial_factors.spec_hash IS 'as in trials';
 COMMENT ON COLUMN trial_factors.factor IS 'name in the study''s file';
 COMMENT ON COLUMN trial_factors.value IS 'level: a text as it is, anything else as JSON';
-COMMENT ON COLUMN trial_factors.words IS 'whether the factor is one of words, whose level the '
-    'variant names';
+COMMENT ON COLUMN trial_factors.words IS 'whether it is a text factor, whose level the variant '
+    'names';
 
 CREATE TABLE states (
     trial_id VARCHAR NOT NULL,
@@ -293,8 +293,8 @@ FROM (
     ) USING (trial_id, spec_hash)
 );
 COMMENT ON VIEW trial_drivers IS 'One row per trial: its driver. Two different drivers are joined '
-    'by a plus, the ego first; another sample set and the levels of other factors than prompt, '
-    'words and opponent follow.';
+    'by a plus, the ego first; another sample set and the levels of factors other than prompt, '
+    'text factors and opponent follow.';
 COMMENT ON COLUMN trial_drivers.driver IS 'model, with its endpoint if that is not the '
     'provider''s own, as in o3 at localhost:8080';
 COMMENT ON COLUMN trial_drivers.ego IS 'side of the driver that is named first: the focal one; '
@@ -320,8 +320,8 @@ FROM (
 ) USING (trial_id, spec_hash)
 WHERE source <> 'human';
 COMMENT ON VIEW trial_levels IS 'One row per driven trial and factor: those of trial_factors '
-    'without words, and model and prompt. A driver that meets an opponent is the model; a pair '
-    'without an opponent is one model, the ego first.';
+    'without text factors, and model and prompt. A driver that meets an opponent is the model; a '
+    'pair without an opponent is one model, the ego first.';
 
 CREATE VIEW attempts AS
 SELECT calls.*, source, variant, condition, sample_set,
