@@ -32,7 +32,7 @@ def test_the_docs_print_what_the_controls_give():
     ]
     *_, gini, gain = [f"{min(of):.2f} to {max(of):.2f}" for of in areas]
     assert (
-        f"with noise of up to {max(NOISES_MPS)} m/s, its area under the ROC curve is {gain}."
+        f"with noise of up to {max(NOISES_MPS)} m/s, the gain's area under the ROC curve is {gain}."
         in text
     )
     assert f"For Gini's coefficient of |Δa| the area is {gini}." in text
