@@ -50,7 +50,7 @@ check-all: check ## what an hour may find: the weekly tests too, and the wheel o
 	@MERGE_RUNNER_BROWSER=required $(PYTEST) tests/weekly $(ARGS)
 	@.ci/installed everywhere
 
-bench: .venv/runtime .venv-peer/installed ## the benchmarks: docs/reference/performance.md
+bench: .venv/runtime .venv-peer/installed ## the benchmarks: benchmarks/README.md
 	@.venv/bin/python -m benchmarks $(ARGS)
 
 lock: ## renew the lock files (needs uv)

@@ -152,7 +152,7 @@ def _limit(connection: duckdb.DuckDBPyConnection) -> None:
 def load_trials(db: Path | str = DEFAULT_DB) -> pd.DataFrame:
     """Return one row a trial, as its ``ego`` sees it: condition, outcome and metrics in SI units.
 
-    See docs/reference/tables.md. A trial whose ego sat on the right is mirrored: its left is the
+    See docs/tables.md. A trial whose ego sat on the right is mirrored: its left is the
     ego's side. First situations that were only asked are left out.
     """
     return load(f"FROM ({TRIALS}) WHERE source <> 'seat'", db)

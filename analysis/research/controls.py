@@ -1,6 +1,6 @@
 """Speeds whose control is known, and how far measures of I5 tell them apart.
 
-``python -m analysis.research.controls`` prints tables of docs/reference/analysis.md.
+``python -m analysis.research.controls`` prints what docs/numbers.md sums up.
 """
 
 from __future__ import annotations

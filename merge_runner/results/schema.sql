@@ -4,8 +4,9 @@
 CREATE TABLE meta (
     schema_version INTEGER NOT NULL
 );
-COMMENT ON TABLE meta IS 'What this program needs to know of the database.';
-COMMENT ON COLUMN meta.schema_version IS 'of the tables: files of another are refused';
+COMMENT ON TABLE meta IS 'Facts about the database itself.';
+COMMENT ON COLUMN meta.schema_version IS 'version of the tables; a file of another version is '
+    'refused';
 
 CREATE TABLE sweeps (
     sweep_id VARCHAR PRIMARY KEY,
@@ -18,31 +19,35 @@ CREATE TABLE sweeps (
     git_dirty BOOLEAN,
     versions JSON NOT NULL
 );
-COMMENT ON TABLE sweeps IS 'A run of a sweep.';
-COMMENT ON COLUMN sweeps.sweep_id IS 'its name, its drivers and when it started';
-COMMENT ON COLUMN sweeps.name IS 'of its file, as in experiments/NAME.toml';
-COMMENT ON COLUMN sweeps.started_at IS 'when the run began';
-COMMENT ON COLUMN sweeps.ended_at IS 'NULL: running, or ended without a word';
+COMMENT ON TABLE sweeps IS 'One row per run of a sweep.';
+COMMENT ON COLUMN sweeps.sweep_id IS 'name, drivers and start time of the run';
+COMMENT ON COLUMN sweeps.name IS 'name of its file, as in experiments/NAME.toml';
+COMMENT ON COLUMN sweeps.started_at IS 'start of the run';
+COMMENT ON COLUMN sweeps.ended_at IS 'end of the run; NULL: running, or killed';
 COMMENT ON COLUMN sweeps.exit_code IS '0: all trials ended, and none was removed since';
-COMMENT ON COLUMN sweeps.config IS 'what was to be played, by whom, with which parameters';
-COMMENT ON COLUMN sweeps.git_commit IS 'of the program, or its installed version';
-COMMENT ON COLUMN sweeps.git_dirty IS 'whether the program had uncommitted changes';
-COMMENT ON COLUMN sweeps.versions IS 'of Python and the packages';
+COMMENT ON COLUMN sweeps.config IS 'plan: trials, drivers, parameters';
+COMMENT ON COLUMN sweeps.git_commit IS 'commit of the program''s checkout; without one, its '
+    'installed version';
+COMMENT ON COLUMN sweeps.git_dirty IS 'whether the checkout had uncommitted changes; NULL: '
+    'installed version';
+COMMENT ON COLUMN sweeps.versions IS 'versions of Python and the packages';
 
 CREATE TABLE sweep_trials (
     sweep_id VARCHAR NOT NULL,
     trial_id VARCHAR NOT NULL,
     spec_hash VARCHAR NOT NULL
 );
-COMMENT ON TABLE sweep_trials IS 'The trials of each run of a sweep.';
+COMMENT ON TABLE sweep_trials IS 'One row per trial of a run of a sweep.';
 
 CREATE TABLE specs (
     spec_hash VARCHAR PRIMARY KEY,
     spec JSON NOT NULL
 );
-COMMENT ON TABLE specs IS 'What a spec_hash stands for: both drivers, all parameters and prompt '
-    'texts, the sample set.';
-COMMENT ON COLUMN specs.spec IS 'both drivers, all parameters, prompt texts, sample set';
+COMMENT ON TABLE specs IS 'One row per spec_hash: both drivers, all parameters, prompt texts, '
+    'sample set.';
+COMMENT ON COLUMN specs.spec IS 'both drivers, all parameters, prompt texts, sample set; of a '
+    'program also its revision, its own rate, the program that it is based_on, and the hash of '
+    'the data that it drives by';
 
 CREATE TABLE trials (
     trial_id VARCHAR NOT NULL,
@@ -65,27 +70,34 @@ CREATE TABLE trials (
     focal VARCHAR,
     PRIMARY KEY (trial_id, spec_hash)
 );
-COMMENT ON TABLE trials IS 'A trial.';
-COMMENT ON COLUMN trials.trial_id IS 'drivers/variant/condition/repetition, and the sample set; the '
-    'variant without levels of words, which stand behind it with those of other factors';
-COMMENT ON COLUMN trials.spec_hash IS 'of what determines the result, but condition and rep';
-COMMENT ON COLUMN trials.pair IS 'human pairs only';
-COMMENT ON COLUMN trials.source IS 'llm, driver, human; seat: asked without the loop';
-COMMENT ON COLUMN trials.model_left IS 'who drove on the left: a model of the registry or a program';
-COMMENT ON COLUMN trials.model_right IS 'who drove on the right';
-COMMENT ON COLUMN trials.variant IS 'of the prompt, and the levels of words that it has';
-COMMENT ON COLUMN trials.condition IS 'of the experiment';
-COMMENT ON COLUMN trials.projected_headway_m IS 'of the condition, left minus right';
-COMMENT ON COLUMN trials.relative_velocity_mps IS 'of the condition, left minus right';
-COMMENT ON COLUMN trials.rep IS 'the repetition, from 1';
-COMMENT ON COLUMN trials.sample_set IS 'another number is a fresh set of samples';
-COMMENT ON COLUMN trials.status IS 'finished, collided, timeout, failed';
-COMMENT ON COLUMN trials.merged_first IS 'left, right, NULL: collided, failed, or nobody merged';
-COMMENT ON COLUMN trials.end_time_s IS 'when the trial ended';
+COMMENT ON TABLE trials IS 'One row per trial. One trial_id may occur with two specs: join and '
+    'group by (trial_id, spec_hash).';
+COMMENT ON COLUMN trials.trial_id IS 'drivers/variant/condition/repetition, then the sample set; '
+    'levels of factors follow; of first decisions alone it begins with seat/';
+COMMENT ON COLUMN trials.spec_hash IS 'hash of all that determines the result, except condition '
+    'and rep';
+COMMENT ON COLUMN trials.pair IS 'the human pair; NULL: no human trial';
+COMMENT ON COLUMN trials.source IS 'llm, driver, human; seat: first decisions alone, without the '
+    'closed loop';
+COMMENT ON COLUMN trials.model_left IS 'left driver: a model of the registry or a program';
+COMMENT ON COLUMN trials.model_right IS 'right driver';
+COMMENT ON COLUMN trials.variant IS 'prompt variant, with its levels of text factors';
+COMMENT ON COLUMN trials.condition IS 'initial condition, such as L_4_-8';
+COMMENT ON COLUMN trials.projected_headway_m IS 'projected headway of the condition, left minus '
+    'right';
+COMMENT ON COLUMN trials.relative_velocity_mps IS 'relative velocity of the condition, left minus '
+    'right';
+COMMENT ON COLUMN trials.rep IS 'repetition, from 1';
+COMMENT ON COLUMN trials.sample_set IS 'number of the sample set; another number asks anew';
+COMMENT ON COLUMN trials.status IS 'finished, collided, timeout, failed; a collision by the rule '
+    'of the scenario, of humans by boxes at 20 Hz';
+COMMENT ON COLUMN trials.merged_first IS 'left, right; NULL: collided, failed, or nobody merged';
+COMMENT ON COLUMN trials.end_time_s IS 'end of the trial';
 COMMENT ON COLUMN trials.error IS 'why it failed';
-COMMENT ON COLUMN trials.scripted IS 'a scripted stand-in answered on a side, and no model';
-COMMENT ON COLUMN trials.focal IS 'left, right: the side of the ego, where the two drivers are given '
-    'different words, parameters or perceptions; NULL: they are given the same';
+COMMENT ON COLUMN trials.scripted IS 'whether a mock model answered on either side, whatever '
+    'model was requested';
+COMMENT ON COLUMN trials.focal IS 'left, right: side of the ego, if the two drivers have '
+    'different texts, parameters or perceptions; NULL: they have the same';
 
 CREATE TABLE trial_factors (
     trial_id VARCHAR NOT NULL,
@@ -94,12 +106,13 @@ CREATE TABLE trial_factors (
     value VARCHAR NOT NULL,
     words BOOLEAN NOT NULL
 );
-COMMENT ON TABLE trial_factors IS 'A level of a factor of a trial''s study.';
-COMMENT ON COLUMN trial_factors.trial_id IS 'of trials';
-COMMENT ON COLUMN trial_factors.spec_hash IS 'of trials';
-COMMENT ON COLUMN trial_factors.factor IS 'as the study''s file names it';
-COMMENT ON COLUMN trial_factors.value IS 'the level: a text as it is, anything else as JSON';
-COMMENT ON COLUMN trial_factors.words IS 'it is a level of words, which the prompt''s variant names';
+COMMENT ON TABLE trial_factors IS 'One row per trial and factor of its study.';
+COMMENT ON COLUMN trial_factors.trial_id IS 'as in trials';
+COMMENT ON COLUMN trial_factors.spec_hash IS 'as in trials';
+COMMENT ON COLUMN trial_factors.factor IS 'name in the study''s file';
+COMMENT ON COLUMN trial_factors.value IS 'level: a text as it is, anything else as JSON';
+COMMENT ON COLUMN trial_factors.words IS 'whether it is a text factor, whose level the variant '
+    'names';
 
 CREATE TABLE states (
     trial_id VARCHAR NOT NULL,
@@ -111,13 +124,15 @@ CREATE TABLE states (
     velocity_mps DOUBLE NOT NULL,
     acceleration_mps2 DOUBLE NOT NULL
 );
-COMMENT ON TABLE states IS 'A vehicle at a sample.';
-COMMENT ON COLUMN states.step IS 'of the simulation, 0 where the drivers take control';
-COMMENT ON COLUMN states.time_s IS '0 where the drivers take control';
+COMMENT ON TABLE states IS 'One row per vehicle and sample.';
+COMMENT ON COLUMN states.step IS 'step of the simulation; 0 at the start of control';
+COMMENT ON COLUMN states.time_s IS '0 at the start of control';
 COMMENT ON COLUMN states.side IS 'left, right';
-COMMENT ON COLUMN states.position_m IS 'travelled along the own branch; see geometry';
-COMMENT ON COLUMN states.velocity_mps IS 'along the own branch';
-COMMENT ON COLUMN states.acceleration_mps2 IS 'realised over the step before this sample';
+COMMENT ON COLUMN states.position_m IS 'distance travelled along the own branch: tunnel exit 50, '
+    'merge point 100, end 150';
+COMMENT ON COLUMN states.velocity_mps IS 'speed along the own branch';
+COMMENT ON COLUMN states.acceleration_mps2 IS 'realised acceleration over the step before the '
+    'sample';
 
 CREATE TABLE decisions (
     trial_id VARCHAR NOT NULL,
@@ -143,27 +158,34 @@ CREATE TABLE decisions (
     told_other_acceleration_mps2 DOUBLE,
     told_other_speeds_mps DOUBLE[]
 );
-COMMENT ON TABLE decisions IS 'A driver at a decision instant.';
-COMMENT ON COLUMN decisions.decision IS 'counts the instants of this driver''s pace from 0, the '
-    'start of control, and begins above 0 where it leaves its tunnel later (control_start own_exit)';
-COMMENT ON COLUMN decisions.valid IS 'whether the reply holds a plan';
-COMMENT ON COLUMN decisions.failure IS 'why it is invalid; no_decision: it is valid, and lacks the '
-    'tactical decision asked for';
-COMMENT ON COLUMN decisions.tactical IS 'M, Y';
-COMMENT ON COLUMN decisions.rationale IS 'the reason in the reply';
-COMMENT ON COLUMN decisions.plan IS 'normalised to [-1, 1], the whole horizon';
-COMMENT ON COLUMN decisions.applied IS 'normalised, what was driven';
-COMMENT ON COLUMN decisions.fallback IS 'applied comes from an older plan, or is 0';
-COMMENT ON COLUMN decisions.prompt IS 'the situation as the driver was told it';
+COMMENT ON TABLE decisions IS 'One row per driver and decision instant.';
+COMMENT ON COLUMN decisions.decision IS 'number of the instant at this driver''s rate, 0 at the '
+    'start of control; higher at first if the driver leaves its tunnel later (control_start = '
+    '"own_exit")';
+COMMENT ON COLUMN decisions.valid IS 'whether the reply holds a valid plan';
+COMMENT ON COLUMN decisions.failure IS 'why the plan is invalid; no_decision: the plan is valid, '
+    'but the requested tactical decision is missing';
+COMMENT ON COLUMN decisions.tactical IS 'M (merge), Y (yield)';
+COMMENT ON COLUMN decisions.rationale IS 'reason in the reply';
+COMMENT ON COLUMN decisions.plan IS 'whole plan, normalised to [-1, 1] (times 2.5 m/s^2); a '
+    'model''s actions have plan_step_s, a program''s step_s';
+COMMENT ON COLUMN decisions.applied IS 'normalised actions that were driven';
+COMMENT ON COLUMN decisions.fallback IS 'whether applied comes from an older plan, or is 0';
+COMMENT ON COLUMN decisions.prompt IS 'situation as the driver observed it, in words';
 COMMENT ON COLUMN decisions.prompt_hash IS 'SHA-256 of the prompt';
-COMMENT ON COLUMN decisions.call_key IS 'leads to the call; NULL: a program decided';
-COMMENT ON COLUMN decisions.other_seen IS 'whether it saw the other; NULL: it was told the truth';
-COMMENT ON COLUMN decisions.told_own_position_m IS 'what it was told; NULL: the truth';
-COMMENT ON COLUMN decisions.told_own_speed_mps IS 'what it was told; NULL: the truth';
-COMMENT ON COLUMN decisions.told_distance_m IS 'how far ahead the other is, it was told; NULL: not seen';
-COMMENT ON COLUMN decisions.told_other_speed_mps IS 'what it was told; NULL: the truth, or not seen';
-COMMENT ON COLUMN decisions.told_other_acceleration_mps2 IS 'what programs were told; NULL as above';
-COMMENT ON COLUMN decisions.told_other_speeds_mps IS 'the history that it was told; NULL as above';
+COMMENT ON COLUMN decisions.call_key IS 'key in calls; NULL: a program decided';
+COMMENT ON COLUMN decisions.other_seen IS 'whether the other vehicle was seen; NULL: perfect '
+    'perception';
+COMMENT ON COLUMN decisions.told_own_position_m IS 'observed value; NULL: the true one';
+COMMENT ON COLUMN decisions.told_own_speed_mps IS 'observed value; NULL: the true one';
+COMMENT ON COLUMN decisions.told_distance_m IS 'observed distance to the other vehicle, ahead '
+    'positive; NULL: not seen, or the true one';
+COMMENT ON COLUMN decisions.told_other_speed_mps IS 'observed value; NULL: not seen, or the true '
+    'one';
+COMMENT ON COLUMN decisions.told_other_acceleration_mps2 IS 'value that programs observed; NULL: '
+    'not seen, or the true one';
+COMMENT ON COLUMN decisions.told_other_speeds_mps IS 'observed history; NULL: not seen, or the '
+    'true one';
 
 CREATE TABLE calls (
     call_key VARCHAR NOT NULL,
@@ -192,27 +214,30 @@ CREATE TABLE calls (
     scripted BOOLEAN NOT NULL,
     batch_id VARCHAR
 );
-COMMENT ON TABLE calls IS 'An attempt at a call.';
-COMMENT ON COLUMN calls.call_key IS 'a hash of the request and its slot among the samples';
-COMMENT ON COLUMN calls.attempt IS 'counts those at this call from 1';
-COMMENT ON COLUMN calls.provider IS 'whose format was spoken';
-COMMENT ON COLUMN calls.model_requested IS 'the id that was asked for';
-COMMENT ON COLUMN calls.model_served IS 'the id that the reply names';
-COMMENT ON COLUMN calls.http_status IS 'NULL: no reply came';
-COMMENT ON COLUMN calls.outcome IS 'ok, refusal, truncated, empty, unknown, or why it failed';
-COMMENT ON COLUMN calls.cached IS 'made before this run, which did not pay for it';
-COMMENT ON COLUMN calls.started_at IS 'when it was made, maybe long before this run';
-COMMENT ON COLUMN calls.latency_s IS 'from the request to the end of the reply';
-COMMENT ON COLUMN calls.input_tokens IS 'includes the cached ones';
+COMMENT ON TABLE calls IS 'One row per HTTP attempt at a call.';
+COMMENT ON COLUMN calls.call_key IS 'hash of the request and its slot';
+COMMENT ON COLUMN calls.attempt IS 'number of the attempt at this call, from 1';
+COMMENT ON COLUMN calls.provider IS 'provider, as the registry names it';
+COMMENT ON COLUMN calls.model_requested IS 'requested model id';
+COMMENT ON COLUMN calls.model_served IS 'model id that the reply names';
+COMMENT ON COLUMN calls.http_status IS 'NULL: no reply';
+COMMENT ON COLUMN calls.outcome IS 'ok, refusal, truncated, empty; unknown: the run was killed '
+    'before the reply; else the reason of the failure';
+COMMENT ON COLUMN calls.cached IS 'whether the attempt was made before this run, or for another '
+    'trial of it';
+COMMENT ON COLUMN calls.started_at IS 'when it was made (a batch: when that was submitted), maybe '
+    'long before this run';
+COMMENT ON COLUMN calls.latency_s IS 'from the request to the end of the reply; NULL in a batch';
+COMMENT ON COLUMN calls.input_tokens IS 'cached ones included';
 COMMENT ON COLUMN calls.cached_input_tokens IS 'read from the provider''s cache';
-COMMENT ON COLUMN calls.output_tokens IS 'includes the reasoning ones';
-COMMENT ON COLUMN calls.reasoning_tokens IS 'of which the reply shows nothing';
-COMMENT ON COLUMN calls.cost_usd IS 'what it cost when it was made; NULL: unknown';
+COMMENT ON COLUMN calls.output_tokens IS 'reasoning ones included';
+COMMENT ON COLUMN calls.reasoning_tokens IS 'tokens that the reply does not show';
+COMMENT ON COLUMN calls.cost_usd IS 'cost at the prices of started_at; NULL: unknown';
 COMMENT ON COLUMN calls.finish_reason IS 'as the provider says it';
-COMMENT ON COLUMN calls.request IS 'the body that was sent';
-COMMENT ON COLUMN calls.reply IS 'the body that came';
-COMMENT ON COLUMN calls.scripted IS 'a scripted stand-in answered, whoever was asked';
-COMMENT ON COLUMN calls.batch_id IS 'the provider''s batch that it was a line of; NULL: of none';
+COMMENT ON COLUMN calls.request IS 'body that was sent';
+COMMENT ON COLUMN calls.reply IS 'body that was received';
+COMMENT ON COLUMN calls.scripted IS 'whether a mock model answered, whatever model was requested';
+COMMENT ON COLUMN calls.batch_id IS 'provider''s batch of the request; NULL: sent alone';
 
 -- How a driver is named: by its model, and by its endpoint where that is not the provider's own.
 CREATE MACRO driver_name(model, endpoint) AS
@@ -232,12 +257,12 @@ FROM decisions
 JOIN states AS own USING (trial_id, spec_hash, time_s, side)
 JOIN states AS other USING (trial_id, spec_hash, step)
 WHERE other_seen IS NOT NULL AND other.side <> own.side;
-COMMENT ON VIEW perceptions IS 'What was so beside what a driver with imperfect perception was '
-    'told, for each of its decisions.';
-COMMENT ON COLUMN perceptions.distance_m IS 'how far ahead the other was';
-COMMENT ON COLUMN perceptions.other_speed_mps IS 'how fast the other was';
-COMMENT ON COLUMN perceptions.own_position_m IS 'where the own vehicle was';
-COMMENT ON COLUMN perceptions.own_speed_mps IS 'how fast the own vehicle was';
+COMMENT ON VIEW perceptions IS 'One row per decision under imperfect perception: true values and '
+    'observed ones.';
+COMMENT ON COLUMN perceptions.distance_m IS 'true distance to the other vehicle, ahead positive';
+COMMENT ON COLUMN perceptions.other_speed_mps IS 'true speed of the other vehicle';
+COMMENT ON COLUMN perceptions.own_position_m IS 'true position of the own vehicle';
+COMMENT ON COLUMN perceptions.own_speed_mps IS 'true speed of the own vehicle';
 
 CREATE VIEW trial_drivers AS
 SELECT trial_id, spec_hash,
@@ -267,14 +292,15 @@ FROM (
         FROM trial_factors GROUP BY ALL
     ) USING (trial_id, spec_hash)
 );
-COMMENT ON VIEW trial_drivers IS 'Who drove: two different drivers are joined by a plus, the ego '
-    'first, whichever side it sat on; another sample set has its number, and so has each level of a '
-    'study''s factors but the prompt, with its words, and the opponent, which are named already.';
-COMMENT ON COLUMN trial_drivers.driver IS 'the model, with its endpoint if that is not the provider''s own';
-COMMENT ON COLUMN trial_drivers.ego IS 'the side of the driver that is named first, whose odds are '
-    'told: the focal one; else of two different ones that which its study does not call the opponent, '
-    'else a language model before a program, else the first in the alphabet; of two equal ones, and '
-    'of humans, the left one';
+COMMENT ON VIEW trial_drivers IS 'One row per trial: its driver. Two different drivers are joined '
+    'by a plus, the ego first; another sample set and the levels of factors other than prompt, '
+    'text factors and opponent follow.';
+COMMENT ON COLUMN trial_drivers.driver IS 'model, with its endpoint if that is not the '
+    'provider''s own, as in o3 at localhost:8080';
+COMMENT ON COLUMN trial_drivers.ego IS 'side of the driver that is named first: the focal one; '
+    'else, of two different ones, that which its study does not call the opponent, else a '
+    'language model before a program, else the first in the alphabet; of two equal ones and of '
+    'humans, the left one';
 
 CREATE VIEW trial_levels AS
 WITH own AS (SELECT * EXCLUDE words FROM trial_factors)
@@ -293,9 +319,9 @@ FROM (
     FROM own GROUP BY ALL
 ) USING (trial_id, spec_hash)
 WHERE source <> 'human';
-COMMENT ON VIEW trial_levels IS 'What was designed: a row for each factor of a driven trial, those of its '
-    'study, and the model and the prompt that it had. Who meets an opponent is the model; of a pair '
-    'without one both are, the ego first.';
+COMMENT ON VIEW trial_levels IS 'One row per driven trial and factor: those of trial_factors '
+    'without text factors, and model and prompt. A driver that meets an opponent is the model; a '
+    'pair without an opponent is one model, the ego first.';
 
 CREATE VIEW attempts AS
 SELECT calls.*, source, variant, condition, sample_set,
@@ -310,11 +336,11 @@ JOIN trials USING (trial_id, spec_hash)
 LEFT JOIN (SELECT trial_id, spec_hash, side, decision, valid, failure, fallback FROM decisions)
     USING (trial_id, spec_hash, side, decision)
 WINDOW call AS (PARTITION BY calls.trial_id, calls.spec_hash, calls.side, calls.decision);
-COMMENT ON VIEW attempts IS 'The ledger of attempts: what became of each. retried: another one '
-    'followed; driven: its plan was; fallback: it gave no valid plan (see failure), so that an older '
-    'plan or 0 was driven; lost: its call ended without an answer, and with it the trial.';
-COMMENT ON COLUMN attempts.model IS 'who was asked: a model of the registry';
-COMMENT ON COLUMN attempts.fate IS 'retried, driven, fallback or lost: see the view';
+COMMENT ON VIEW attempts IS 'One row per attempt, with its trial and its fate.';
+COMMENT ON COLUMN attempts.model IS 'requested model of the registry';
+COMMENT ON COLUMN attempts.fate IS 'retried: another attempt followed; driven: its plan was '
+    'driven; fallback: no valid plan (see failure), an older one or 0 was driven; lost: the call '
+    'failed, and so did the trial';
 
 CREATE VIEW trial_costs AS
 SELECT trial_id, spec_hash,
@@ -329,13 +355,12 @@ SELECT trial_id, spec_hash,
     count(*) FILTER (call_key IS NOT NULL AND cost_usd IS NULL) AS attempts_of_unknown_cost
 FROM trials LEFT JOIN calls USING (trial_id, spec_hash)
 GROUP BY ALL;
-COMMENT ON VIEW trial_costs IS 'What the replies of a trial cost, whoever paid, and what of it the '
-    'run that played it paid.';
-COMMENT ON COLUMN trial_costs.attempts IS 'how many attempts there were';
-COMMENT ON COLUMN trial_costs.calls IS 'how many calls there were';
-COMMENT ON COLUMN trial_costs.cost_usd IS 'what the replies cost when they were made, whoever paid';
-COMMENT ON COLUMN trial_costs.paid_usd IS 'the part paid by the run that played the trial';
-COMMENT ON COLUMN trial_costs.attempts_of_unknown_cost IS 'how many of the attempts have no known cost';
+COMMENT ON VIEW trial_costs IS 'One row per trial: the cost of its replies.';
+COMMENT ON COLUMN trial_costs.attempts IS 'number of attempts';
+COMMENT ON COLUMN trial_costs.calls IS 'number of calls';
+COMMENT ON COLUMN trial_costs.cost_usd IS 'cost of the replies when they were made, whoever paid';
+COMMENT ON COLUMN trial_costs.paid_usd IS 'part that the run of the trial paid';
+COMMENT ON COLUMN trial_costs.attempts_of_unknown_cost IS 'number of attempts without a known cost';
 
 CREATE VIEW sweep_costs AS
 SELECT sweep_id,
@@ -344,5 +369,5 @@ SELECT sweep_id,
     sum(cost_usd) AS cost_usd, sum(attempts_of_unknown_cost) AS attempts_of_unknown_cost
 FROM (SELECT DISTINCT * FROM sweep_trials) JOIN trial_costs USING (trial_id, spec_hash)
 GROUP BY ALL;
-COMMENT ON VIEW sweep_costs IS 'The sums of trial_costs over the trials of a sweep.';
-COMMENT ON COLUMN sweep_costs.trials IS 'how many trials the sweep has';
+COMMENT ON VIEW sweep_costs IS 'One row per sweep: sums of trial_costs over its trials.';
+COMMENT ON COLUMN sweep_costs.trials IS 'number of trials';

@@ -2,7 +2,7 @@
 
 Equations and constants: Siebinga, Zgonnikov and Abbink, PNAS Nexus 3(10), pgae420 (2024), arXiv
 2312.09776. The fitted thresholds of that paper are not public: each set here is ours, calibrated to
-the outcomes that the paper published (docs/reference/cei.md says which it meets and which not).
+the outcomes that the paper published (README.md says which it meets).
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ def test_every_how_to_is_in_the_list_of_them():
 
 
 def test_the_readings_of_the_docs_are_those_of_the_report():
-    text = (PROJECT / "docs/explanation/reproduction.md").read_text(encoding="utf-8")
+    text = (PROJECT / "docs/reproduction.md").read_text(encoding="utf-8")
     shown = [line for line in text.splitlines() if line.startswith("| ")][1:]
     readings = published("readings").itertuples(index=False)
     assert shown == ["| " + " | ".join(c.replace("|", r"\|") for c in r) + " |" for r in readings]

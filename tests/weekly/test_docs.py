@@ -20,6 +20,7 @@ TUTORIAL = DOCS / "tutorial.md"
 LAST = DOCS / "how-to/local-models.md"
 # Pages of users, in the order in which their commands are run.
 PAGES = [PROJECT / "README.md", *sorted(PROJECT.glob("plugins/*/README.md"))]
+PAGES += [PROJECT / "benchmarks/README.md"]
 PAGES += [*sorted(set(DOCS.rglob("*.md")) - {TUTORIAL, LAST}), LAST]
 PATH = f"{PROJECT}/.venv/bin:{os.environ['PATH']}"
 # The environment is the project's own: a make in another folder must not install into it.

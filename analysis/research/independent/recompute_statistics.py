@@ -1,4 +1,4 @@
-"""The tests and intervals that docs/reference/analysis.md names, from their definitions.
+"""The tests and intervals that docs/numbers.md names, from their definitions.
 
 Nothing of the project is imported.
 """

@@ -1,7 +1,7 @@
 """The trials of a results database, measured anew from states and decisions.
 
 Nothing of the project is imported, nor are its views of measures read: the definitions are those of
-the paper (arXiv 2604.09609) and of docs/reference. Lengths in m, times in s, speeds in m/s.
+the paper (arXiv 2604.09609) and of docs/numbers.md. Lengths in m, times in s, speeds in m/s.
 """
 
 from __future__ import annotations

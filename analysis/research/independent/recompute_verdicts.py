@@ -1,4 +1,4 @@
-"""Each driver beside the humans, recomputed as docs/reference/analysis.md says.
+"""Each driver beside the humans, recomputed as docs/numbers.md says.
 
 Nothing of the project is imported. I5 (``held``) is not recomputed.
 """

@@ -45,16 +45,19 @@ SELECT
     merge_point_m - least(along2, contact) AS merge_low_m,
     merge_point_m + least(along, across / sin1) AS merge_high_m
 FROM reaches;
-COMMENT ON VIEW geometry IS 'One row a spec: its vehicles'' size, in a human recording that of the '
-    'experiment, and where the vehicles'' boxes overlap (collision.py).';
-COMMENT ON COLUMN geometry.length_m IS 'of both vehicles';
-COMMENT ON COLUMN geometry.width_m IS 'of both vehicles';
-COMMENT ON COLUMN geometry.merge_point_m IS 'where the branches meet, along either';
-COMMENT ON COLUMN geometry.end_m IS 'where the track ends';
-COMMENT ON COLUMN geometry.front_m IS 'where a vehicle''s centre is when its front reaches the merge point';
-COMMENT ON COLUMN geometry.rear_m IS 'where a vehicle''s centre is when its rear has left the merge point';
-COMMENT ON COLUMN geometry.contact_m IS 'A vehicle at contact_m overlaps the other from there to '
-    'contact_high_m, one at the merge point from merge_low_m to merge_high_m.';
+COMMENT ON VIEW geometry IS 'One row per spec: size of the vehicles (of human recordings, that of '
+    'the experiment), the track, and where the vehicles'' boxes overlap (collision.py).';
+COMMENT ON COLUMN geometry.length_m IS 'length of both vehicles';
+COMMENT ON COLUMN geometry.width_m IS 'width of both vehicles';
+COMMENT ON COLUMN geometry.merge_point_m IS 'distance at which the branches meet, along either';
+COMMENT ON COLUMN geometry.end_m IS 'end of the track';
+COMMENT ON COLUMN geometry.front_m IS 'centre of a vehicle whose front is at the merge point';
+COMMENT ON COLUMN geometry.rear_m IS 'centre of a vehicle whose rear has left the merge point';
+COMMENT ON COLUMN geometry.contact_m IS 'first point of overlap: a vehicle there overlaps the '
+    'other from there to contact_high_m, one at the merge point from merge_low_m to merge_high_m';
+COMMENT ON COLUMN geometry.contact_high_m IS 'see contact_m';
+COMMENT ON COLUMN geometry.merge_low_m IS 'see contact_m';
+COMMENT ON COLUMN geometry.merge_high_m IS 'see contact_m';
 
 -- On a collision course for a point: when a vehicle will be there at its present speed, the other
 -- will be within the bounds in which their boxes overlap (Siebinga et al., conflict_signal.py).
@@ -84,8 +87,18 @@ SELECT *,
     first_value(left_mps) OVER trial AS left_first_mps,
     first_value(right_mps) OVER trial AS right_first_mps
 FROM pairs WINDOW trial AS (PARTITION BY trial_id, spec_hash ORDER BY step);
-COMMENT ON VIEW vehicle_pairs IS 'One row a sample, both vehicles side by side, the sample before, '
-    'and the speeds of the first.';
+COMMENT ON VIEW vehicle_pairs IS 'One row per sample: both vehicles, the sample before, and the '
+    'first speeds.';
+COMMENT ON COLUMN vehicle_pairs.left_m IS 'position of the left vehicle';
+COMMENT ON COLUMN vehicle_pairs.right_m IS 'position of the right vehicle';
+COMMENT ON COLUMN vehicle_pairs.left_mps IS 'speed of the left vehicle';
+COMMENT ON COLUMN vehicle_pairs.right_mps IS 'speed of the right vehicle';
+COMMENT ON COLUMN vehicle_pairs.hardest_mps2 IS 'larger of the absolute accelerations';
+COMMENT ON COLUMN vehicle_pairs.time_before_s IS 'time of the sample before';
+COMMENT ON COLUMN vehicle_pairs.left_before_m IS 'left position at the sample before';
+COMMENT ON COLUMN vehicle_pairs.right_before_m IS 'right position at the sample before';
+COMMENT ON COLUMN vehicle_pairs.left_first_mps IS 'left speed at the first sample';
+COMMENT ON COLUMN vehicle_pairs.right_first_mps IS 'right speed at the first sample';
 
 -- What takes the name of samples or times: trial_metrics makes its samples once, as that is most of its
 -- work.
@@ -104,8 +117,16 @@ FROM (SELECT trial_id, spec_hash,
 FROM query_table(pairs) LEFT JOIN geometry USING (spec_hash) GROUP BY ALL);
 
 CREATE OR REPLACE VIEW merge_times AS FROM merge_times_in('vehicle_pairs');
-COMMENT ON VIEW merge_times IS 'When each vehicle''s centre reaches the merge point, when its front '
-    'does, and when its rear has left it; NULL: never.';
+COMMENT ON VIEW merge_times IS 'One row per trial: when the centre, the front and the rear of '
+    'each vehicle pass the merge point; NULL: never.';
+COMMENT ON COLUMN merge_times.left_s IS 'when the left vehicle''s centre passes the merge point';
+COMMENT ON COLUMN merge_times.right_s IS 'when the right vehicle''s centre passes it';
+COMMENT ON COLUMN merge_times.left_front_s IS 'when the left vehicle''s front passes it';
+COMMENT ON COLUMN merge_times.right_front_s IS 'when the right vehicle''s front passes it';
+COMMENT ON COLUMN merge_times.left_rear_s IS 'when the left vehicle''s rear passes it';
+COMMENT ON COLUMN merge_times.right_rear_s IS 'when the right vehicle''s rear passes it';
+COMMENT ON COLUMN merge_times.first_s IS 'when the first centre passes it';
+COMMENT ON COLUMN merge_times.both_s IS 'when the second centre passes it';
 
 -- Squares are added in the order of time: threads would add them in any, and round differently.
 CREATE OR REPLACE MACRO speed_deviations_in(pairs, times) AS TABLE
@@ -133,11 +154,13 @@ GROUP BY ALL);
 
 CREATE OR REPLACE VIEW speed_deviations AS
 FROM speed_deviations_in('vehicle_pairs', 'merge_times');
-COMMENT ON VIEW speed_deviations IS 'RMSE of each vehicle''s speed from its initial speed, over '
-    'four readings of "the interaction window": from the start of control to the first vehicle''s '
-    'merge, to the second''s, to the end, and the whole trial with the tunnel where it was recorded. '
-    'A window ends with the first sample at which it is over. A human''s speed is compared with that '
-    'of the condition, which the simulator gave the vehicle; a recording begins up to a step later.';
+COMMENT ON VIEW speed_deviations IS 'One row per finished trial and time_window: RMSE of each '
+    'vehicle''s speed from its initial speed, from the start of control to the first merge, to '
+    'both merges, to the end, or in the whole recording, tunnel included. A window ends with the '
+    'first sample at which it is over. A human''s initial speed is that of the condition.';
+COMMENT ON COLUMN speed_deviations.time_window IS 'first_merge, both_merges, end, whole';
+COMMENT ON COLUMN speed_deviations.rmse_left_mps IS 'RMSE of the left vehicle''s speed in the window';
+COMMENT ON COLUMN speed_deviations.rmse_right_mps IS 'RMSE of the right vehicle''s speed in the window';
 
 CREATE OR REPLACE VIEW trial_metrics AS
 WITH pairs AS MATERIALIZED (FROM vehicle_pairs),
@@ -211,25 +234,27 @@ LEFT JOIN (FROM speed_deviations_in('pairs', 'times') WHERE time_window = 'first
     USING (trial_id, spec_hash)
 LEFT JOIN collision_times USING (trial_id, spec_hash)
 LEFT JOIN resolutions USING (trial_id, spec_hash);
-COMMENT ON VIEW trial_metrics IS 'One row a trial. What a trial has no value for is NULL: gaps, '
+COMMENT ON VIEW trial_metrics IS 'One row per trial. A measure without a value is NULL: gaps, '
     'speed deviations and joint are those of finished trials (arXiv 2604.09609, sec. II-G).';
 COMMENT ON COLUMN trial_metrics.gap_m IS 'net gap, |s_left - s_right| less the vehicle length of '
-    'the trial''s spec, when the first vehicle reaches the merge point, interpolated linearly within '
-    'the step; finished trials';
-COMMENT ON COLUMN trial_metrics.gap_first_sample_m IS 'the same at the first sample at or after that instant';
-COMMENT ON COLUMN trial_metrics.gap_mean100_m IS 'the same at the first sample at which the mean '
+    'the trial''s spec, when the first vehicle reaches the merge point, interpolated linearly '
+    'within the step; finished trials';
+COMMENT ON COLUMN trial_metrics.gap_first_sample_m IS 'net gap at the first sample at or after '
+    'that instant';
+COMMENT ON COLUMN trial_metrics.gap_mean100_m IS 'net gap at the first sample at which the mean '
     'position has reached the merge point (Siebinga et al.; 100 m in the human experiment)';
 COMMENT ON COLUMN trial_metrics.rmse_left_mps IS 'RMSE of the left vehicle''s speed from its '
     'initial speed, from the start of control to the first sample after the first merge';
 COMMENT ON COLUMN trial_metrics.rmse_right_mps IS 'the same of the right vehicle';
-COMMENT ON COLUMN trial_metrics.rmse_mps IS 'the mean of both';
+COMMENT ON COLUMN trial_metrics.rmse_mps IS 'mean of both';
 COMMENT ON COLUMN trial_metrics.joint IS 'whether both are at least 0.5 m/s';
 COMMENT ON COLUMN trial_metrics.time_to_merge_s IS 'when the first vehicle reaches the merge point';
-COMMENT ON COLUMN trial_metrics.merge_interval_s IS 'between the two vehicles'' arrivals there';
-COMMENT ON COLUMN trial_metrics.post_encroachment_s IS 'from when the first vehicle''s rear has '
-    'left the merge point to when the second''s front is there';
-COMMENT ON COLUMN trial_metrics.min_ttc_s IS 'smallest time to collision once a vehicle is past the '
-    'merge point; NULL if they never close in faster than 0.01 m/s: no conflict';
+COMMENT ON COLUMN trial_metrics.merge_interval_s IS 'time between the two vehicles'' arrivals at '
+    'the merge point';
+COMMENT ON COLUMN trial_metrics.post_encroachment_s IS 'time from when the first vehicle''s rear '
+    'has left the merge point to when the second''s front is there';
+COMMENT ON COLUMN trial_metrics.min_ttc_s IS 'smallest time to collision once a vehicle is past '
+    'the merge point; NULL: they never close in faster than 0.01 m/s';
 COMMENT ON COLUMN trial_metrics.max_acceleration_mps2 IS 'largest absolute acceleration of either '
     'vehicle under the drivers'' control';
 COMMENT ON COLUMN trial_metrics.conflict_resolution_s IS 'when the vehicles are first off a '

@@ -1,4 +1,4 @@
-"""The page on imperfect perception: its study is played, and what it says of it holds."""
+"""The page on perception: its study is played, and what it says of it holds."""
 
 import re
 
@@ -9,7 +9,7 @@ from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from tests.support.harness import PROJECT
 
-PAGE = (PROJECT / "docs/how-to/imperfect-perception.md").read_text()
+PAGE = (PROJECT / "docs/perception.md").read_text()
 
 
 def test_every_key_is_explained_and_the_study_of_the_page_can_be_played(tmp_path):

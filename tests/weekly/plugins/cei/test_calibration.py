@@ -123,12 +123,13 @@ SHOWN = [(3, ["K0"]), (4, ["F1"]), (5, ["drag-free"]), (6, ["K0", "--tunnel"])]
 
 
 @pytest.mark.parametrize(("column", "command"), SHOWN)
-def test_the_docs_tell_what_the_driver_cei_comes_to(column, command):
+def test_the_readme_prints_the_results_of_the_driver_cei(column, command):
     program = [sys.executable, "-m", "merge_runner_cei.calibration", "check", *command]
     out = subprocess.check_output(program, cwd=PROJECT, env=environment(), text=True)
     # Each line ends with the mean, its spread, the tolerance and by how many of these it is off.
     found = [tuple(map(float, line.split()[-4:-2])) for line in out.splitlines()[1:]]
-    text = (PROJECT / "docs/reference/cei.md").read_text("utf-8").replace("\N{MINUS SIGN}", "-")
+    readme = PROJECT / "plugins/merge_runner_cei/README.md"
+    text = readme.read_text("utf-8").replace("\N{MINUS SIGN}", "-")
     rows = re.findall(r"^\| (?:collisions|time-outs|who|gap|largest|conflict|first).*", text, re.M)
     cells = [re.split(r"(?<!\\)\|", row)[column].replace("*", "") for row in rows]
     shown = [tuple(map(float, re.findall(r"-?\d+(?:\.\d+)?", cell))) for cell in cells]
