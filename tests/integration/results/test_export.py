@@ -99,6 +99,6 @@ def test_every_column_of_a_table_and_of_the_metrics_has_a_meaning_which_is_docum
     (metrics,) = [table for table in tables() if table.name == "trial_metrics"]
     for column in metrics.columns[2:]:
         assert f"| `{column.name}` | {column.comment.replace('|', chr(92) + '|')} |" in described
-    recording = (PROJECT / "docs/reference/recordings.md").read_text()
+    recording = (PROJECT / "docs/recordings.md").read_text()
     for name, kind in COLUMNS.items():
         assert f"| `{name}` | {kind} | " in recording
