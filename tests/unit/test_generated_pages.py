@@ -19,21 +19,50 @@ from tests.support.harness import PROJECT, asked_to_write
 from tests.unit.prompts.test_render import FIRST
 
 WIDTH = 90
+COMMANDS = """\
+# Commands
+
+Generated from the program's help. `make` wraps the commands used most and installs what they need;
+`ARGS="..."` passes options on. `merge-runner --install-completion` lets your shell complete
+commands and options. [Exit codes](reliability.md#exit-codes);
+[keys and base URLs](models.md#endpoints-and-keys).
+
+| target | does |
+|---|---|
+"""
+PROMPT_BLOCKS = """\
+# Prompt blocks
+
+Generated from `merge_runner/prompts/blocks.py`. A [study](run-a-study.md#prompts) names these
+blocks, and these fields in braces. Values are those of the left driver at the start of `L_4_-8`, in
+m, s and m/s unless the name or the value has another unit. Double a brace that is meant as one.
+`distance_to_merge` exists before the merge point only. Fields on the other car are `not seen` while
+it is out of sight.
+
+## Fields
+
+| field | value |
+|---|---|
+"""
+MODELS = (
+    "# Model list\n\nGenerated from `experiments/models.toml`. `merge-runner models` adds prices "
+    "and keys. RPM and TPM are requests and\ntokens a minute of a common paid tier.\n\n"
+    "| name | provider | format | id | parameters | rejects | output tokens | RPM | TPM | shutdown "
+    "| successor |\n" + "|---" * 11 + "|\n"
+)
 
 
 def _commands() -> Iterator[str]:
-    yield (
-        "# Commands\n\nGenerated from the program's help. `make` wraps the commands used most and "
-        "installs what they need;\n`ARGS=\"...\"` passes options on. "
-        "`merge-runner --install-completion` completes commands and options in your shell.\n"
-    )
+    yield COMMANDS
     targets = re.findall(r"^([a-z-]+):.*## (.*)", (PROJECT / "Makefile").read_text(), re.MULTILINE)
-    yield "\n| target | does |\n|---|---|\n"
     yield from (f"| `make {target}` | {does} |\n" for target, does in targets)
-    yield "\n[Exit codes](reliability.md#exit-codes), [keys and base URLs](models.md#endpoints-and-keys).\n"
     whole = typer.main.get_command(app)
-    names = {"help_option_names": ["-h", "--help"]}
-    root = typer.Context(whole, info_name="merge-runner", terminal_width=WIDTH, **names)
+    root = typer.Context(
+        whole,
+        info_name="merge-runner",
+        terminal_width=WIDTH,
+        help_option_names=["-h", "--help"],
+    )
     yield _help(root, "merge-runner")
     for name, command in whole.commands.items():
         of_command = typer.Context(command, info_name=name, parent=root)
@@ -51,23 +80,18 @@ def _help(ctx: typer.Context, title: str) -> str:
 def _prompt_blocks() -> Iterator[str]:
     now = Situation(FIRST, ScenarioConfig(), None, first=True)
     values = {name: field(now) for name, field in FIELDS.items()}
-    yield (
-        "# Prompt blocks\n\nGenerated from `merge_runner/prompts/blocks.py`. "
-        "A [study](run-a-study.md#prompts) names these blocks, and these fields in braces.\nThe "
-        "values are those of the left driver at the start of `L_4_-8`. Units are m, s and m/s, "
-        "unless the name or the value\nhas another. Double a brace that is meant as one. "
-        "`distance_to_merge` exists before the merge point only. Fields on the\nother car are "
-        "`not seen` while it is out of sight.\n\n## Fields\n\n| field | value |\n|---|---|\n"
-    )
+    yield PROMPT_BLOCKS
     yield from (f"| `{name}` | {value} |\n" for name, value in values.items())
     yield "\n## Variants\n\n| variant | without | title |\n|---|---|---|\n"
-    for name in ("baseline", *(f"A{i}" for i in range(1, 8))):
+    for name in ("baseline", *(f"A{number}" for number in range(1, 8))):
         variant = VARIANTS[name]
         removed = ", ".join(f"`{block}`" for block in sorted(variant.removes)) or "–"
         yield f"| `{name}` | {removed} | {variant.title} |\n"
-    for title, is_ready in (("The baseline", False), ("Ready blocks, in no prompt by default", True)):
+    ready = [name for name in BLOCKS if name.startswith("state.")]
+    paper = [name for name in BLOCKS if name not in ready]
+    for title, names in (("The baseline", paper), ("Ready blocks, in no prompt by default", ready)):
         yield f"\n## {title}\n"
-        for name in (each for each in BLOCKS if each.startswith("state.") is is_ready):
+        for name in names:
             block = BLOCKS[name]
             roads = {"before the merge point": block.merge, "after it": block.straight}
             if block.merge == block.straight:
@@ -79,21 +103,16 @@ def _prompt_blocks() -> Iterator[str]:
 
 
 def _model_list() -> Iterator[str]:
-    yield (
-        "# Model list\n\nGenerated from `experiments/models.toml`. `merge-runner models` adds prices "
-        "and keys. Limits are those of a common paid tier.\n\n"
-        "| name | provider | format | id | parameters | rejects | output tokens | requests a minute "
-        "| tokens a minute | shutdown | successor |\n" + "|---" * 11 + "|\n"
-    )
+    yield MODELS
     for name, entry in read_models(PROJECT / "experiments/models.toml").items():
-        plain = {key: value for key, value in entry.parameters.items() if key != "grammar"}
+        given = [
+            "a grammar" if key == "grammar" else f"{key} = {value}"
+            for key, value in entry.parameters.items()
+        ]
         cells = (
             *(f"`{each}`" for each in (name, entry.provider, entry.format, entry.id)),
-            ", ".join(f"{key} = {value}" for key, value in plain.items())
-            + (", a grammar" if len(plain) < len(entry.parameters) else ""),
-            ", ".join(entry.rejects),
-            *(entry.max_output_tokens, entry.rpm or "", entry.tpm or ""),
-            *(entry.shutdown or "", entry.successor),
+            *(", ".join(given), ", ".join(entry.rejects), entry.max_output_tokens),
+            *(entry.rpm or "", entry.tpm or "", entry.shutdown or "", entry.successor),
         )
         yield f"| {' | '.join(map(str, cells))} |\n"
 
@@ -102,7 +121,7 @@ PAGES = {"commands": _commands, "prompt-blocks": _prompt_blocks, "model-list": _
 
 
 @pytest.mark.parametrize("name", PAGES)
-def test_a_page_is_what_the_program_makes_of_it(name):
+def test_a_generated_page_is_what_the_program_says(name):
     assert (PROJECT / f"docs/{name}.md").read_text("utf-8") == "".join(PAGES[name]())
 
 

@@ -1,4 +1,4 @@
-"""A driver, a condition, a block and a metric that a study adds, two of them as docs/extend.md does."""
+"""A driver, a condition, a block and a metric that a study adds, as docs/extend.md says."""
 
 import json
 

@@ -17,7 +17,7 @@ EXAMPLES = dict(re.findall(r"^## ([^\n]*)\n+```toml\n(.*?)^```", PAGE, re.DOTALL
 
 
 def keys(model: type):
-    """The keys of a table of the file, and of those within it but what pages of their own explain."""
+    """The keys of a table and of those within it, but the scenario's and the perception's."""
     if is_dataclass(model):
         yield from (field.name for field in fields(model))
         return

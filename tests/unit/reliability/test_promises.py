@@ -16,7 +16,7 @@ PAGE = PROJECT / "docs/promises.md"
 HEAD = """\
 # Promises
 
-Generated from `tests/promises.toml`, which names the tests of each promise. `make test ARGS="-k NAME"` runs one.
+Generated from `tests/promises.toml`, which names the tests of each promise.
 [Reliability](reliability.md), [SECURITY.md](../SECURITY.md) and [cluster](cluster.md) explain them.
 """
 
