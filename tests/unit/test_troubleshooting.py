@@ -6,7 +6,7 @@ import re
 from tests.support.harness import PROJECT
 
 PAGE = (PROJECT / "docs/troubleshooting.md").read_text("utf-8")
-QUOTED = re.findall(r"^\| `(.+?)` \|", PAGE, re.MULTILINE)
+QUOTED = re.findall(r"^\| `+ ?(.+?) ?`+ \|", PAGE, re.MULTILINE)
 GAP = "…"
 
 
