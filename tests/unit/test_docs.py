@@ -24,6 +24,12 @@ def test_every_command_and_every_make_target_is_in_the_docs():
         assert f"make {target}" in text, target
 
 
+def test_every_page_is_in_the_index():
+    index = (DOCS / "README.md").read_text()
+    for page in {*DOCS.glob("*.md")} - {DOCS / "README.md"}:
+        assert f"({page.name})" in index, page.name
+
+
 def test_the_readings_of_the_docs_are_those_of_the_report():
     text = (PROJECT / "docs/explanation/reproduction.md").read_text(encoding="utf-8")
     shown = [line for line in text.splitlines() if line.startswith("| ")][1:]
