@@ -326,7 +326,7 @@ for _name, _provider in {
             | {"structured_outputs", "chat_template_kwargs", "mirostat_mode", "options"}
         ),
         model_env="LOCAL_MODEL",
-        if_nobody="start a server (docs/how-to/local-models.md)",
+        if_nobody="start a server (docs/models.md#local-models)",
     ),
     "emulator": Provider(
         "http://127.0.0.1/v1",

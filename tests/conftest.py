@@ -25,7 +25,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # The gate depends on neither luck nor load.
 settings.register_profile("gate", derandomize=True, deadline=None)
-# For an hour of one's own; docs/explanation/reliability.md has the command.
+# For an hour of one's own: `make test ARGS="-n0 ... --hypothesis-profile 100000"`.
 settings.register_profile("100000", max_examples=100_000, derandomize=False, deadline=None)
 settings.load_profile("gate")
 

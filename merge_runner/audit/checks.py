@@ -74,7 +74,7 @@ NEVER = datetime(1970, 1, 1)  # noqa: DTZ001 # as the database has all times
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that does not hold, and where; docs/reference/audit.md lists the kinds."""
+    """One thing that does not hold, and where; docs/recordings.md lists the kinds."""
 
     kind: str
     text: str

@@ -252,7 +252,7 @@ def may_be_charged(raw: RawReply, endpoint: str) -> bool:
 
 
 def judge(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
-    """Classify a reply by the rules of docs/reference/providers.md."""
+    """Classify a reply by the rules of docs/models.md."""
     if raw.status == 200 and not isinstance(raw.payload, dict):
         why = f"the body is not a JSON object: {raw.excerpt}"
         return AttemptOutcome("retry", "bad_body", why, raw=raw)

@@ -82,7 +82,7 @@ def shutdown_notes(entries: Mapping[str, ModelEntry], today: date) -> Iterator[s
         if days <= 0:
             said = f"WARNING: {name} closed on {entry.shutdown}: only a recording answers for it"
         elif days <= SOON_DAYS:
-            said = f"WARNING: {closes}: record it now (docs/how-to/record-before-shutdown.md)"
+            said = f"WARNING: {closes}: record it now (docs/recordings.md)"
         else:
             said = f"note: {closes}"
         yield said + (f"; its successor is {entry.successor}" if entry.successor else "")

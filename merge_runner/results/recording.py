@@ -68,7 +68,7 @@ COLUMNS = {
     "body": "VARCHAR",
     "attempts": "VARCHAR",
 }
-"""docs/reference/recordings.md says what they mean."""
+"""docs/recordings.md says what they mean."""
 SLOT = ("condition", "repetition", "side", "decision", "sample_set")
 # Far beyond any sweep; a file that claims more was made to do harm.
 MOST_CALLS = 10_000_000

@@ -46,7 +46,7 @@ from merge_runner.text_safety import one_line
 
 TOLERANCE = 1e-9
 """Numbers may differ by this much, as between the arithmetic of two machines."""
-# The columns that no replay gives; docs/reference/audit.md says why. A cache has those of
+# The columns that no replay gives; docs/recordings.md says why. A cache has those of
 # ``calls``, except ``cached``.
 NOT_REPLAYED = (
     "calls.cached",

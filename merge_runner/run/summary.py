@@ -198,7 +198,7 @@ def _faults(summary: dict[str, Any]) -> Iterator[str]:
         prompts = "; ".join(map(", ".join, same))
         yield (
             f"the same trials with these prompts: {prompts}. The emulator reads no words: plant an "
-            "effect to rehearse (docs/how-to/run-a-study.md#words-that-cross)"
+            "effect to rehearse (docs/run-a-study.md#text-factors)"
         )
     audit = summary["audit"]
     audit_it = command_at("merge-runner audit", "--db", summary["db"], DEFAULT_DB)

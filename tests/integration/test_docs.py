@@ -8,7 +8,7 @@ import pytest
 from tests.support import program
 from tests.support.harness import PROJECT, environment
 
-RECORD = (PROJECT / "docs/how-to/record-before-shutdown.md").read_text()
+RECORD = (PROJECT / "docs/recordings.md").read_text()
 BINARY = (".parquet", ".duckdb", ".png", ".gz")
 
 

@@ -4,8 +4,9 @@ import subprocess
 import sys
 
 from tests.support import program
-from tests.support.harness import PROGRAM, environment, how_to, plugin
+from tests.support.harness import PROGRAM, PROJECT, environment, plugin
 
+IMPULSIVE = (PROJECT / "tests/cases/parts/driver.py").read_text()
 LOOKS = """
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
@@ -45,7 +46,7 @@ def test_where_its_package_is_not_installed_a_driver_is_named_and_the_rest_is_ch
         'conditions = ["N_0_0"]\nrepetitions = 1\n[scenario]\nstep_s = 0.05\nplan_step_s = 0.2\n'
     )
     sweep = ("sweep", "fine.toml", "--model", "constant+impulsive")
-    env = environment(**plugin(tmp_path / "installed", how_to("add-a-driver")))
+    env = environment(**plugin(tmp_path / "installed", IMPULSIVE))
     assert program.run(sweep, cwd=tmp_path, env=env).code == 0
     audit = program.run(("audit",), cwd=tmp_path, env=environment())
     assert audit.code == 0

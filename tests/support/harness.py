@@ -43,10 +43,10 @@ class Run:
         return json.loads(self.out)
 
 
-def how_to(name: str) -> str:
-    """The code of a page of docs/how-to."""
-    page = (PROJECT / f"docs/how-to/{name}.md").read_text()
-    (code,) = re.findall(r"```python\n(.*?)```", page, re.S)
+def how_to(part: str) -> str:
+    """The code of a section of docs/extend.md."""
+    _, _, rest = (PROJECT / "docs/extend.md").read_text().partition(f"\n## {part}\n")
+    (code,) = re.findall(r"```python\n(.*?)```", rest.partition("\n## ")[0], re.S)
     return code
 
 

@@ -17,7 +17,7 @@ from tests.support.recordings import drive, write_folder
 DOCS = PROJECT / "docs"
 TUTORIAL = DOCS / "tutorial.md"
 # Its sweep would be the newest one of the pages that follow.
-LAST = DOCS / "how-to/local-models.md"
+LAST = DOCS / "models.md"
 # Pages of users, in the order in which their commands are run.
 PAGES = [PROJECT / "README.md", *sorted(PROJECT.glob("plugins/*/README.md"))]
 PAGES += [PROJECT / "benchmarks/README.md"]
@@ -114,7 +114,7 @@ async def test_every_command_of_the_docs_does_what_it_says(folder):
     assert len(done) >= 14
 
 
-RECORD = DOCS / "how-to/record-before-shutdown.md"
+RECORD = DOCS / "recordings.md"
 
 
 @pytest.mark.parametrize(

@@ -146,7 +146,7 @@ def test_a_configuration_that_cannot_be_read_is_a_finding(db, merged):
 
 
 def test_what_is_not_replayed_is_listed_in_the_docs_and_by_the_command(made, prepare):
-    page = (PROJECT / "docs/reference/audit.md").read_text()
+    page = (PROJECT / "docs/recordings.md").read_text()
     listed = prepare(made, "audit").out.splitlines()[-1]
     for name in NOT_REPLAYED:
         assert f"`{name}`" in page

@@ -1,18 +1,21 @@
-"""The code of the pages on adding a driver, a condition, a block and a metric, in one study."""
+"""A driver, a condition, a block and a metric that a study adds, as docs/extend.md says."""
 
 import json
-import re
 
 import pytest
 
 from merge_runner.results.store import query, results_digest
 from merge_runner.run.plan import make_plan
+from merge_runner.study.file import PLUGIN, TEMPLATE
 from tests.support.harness import FAST, PROJECT, how_to
 
-KINDS = ("driver", "condition", "prompt-block", "metric")
-(WILD,) = re.findall(
-    r"```toml\n(\[drivers.*?)```", (PROJECT / "docs/how-to/add-a-driver.md").read_text(), re.DOTALL
-)
+PARTS = PROJECT / "tests/cases/parts"
+CODE = {
+    "driver": (PARTS / "driver.py").read_text(),
+    "condition": how_to("Condition"),
+    "prompt_block": how_to("Prompt block"),
+    "metric": (PARTS / "metric.py").read_text(),
+}
 STUDY = f"""
 models = ["emulator+impulsive", "constant+hesitant", "wild", "projected-order"]
 conditions = ["far", "fast-tie", "N_0_0"]
@@ -21,8 +24,11 @@ repetitions = {{ baseline = 1, A8 = 1, A9 = 1 }}
 step_s = 0.05
 plan_step_s = 0.2
 [plugins]
-files = {[f"{kind}.py" for kind in KINDS]}
-{WILD}
+files = {[f"{kind}.py" for kind in CODE]}
+[drivers.wild]
+program = "impulsive"
+strength = 0.9
+clock = 1.0
 """
 WITH = ("--study", "study.toml", "--trust")
 WARNING = "Mind the speed of the other car: at "
@@ -37,8 +43,8 @@ AND variant = 'A8' AND model_left = 'emulator' GROUP BY trial_id, spec_hash)
 def write(folder, **changed):
     folder.mkdir(exist_ok=True)
     (folder / "study.toml").write_text(changed.get("study", STUDY))
-    for kind in KINDS:
-        (folder / f"{kind}.py").write_text(changed.get(kind, how_to(f"add-a-{kind}")))
+    for kind, code in CODE.items():
+        (folder / f"{kind}.py").write_text(changed.get(kind, code))
     return folder
 
 
@@ -139,7 +145,7 @@ def test_a_metric_is_in_the_tables_and_leads_to_its_trials(run, rows):
 def test_a_kept_table_is_of_the_metric_as_it_stands(run, folder):
     table = ("tables", "ablation-quantitative")
     assert HEADING in run(*table, *WITH).out
-    write(folder, metric=how_to("add-a-metric").replace('label="mean |a|"', 'label="average |a|"'))
+    write(folder, metric=CODE["metric"].replace('label="mean |a|"', 'label="average |a|"'))
     assert "average |a| (m/s²)" in run(*table, *WITH).out
     write(folder)
     assert "|a|" not in run(*table).out
@@ -164,14 +170,13 @@ REFUSED = {
     ),
     "a condition beyond": (
         {
-            "condition": how_to("add-a-condition")
-            + "CONDITIONS.register('beyond', Condition(60.0, 0.0))",
+            "condition": CODE["condition"] + "CONDITIONS.register('beyond', Condition(60.0, 0.0))",
             "study": STUDY.replace('"far"', '"beyond"'),
         },
         "at the merge point",
     ),
     "a block without a place": (
-        {"prompt-block": MISPLACED},
+        {"prompt_block": MISPLACED},
         "unknown place of the prompt block C6, before 'C9",
     ),
 }
@@ -188,9 +193,17 @@ def test_a_part_that_cannot_be_is_refused_in_one_line_before_any_call(
 
 
 def test_a_mistake_in_the_sql_of_a_metric_is_told_in_one_line(prepare, folder):
-    wrong = how_to("add-a-metric").replace("avg(abs(acceleration_mps2))", "avg(nothing)")
+    wrong = CODE["metric"].replace("avg(abs(acceleration_mps2))", "avg(nothing)")
     write(folder, metric=wrong)
     done = prepare(folder, "tables", "gap", *WITH)
     write(folder)
     assert (done.code, done.err.count("\n")) == (2, 1)
     assert done.err.startswith(f"error: the SQL of the metric {NAME} fails: ")
+
+
+@pytest.mark.parametrize("part", ["Driver", "Metric"])
+def test_the_page_shows_the_driver_and_the_metric_that_init_writes(part):
+    written = (TEMPLATE / PLUGIN).read_text()
+    for paragraph in how_to(part).split("\n\n\n"):
+        for lines in paragraph.splitlines() if "import " in paragraph else [paragraph.strip()]:
+            assert lines in written

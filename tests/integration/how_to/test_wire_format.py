@@ -1,4 +1,4 @@
-"""A wire format that a study adds, and a provider with it, as docs/how-to says."""
+"""A wire format that a study adds, and a provider with it, as docs/extend.md says."""
 
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
@@ -68,7 +68,7 @@ async def listening(talker):
 def folder(tmp_path):
     (tmp_path / "models.toml").write_text(MODELS)
     (tmp_path / "study.toml").write_text(STUDY)
-    (tmp_path / "say.py").write_text(how_to("add-a-wire-format"))
+    (tmp_path / "say.py").write_text(how_to("Wire format"))
     return tmp_path
 
 

@@ -94,6 +94,6 @@ def test_every_column_has_a_meaning_and_those_of_a_recording_are_documented():
     for table in tables():
         assert table.comment, table.name
         assert [column.name for column in table.columns if not column.comment] == []
-    recording = (PROJECT / "docs/reference/recordings.md").read_text()
+    recording = (PROJECT / "docs/recordings.md").read_text()
     for name, kind in COLUMNS.items():
         assert f"| `{name}` | {kind} | " in recording

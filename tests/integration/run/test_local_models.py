@@ -81,7 +81,7 @@ async def test_a_server_s_one_model_is_asked_of_several_one_must_be_chosen_and_a
 
 async def test_where_nobody_answers_the_run_ends_within_seconds_with_what_to_start(merge_runner):
     for url, said in (
-        (DEAD, f"nothing listens at {DEAD}: start a server (docs/how-to/local-models.md)"),
+        (DEAD, f"nothing listens at {DEAD}: start a server (docs/models.md#local-models)"),
         ("http://gpu.invalid:8000/v1", "http://gpu.invalid:8000/v1 cannot be reached ("),
     ):
         run = await merge_runner(*LOCAL, LOCAL_BASE_URL=url)

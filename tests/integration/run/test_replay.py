@@ -100,7 +100,7 @@ async def test_the_recordings_of_a_real_small_model_replay_to_what_their_page_sa
     trials, decisions = run.summary["trials"], run.summary["decisions"]
     figures = (trials["planned"], trials["collided"], decisions, run.summary["invalid_decisions"])
     row = " | ".join([f"| `{model}`", *map(str, figures)])
-    assert f"{row} |" in (PROJECT / "docs/reference/smollm2.md").read_text()
+    assert f"{row} |" in (PROJECT / "docs/models.md").read_text()
     assert (await merge_runner("digest")).out == GOLDEN[model]
 
 

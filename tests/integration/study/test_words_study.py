@@ -8,9 +8,9 @@ import pytest
 from merge_runner.results.store import query, results_digest
 from tests.support.harness import FAST, PROJECT
 
-PAGE = (PROJECT / "docs/how-to/run-a-study.md").read_text("utf-8")
+PAGE = (PROJECT / "docs/run-a-study.md").read_text("utf-8")
 # The study that the page about them shows, in one condition.
-EXAMPLE = re.search(r"## Words that cross\n+```toml\n(.*?)```", PAGE, re.DOTALL)[1]
+EXAMPLE = re.search(r"## Text factors\n+```toml\n(.*?)```", PAGE, re.DOTALL)[1]
 PLANTED = EXAMPLE.replace("repetitions = 10", 'repetitions = 20\nconditions = ["N_0_0"]')
 STUDY = PLANTED.replace("emulator = { own_first = 1.5 }\n", "")
 FIRST = """
@@ -107,7 +107,7 @@ async def test_a_run_says_where_several_prompts_gave_the_same_trials(merge_runne
     assert (
         "the same trials with these prompts: baseline, hurry=yes, persona=taxi, persona=taxi "
         "hurry=yes. The emulator reads no words: plant an effect to rehearse "
-        "(docs/how-to/run-a-study.md#words-that-cross)"
+        "(docs/run-a-study.md#text-factors)"
     ) in told.err + told.out
     text = text + "emulator = { own_first = 6 }\n"
     (tmp_path / "words.toml").write_text(text)

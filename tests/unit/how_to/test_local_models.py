@@ -1,4 +1,4 @@
-"""The entries of docs/how-to/local-models.md: what they send, and how such replies are read."""
+"""The entries of docs/models.md for local servers: what they send."""
 
 import re
 import tomllib
@@ -7,27 +7,29 @@ from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.models import read_models
 from tests.support.harness import PROJECT
 
-PAGE = (PROJECT / "docs/how-to/local-models.md").read_text()
+PAGE = (PROJECT / "docs/models.md").read_text()
 BLOCKS = re.findall(r"```toml\n(.*?)\n```\n", PAGE, re.S)
 ENTRIES = {name: entry for block in BLOCKS for name, entry in tomllib.loads(block).items()}
 GRAMMAR = tomllib.loads((PROJECT / "experiments/models.toml").read_text())["smollm2"]["parameters"][
     "grammar"
 ]
-PATTERN = ENTRIES["held-by-json"]["parameters"]["response_format"]["schema"]["pattern"]
+PATTERN = ENTRIES["held-by-schema"]["parameters"]["response_format"]["json_schema"]["schema"][
+    "pattern"
+]
 SCHEMA = {"type": "string", "pattern": PATTERN}
 
 
 SENT = {
     "qwen3": {"model": "qwen3:8b", "max_tokens": 4000, "temperature": 1.0},
     "held-by-grammar": {"grammar": GRAMMAR},
-    "held-by-vllm": {"structured_outputs": {"grammar": GRAMMAR}},
     "held-by-schema": {
         "response_format": {
             "type": "json_schema",
             "json_schema": {"name": "reply", "schema": SCHEMA},
         }
     },
-    "held-by-json": {"response_format": {"type": "json_object", "schema": SCHEMA}},
+    "my-model": {"model": "qwen3-32b", "temperature": 0.7, "top_p": 0.95},
+    "my-azure-o3": {"model": "my-deployment", "max_completion_tokens": 16000},
 }
 
 

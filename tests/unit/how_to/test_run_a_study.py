@@ -6,27 +6,25 @@ from dataclasses import fields, is_dataclass
 
 import pytest
 
-from merge_runner.config import ScenarioConfig, model_in
-from merge_runner.prompts.blocks import BLOCKS, FIELDS, VARIANTS, Variant, prompt_of, render_prompt
+from merge_runner.config import Perception, ScenarioConfig, model_in
 from merge_runner.run.plan import Options, make_plan
 from merge_runner.run.sweep import unsent
 from merge_runner.study.file import StudyFile
 from tests.support.harness import PROJECT
-from tests.unit.prompts.test_render import FIRST
 
-PAGE = (PROJECT / "docs/how-to/run-a-study.md").read_text()
+PAGE = (PROJECT / "docs/run-a-study.md").read_text()
 EXAMPLES = dict(re.findall(r"^## ([^\n]*)\n+```toml\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE))
 
 
 def keys(model: type):
-    """The keys of a table of the file, and of those within it but the scenario's."""
+    """The keys of a table and of those within it, but the scenario's and the perception's."""
     if is_dataclass(model):
         yield from (field.name for field in fields(model))
         return
     yield from model.model_fields
     for field in model.model_fields.values():
         inner = model_in(field.annotation)
-        if inner is not None and inner is not ScenarioConfig:
+        if inner not in {None, Perception, ScenarioConfig}:
             yield from keys(inner)
 
 
@@ -39,14 +37,10 @@ def plan_of(folder, example, **asked):
 @pytest.mark.parametrize(
     ("example", "arms"),
     [
-        ("Who, how often, where", 2),
-        ("What varies", 12 + 6 + 4 + 2),  # those against projected-order both ways round
-        ("Prompts", 5),
-        ("Words that cross", 1 + 3 * 2 + 4 * 2),
-        ("The driving task", 1),
-        ("What a driver perceives", 2),
-        ("Drivers", 3),
-        ("Money and plug-ins", 2),
+        ("The file", 3),
+        ("What varies", 8 + 8 + 4 + 4),  # those against projected-order both ways round
+        ("Prompts", 4),
+        ("Text factors", 1 + 3 * 2 + 4 * 2),
     ],
 )
 def test_every_example_can_be_played(example, arms, tmp_path):
@@ -71,7 +65,7 @@ async def test_the_study_of_the_readme_fits_its_cap_with_models_that_answer_in_2
 
 
 def test_every_key_is_explained_and_shown_in_an_example():
-    assert len(EXAMPLES) == PAGE.count("```toml\n") == 8
+    assert len(EXAMPLES) == PAGE.count("```toml\n") == 4
     explained = re.sub(r"```.*?```", "", PAGE, flags=re.DOTALL)
     shown = "\n".join(EXAMPLES.values())
     for key in keys(StudyFile):
@@ -80,21 +74,6 @@ def test_every_key_is_explained_and_shown_in_an_example():
         assert re.search(rf"\b{key}\b", shown) or key == "text", key
     for text in EXAMPLES.values():
         StudyFile.model_validate(tomllib.loads(text))
-
-
-def test_all_fields_and_blocks_of_a_prompt_are_named():
-    (fields,) = re.findall(r"<!-- fields -->(.*?)<!-- end -->", PAGE, re.DOTALL)
-    assert re.findall(r"`(\w+)`", fields) == [*FIELDS]
-    for block in BLOCKS:
-        assert f"`{block}`" in PAGE
-
-
-@pytest.mark.parametrize("name", [name for name in BLOCKS if name.startswith("state.")][:-1])
-def test_what_a_ready_block_says_is_shown(name, own_parts):
-    VARIANTS.register(f"with_{name}", Variant(adds=frozenset({name})))
-    prompt = render_prompt(FIRST, None, prompt=prompt_of(f"with_{name}"), scenario=ScenarioConfig())
-    said = prompt.split("\n\n")[2]
-    assert f"| `{name}` | {' '.join(said.splitlines())} |" in PAGE
 
 
 def test_combinations_that_skip_names_are_left_out(tmp_path):

@@ -1,6 +1,6 @@
-"""Each promise in promises.toml is a row of its page, and its tests are there.
+"""Each promise in promises.toml is a row of docs/promises.md, and its tests are there.
 
-``python -m tests.unit.reliability.test_promises --write`` writes the rows of the pages.
+``python -m tests.unit.reliability.test_promises --write`` writes the page.
 """
 
 import re
@@ -10,11 +10,15 @@ from collections import Counter
 
 from tests.support.harness import PROJECT, asked_to_write
 
-PROMISES = tomllib.loads((PROJECT / "tests/promises.toml").read_text())["promise"]
-PAGES = [PROJECT / "SECURITY.md", *sorted((PROJECT / "docs/explanation").glob("*.md"))]
-TABLE = re.compile(
-    r"(?P<head><!-- (?P<name>\w+): from tests/promises.toml -->\n\n\|.*\n\|.*\n)(?:\|.*\n)*"
-)
+FILE = tomllib.loads((PROJECT / "tests/promises.toml").read_text())
+PROMISES, TABLES = FILE["promise"], FILE["table"]
+PAGE = PROJECT / "docs/promises.md"
+HEAD = """\
+# Promises
+
+Generated from `tests/promises.toml`, which names the tests of each promise.
+[Reliability](reliability.md), [SECURITY.md](../SECURITY.md) and [cluster](cluster.md) explain them.
+"""
 
 
 def test_every_promise_has_its_tests():
@@ -27,29 +31,29 @@ def test_every_promise_has_its_tests():
     named = {name for promise in PROMISES for name in promise["tests"]}
     assert {name for name in named if defined[name] != 1} == set()
     assert len({promise["id"] for promise in PROMISES}) == len(PROMISES)
+    assert {promise["table"] for promise in PROMISES} == TABLES.keys()
 
 
-def test_the_pages_have_the_rows_of_the_promises_and_no_others():
-    texts = [page.read_text() for page in PAGES]
-    assert [_with_rows(text) for text in texts] == texts
-    tables = [match["name"] for text in texts for match in TABLE.finditer(text)]
-    assert sorted(tables) == sorted({promise["table"] for promise in PROMISES})
+def test_the_page_has_the_rows_of_the_promises_and_no_others():
+    assert PAGE.read_text() == _page()
+    for name, table in TABLES.items():
+        for promise in PROMISES:
+            if promise["table"] == name:
+                assert promise["row"].count(" | ") == len(table["columns"]) - 1, promise["id"]
 
 
-def _with_rows(page: str) -> str:
-    """A page whose tables of promises are written anew."""
-
-    def table(match: re.Match[str]) -> str:
-        rows = (promise["row"] for promise in PROMISES if promise["table"] == match["name"])
-        return match["head"] + "".join(f"| {row} |\n" for row in rows)
-
-    return TABLE.sub(table, page)
+def _page() -> str:
+    parts = [HEAD]
+    for name, table in TABLES.items():
+        columns = table["columns"]
+        parts += [f"\n## {table['title']}\n\n| {' | '.join(columns)} |\n{'|---' * len(columns)}|\n"]
+        parts += [f"| {each['row']} |\n" for each in PROMISES if each["table"] == name]
+    return "".join(parts)
 
 
 def main(*arguments: str) -> None:
-    asked_to_write(arguments, "the rows of SECURITY.md and docs/explanation anew")
-    for page in PAGES:
-        page.write_text(_with_rows(page.read_text()))
+    asked_to_write(arguments, "docs/promises.md anew")
+    PAGE.write_text(_page())
 
 
 if __name__ == "__main__":

@@ -64,7 +64,7 @@ def test_the_example_of_two_models_has_the_numbers_of_its_test():
         "p_corrected": corrected([found.p, *[1.0] * 6])[0],
     }
     claim, _ = wording.apart("o3", "gpt-6-sol", {"collided_percent": values})
-    assert claim in (PROJECT / "docs/how-to/compare-two-models.md").read_text()
+    assert claim in (PROJECT / "docs/run-a-study.md").read_text()
 
 
 def difference_at(cells, apart):
