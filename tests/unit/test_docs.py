@@ -10,7 +10,14 @@ from merge_runner_analysis.published import published
 from tests.support.harness import PROJECT
 
 DOCS = PROJECT / "docs"
+PAGES_OF_THE_PROGRAM = ("commands", "model-list", "promises", "prompt-blocks", "tables")
 PAGES = [PROJECT / "README.md", *PROJECT.glob("plugins/*/README.md"), *DOCS.rglob("*.md")]
+GENERATED = {DOCS / f"{name}.md" for name in PAGES_OF_THE_PROGRAM}
+WRITTEN = [PROJECT / "README.md", *sorted({*DOCS.glob("*.md")} - GENERATED)]
+# Words of a dialect that a reader would have to learn.
+REFUSED = re.compile(
+    r"\b(told|singly|set aside|(is|are) due|becomes? of|comes? to|stands? beside|heeds?|dearest)\b"
+)
 LINKING = [*PAGES, *PROJECT.glob("*.md"), *PROJECT.glob("*/README.md")]
 
 
@@ -22,6 +29,26 @@ def test_every_command_and_every_make_target_is_in_the_docs():
     targets = re.findall(r"^([a-z]+):.*## ", (PROJECT / "Makefile").read_text(), re.MULTILINE)
     for target in targets:
         assert f"make {target}" in text, target
+
+
+def test_what_a_person_reads_is_short_and_in_plain_words():
+    words = {page.name: len(page.read_text().split()) for page in WRITTEN}
+    assert sum(words.values()) <= 20_000, words
+    assert len(words) <= 22
+    assert len((PROJECT / "README.md").read_text().split()) <= 900
+    for page in WRITTEN:
+        assert not REFUSED.search(page.read_text()), (page.name, REFUSED.search(page.read_text()))
+
+
+def test_sentences_of_the_docs_are_short():
+    lengths = []
+    for page in WRITTEN:
+        text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+        prose = [line for line in text.splitlines() if line[:1] not in {"|", "#", "!"}]
+        sentences = re.split(r"(?<=[.!?:;])\s+|\n\n|\n *- ", "\n".join(prose))
+        lengths += [len(sentence.split()) for sentence in sentences if sentence.strip()]
+    assert sum(lengths) / len(lengths) <= 14
+    assert sum(length > 25 for length in lengths) <= 3  # formulas and code
 
 
 def test_every_page_is_in_the_index():
