@@ -316,7 +316,7 @@ def sentence(verdicts: Mapping[str, Values]) -> str:
     unclear = [
         MEASURES[name].label
         for name in ("headway", "velocity", "collisions", "gap")
-        if verdicts[name].get("state") == OPEN
+        if shown_state(verdicts[name]) == OPEN
     ]
     if unclear:
         parts.append(f"cannot tell yet: {'; '.join(unclear)}")
@@ -326,7 +326,7 @@ def sentence(verdicts: Mapping[str, Values]) -> str:
 
 def _part(values: Values) -> str:
     """What the state of a measure says; empty where it says nothing."""
-    says = MEASURES[str(values["measure"])].says.get(str(values.get("state")), "")
+    says = MEASURES[str(values["measure"])].says.get(shown_state(values), "")
     of, humans = (number(values.get(name)) for name in ("estimate", "human"))
     counted, people = values.get("counted"), values.get("human_counted")
     says = says.format(of=of, humans=humans, more=_more(values))
@@ -354,11 +354,9 @@ def crashes(values: Values) -> str:
         return ""
     seen = values.get("counted") or f"{k} of {ended}"
     text = f"crashed in {seen} trials"
-    if undecided or seen != f"{k} of {ended}":
+    if undecided:
         rule = values.get("counted_by") or PLAYED_RULES["shared_lane"]
-        finer = "looked for at 20 Hz" if rule == PLAYED_RULES["rectangle"] else "by people's rule"
-        text += f" by {rule}; {finer} {k} are certain"
-        text += f", {undecided} cannot be told" if undecided else ""
+        text += f" by {rule}; by people's rule {k} are certain, {undecided} cannot be told"
     people = values.get("human_counted")
     if differs(values):
         than = f" ({people})" if people else ""
@@ -419,6 +417,12 @@ def share(collisions: Values) -> str:
     k, undecided = collisions.get("k") or 0, collisions.get("undecided") or 0
     least = number(_percent(collisions, k))
     return f"{least} to {number(_percent(collisions, k + undecided))}" if undecided else least
+
+
+def shown_state(values: Values) -> str:
+    """A state as sentences and marks show it: of fewer than ENOUGH trials it cannot be told."""
+    state = str(values.get("state") or "")
+    return OPEN if state and (values.get("n") or 0) < ENOUGH else state
 
 
 def differs(values: Values) -> bool:
@@ -591,14 +595,14 @@ def equal_p(p: float) -> str:
 
 def verdict_word(values: Values) -> str:
     """A state in words, as it stands in a list of verdicts."""
-    state, name = values.get("state"), str(values["measure"])
+    state, name = shown_state(values), str(values["measure"])
     if not state:
         return "not judged"
     if name in {"collisions", "gap"} and state != OPEN:
         more = _more(values)
         return f"{'fewer' if (more, name) == ('less', 'collisions') else more} than people"
     words = {SHOWN: "as in people", UNLIKE: "unlike people", OPEN: "cannot tell yet"}
-    return words.get(str(state), str(state))
+    return words.get(state, state)
 
 
 def joined(items: Sequence[str]) -> str:

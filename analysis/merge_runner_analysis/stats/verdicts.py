@@ -184,8 +184,7 @@ def of_humans(study: Study) -> dict[str, Estimate]:
 def counted(both: Both) -> dict[str, Counted]:
     """What a person counts, by measure; nothing is counted where no trial could go so.
 
-    Crashes by the rule that was played, the humans' by theirs. Who goes first: the one ahead, and
-    where neither is, the slower one.
+    Who goes first: the one ahead, and where neither is, the slower one.
     """
     played = both.human.outcomes["condition"].isin(both.group.ended["condition"])
     humans = both.human.outcomes[played]
@@ -204,11 +203,12 @@ def counted(both: Both) -> dict[str, Counted]:
 def went_so(group: Group, measure: str) -> pd.Series:
     """Whether each trial of a driver that could go as a measure counts it did, by its index.
 
-    Only those in conditions of humans count.
+    Only those in conditions of humans count. Collisions are those by the humans' rule, or by the
+    rule that was played where that of the humans does not decide all trials.
     """
     alike = in_human_conditions(group)
     if measure == "collisions":
-        return values(alike, COLLISIONS).astype(bool)
+        return values(alike, COLLISIONS if undecided(alike, BOXES) else BOXES).astype(bool)
     return _went_first(alike.trials, measure)
 
 

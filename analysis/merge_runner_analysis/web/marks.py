@@ -19,6 +19,7 @@ from merge_runner_analysis.wording import (
     brackets,
     number,
     share,
+    shown_state,
     verdict_word,
     with_interval,
 )
@@ -62,7 +63,7 @@ def mark(measure: Measure, values: Values) -> Mark | None:
     ends = None if ci is None else (place(measure, ci[0]), place(measure, ci[1]))
     if value is None:
         return None if ends is None else Mark("", None, ends)
-    shape = SHAPES.get(values.get("state") or "", "plain")
+    shape = SHAPES.get(shown_state(values), "plain")
     arrow = "beyond" if value > high else "below" if value < low else ""
     return Mark(shape, place(measure, value), ends, arrow)
 

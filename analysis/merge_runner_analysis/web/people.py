@@ -20,6 +20,7 @@ from merge_runner_analysis.wording import (
     Values,
     brackets,
     number,
+    shown_state,
 )
 
 HEADINGS = {
@@ -81,12 +82,12 @@ def _mark(name: str, values: Values) -> tuple[str, str]:
 
     The interval of a difference has the level that the verdict rests on, of 95 % or more.
     """
-    state, ci = values.get("state"), values.get("difference_ci")
+    state, ci = shown_state(values), values.get("difference_ci")
     if name not in MARGINS:
-        return STATES.get(str(state), (CANNOT_TELL, "cannot tell yet"))
+        return STATES.get(state, (CANNOT_TELL, "cannot tell yet"))
     if ci is not None and max(-ci[0], ci[1]) <= MARGINS[name]:
         return LIKE, "like people"
-    if state in (None, OPEN):
+    if state in ("", OPEN):
         return CANNOT_TELL, "cannot tell yet"
     mark = MORE if values["difference"] > 0 else LESS
     return mark, WORDS[name][mark]

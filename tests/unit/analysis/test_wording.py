@@ -17,6 +17,7 @@ from merge_runner_analysis.wording import (
     headline,
     sentence,
     told,
+    verdict_word,
 )
 
 PEOPLE = {"headway": "675 of 704", "velocity": "158 of 173", "collisions": "28 of 990"}
@@ -131,12 +132,20 @@ def test_who_collides_has_an_outcome_too(of):
     assert claim.startswith("gpt does not drive like people: it crashed in")
 
 
-def test_crashes_by_one_rule_looked_for_at_each_step_and_more_often():
-    of = row("collisions", "inconclusive", n=10, k=2, counted="1 of 10", human_counted="5 of 90")
-    assert crashes(of | {"counted_by": PLAYED_RULES["rectangle"]}) == (
-        "crashed in 1 of 10 trials by people's rule, looked for at each step; looked for at 20 Hz "
-        "2 are certain; people in 5 of 90"
+def test_crashes_that_another_rule_decides_are_said_by_both():
+    of = row("collisions", "inconclusive", n=10, k=2, counted="2 of 10", human_counted="5 of 90")
+    assert crashes(of) == "crashed in 2 of 10 trials; people in 5 of 90"
+    cut_off = of | {"undecided": 4, "counted": "6 of 14", "counted_by": PLAYED_RULES["euclid2d"]}
+    assert crashes(cut_off) == (
+        "crashed in 6 of 14 trials by the paper's rule; by people's rule 2 are certain, 4 cannot "
+        "be told; people in 5 of 90"
     )
+
+
+@pytest.mark.parametrize(("n", "says"), [(19, "cannot tell yet"), (20, "unlike people")])
+def test_no_verdict_is_shown_of_too_few_trials(n, says):
+    of = row("headway", "unlike", n=n)
+    assert verdict_word(of) == says
 
 
 def test_several_drivers_are_told_together():

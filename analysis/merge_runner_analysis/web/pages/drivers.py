@@ -26,7 +26,7 @@ from merge_runner_analysis.web.judged import (
 from merge_runner_analysis.web.marks import rate
 from merge_runner_analysis.web.scope import Scope, scope_of, unmarked
 from merge_runner_analysis.web.site import NotThere, Site
-from merge_runner_analysis.wording import DIFFERS, OPEN, SHOWN, UNLIKE
+from merge_runner_analysis.wording import DIFFERS, OPEN, SHOWN, UNLIKE, shown_state
 
 # How attempts of a driver's trials with a prompt ended, and which model answered.
 ATTEMPTS = """
@@ -127,7 +127,9 @@ def _apart(site: Site, own: Driver, other: Driver, scope: Scope) -> tuple[Job, C
 
 def _summary(own: Driver) -> str:
     """How many of the humans' traits are shown, and how many measures are open."""
-    states = {name: state for name, cell in own.cells.items() if (state := cell.values["state"])}
+    states = {
+        name: state for name, cell in own.cells.items() if (state := shown_state(cell.values))
+    }
     traits = [states[name] for name in states if name not in {"collisions", "gap"}]
     shown = sum(state in {SHOWN, *DIFFERS} - {UNLIKE} for state in traits)
     return (
