@@ -51,20 +51,20 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         for one in shown
         if one.kind == LANGUAGE_MODEL and one.cells
     }
+    kinds = by_kind(shown)
     conditions = by_condition(site, scope, shown)
     return site.render(
         "home.html",
         here="index",
         **values,
-        # A study of factors says in counts how like people its drivers are.
-        likeness=[(one, likeness_of(one)) for one in shown] if site.catalogue.factors() else [],
+        likeness=[(one, likeness_of(one)) for of_kind in kinds.values() for one in of_kind],
         likeness_headings=HEADINGS,
         people=people_of(conditions, values["human"]),
         part=scope.part,
         standing=standing,
         seen=seen,
         descriptions=descriptions_of(site),
-        kinds=by_kind(shown),
+        kinds=kinds,
         headline=headline(models, [one.kind for one in shown]),
         question=question,
         asking=asking,
