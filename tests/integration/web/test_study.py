@@ -77,16 +77,16 @@ def agree(html: str, values: list[float]) -> bool:
 
 
 def test_the_study_says_and_shows_what_the_table_of_verdicts_has(client, verdicts):
-    text = unescape(client.get("/").text)
-    page, own = Page(text), verdicts["o3/baseline"]
-    for said in (
-        " ".join(headline({"o3": own, "o4": verdicts["o4/baseline"]})),
-        sentence(own),
-        "With other prompts: A1 (-History).",
-    ):
-        assert said in page.text
-    assert sentence(verdicts["o3/A1"]) not in page.text
-    told = dict(re.findall(r'href="/drivers/o3\?[^"#]*#([\w-]+)"\s+title="([^"]+)"', text))
+    own = verdicts["o3/baseline"]
+    first = Page(unescape(client.get("/").text))
+    assert " ".join(headline({"o3": own, "o4": verdicts["o4/baseline"]})) in first.text
+    assert "With other prompts: A1 (-History)." in first.text
+    text = unescape(client.get("/drivers").text)
+    page = Page(text)
+    assert sentence(own) in page.text
+    told = dict(
+        re.findall(r'href="/drivers/o3\?variant=baseline#([\w-]+)"\s+title="([^"]+)"', text)
+    )
     judged = {name: values for name, values in own.items() if values["estimate"] is not None}
     assert len(judged) >= 3
     for name, values in judged.items():
@@ -198,7 +198,8 @@ def test_a_driver_that_is_not_judged_has_no_verdict_and_missing_decisions_are_co
     why = "Not judged: 46 of the 92 decisions of bad are invalid (50.0 %, more than 20 %)."
     assert why in page.text
     assert "Not judged" in client.get("/drivers/bad").text
-    judged = {to.partition("?")[0] for to, _ in page.to("/drivers/") if "#" in to}
+    drivers = Page(client.get("/drivers").text).to("/drivers/")
+    judged = {to.partition("?")[0] for to, _ in drivers if "#" in to}
     assert judged == {"/drivers/o3"}
     ((link, count),) = [one for one in page.to("/trials?") if "missing" in one[0]]
     assert (count, listed(client.get(link).text)) == ("6", 3)

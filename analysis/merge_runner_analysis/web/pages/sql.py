@@ -29,7 +29,7 @@ SCOPED = {
     "variant": "variant in ({})",
     "condition": "condition in ({})",
 }
-# Queries to begin with: those of the README.
+# Queries to begin with.
 EXAMPLES = {
     "Who merged first, and how often did they collide?": """\
 select model_left, variant, condition, count(*) as trials,
