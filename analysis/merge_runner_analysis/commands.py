@@ -9,8 +9,8 @@ import json
 import re
 import sys
 import threading
-from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -170,7 +170,7 @@ def explain(
 ) -> None:
     """Explain a row of a table: its query and its trials.
 
-    Example: merge-runner explain indicators emulator/baseline:collided_percent
+    Example: merge-runner explain ablation-quantitative emulator/baseline:collided_percent
     """
     study = _study(db, _selection(where=where, file=study_file, by=by, run=run), trust=trust)
     from merge_runner_analysis.explain import explain as explain_cell
@@ -266,8 +266,9 @@ def figures(
     study = _study(db, _selection(models, where, study_file, run=run), trust=trust)
     from merge_runner_analysis.figures.gallery import write_figures
 
-    _say_what_is_computed(study, "figures")
-    deque(write_figures(study, out), maxlen=0)
+    with _while_computed(study, "figures") as say_now:
+        for path in write_figures(study, out):
+            say_now(f"wrote {path}")
     print_out(f"wrote the figures into {out}")
 
 
@@ -312,17 +313,27 @@ def report(
     study = _study(db, _selection(models, where, study_file, run=run), trust=trust)
     from merge_runner_analysis.web.report import write_report
 
-    _say_what_is_computed(study, "tables and figures")
-    deque(write_report(study, out, files), maxlen=0)
+    with _while_computed(study, "tables and figures") as say_now:
+        for path in write_report(study, out, files, say_now):
+            say_now(f"wrote {path}")
     also = "" if files is None else f", and its tables and figures into {files}"
     print_out(f"wrote {out}{also}")
 
 
-def _say_what_is_computed(study: Study, what: str) -> None:
-    """Say why nothing is seen for a while."""
+@contextmanager
+def _while_computed(study: Study, what: str) -> Iterator[Callable[[str], None]]:
+    """Say what takes a while; a terminal also shows in a line what is done just now."""
     say(
         f"computing the {what} of {len(study.frames.trials)} trials; a thousand take about a minute"
     )
+    if not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    from rich.console import Console
+    from rich.markup import escape
+
+    with Console(stderr=True).status(what) as status:
+        yield lambda text: status.update(escape(text))
 
 
 def open_browser(address: str) -> bool:

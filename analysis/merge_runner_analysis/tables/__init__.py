@@ -123,8 +123,10 @@ def finished_tables(
     return [found[name] for name in wanted]
 
 
-def table(study: Study | Path | str, name: str) -> pd.DataFrame:
-    """A table of a study, or of a database, as a data frame at full precision.
+def table(
+    study: Study | Path | str, name: str, selection: Selection | None = None
+) -> pd.DataFrame:
+    """A table of a study, or of a ``selection`` of a database, as a data frame at full precision.
 
     It has the rows of the table's CSV, and what the study adds that this process has planned into
     the database. Raises UsageError.
@@ -134,7 +136,7 @@ def table(study: Study | Path | str, name: str) -> pd.DataFrame:
     from merge_runner_analysis.study import Study
 
     with using(in_use_for(study.db if isinstance(study, Study) else Path(study))):
-        read = study if isinstance(study, Study) else Study(study)
+        read = study if isinstance(study, Study) else Study(study, selection or Selection())
         (made,) = make_tables(read, [name])
         frame = pd.DataFrame(value_rows(made), columns=names_of(made)).set_index("row")
     # Of a column without a value pandas cannot tell the type.

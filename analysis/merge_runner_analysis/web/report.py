@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import datetime
 from difflib import unified_diff
 from importlib.metadata import version
@@ -83,11 +83,14 @@ MEANINGS = {
 LIBRARIES = ("statsmodels", "scipy", "numpy", "pandas", "matplotlib")
 
 
-def write_report(study: Study, out: Path, files: Path | None) -> Iterator[Path]:
+def write_report(
+    study: Study, out: Path, files: Path | None, say: Callable[[str], object] = str
+) -> Iterator[Path]:
     """Write the report, and every table and figure into the folder ``files``; yields the paths.
 
-    Raises UsageError.
+    ``say`` gets what is computed just now. Raises UsageError.
     """
+    say("computing the tables")
     tables = finished_tables(study.db, study=study)
     if files is not None:
         yield from write_figures(study, files)
@@ -96,7 +99,7 @@ def write_report(study: Study, out: Path, files: Path | None) -> Iterator[Path]:
                 path = files / f"{table.name}.{form.suffix}"
                 path.write_text(render([table], form) + "\n", encoding="utf-8")
                 yield path
-    text = report_html(study, tables, finished_figures(study))
+    text = report_html(study, tables, finished_figures(study, say))
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(text, encoding="utf-8")
@@ -105,15 +108,15 @@ def write_report(study: Study, out: Path, files: Path | None) -> Iterator[Path]:
     yield out
 
 
-def finished_figures(study: Study) -> dict[str, str]:
+def finished_figures(study: Study, say: Callable[[str], object] = str) -> dict[str, str]:
     """Every figure by name as SVG in Base64: read from the database where stored, else drawn."""
     files = {f"{name}.svg": name for name in FIGURES}  # a table may have the name alone
     found = finished(study.db, study.state, study.options, list(files))
-    drawn = {
-        file: base64.b64encode(rendered(study, name, "svg")).decode()
-        for file, name in files.items()
-        if file not in found
-    }
+    drawn = {}
+    for file, name in files.items():
+        if file not in found:
+            say(f"drawing {name}")
+            drawn[file] = base64.b64encode(rendered(study, name, "svg")).decode()
     if drawn:
         keep_finished(study.db, study.state, study.options, drawn)
     return {name: (found | drawn)[file] for file, name in files.items()}
@@ -139,6 +142,8 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
     question = answer_of(made.get("effects"), made.get("levels"))
     beside = (against(table, study) if table.name in FILES else table for table in tables)
     views = [table_view(table, number) for table in beside]
+    if study.groups == study.baselines:  # it would stand there twice
+        figures = {name: data for name, data in figures.items() if name != "figure2-variants"}
     inlined = inlined_texts([STYLE])
     templates = environment(Links(lambda _: ""), policy_of(inlined), inlined)
     return templates.get_template("report.html").render(
