@@ -123,6 +123,11 @@ def test_several_csv_tables_carry_their_names_and_one_without_rows_its_columns(s
     assert [frame.index.name, *frame] == as_csv(made(small, "factors")).split(",")
 
 
+def test_a_data_frame_may_be_of_a_part_of_a_database(small):
+    (driver, *_) = {group.driver for group in small.models}
+    assert {*table_of(small.db, "gap", Selection([driver]))["driver"]} == {driver}
+
+
 def test_a_table_refuses_nan_and_a_gap_without_a_word():
     column = Column("b", "b", "number")
     with pytest.raises(ValueError, match="NaN"):
