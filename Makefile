@@ -14,7 +14,7 @@ export Q
 # A make that a recipe runs, as the tests do, is another one: it inherits neither words nor variables.
 unexport MODEL SWEEP ARGS RECORDING PYTHON MAKEFLAGS MFLAGS MAKEOVERRIDES
 
-.PHONY: help sweep replay report view sql test lint check check-all bench lock
+.PHONY: help sweep replay report view sql test lint check check-all bench site lock
 
 help:
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
@@ -53,12 +53,16 @@ check-all: check ## what an hour may find: the weekly tests too, and the wheel o
 bench: .venv/runtime .venv-peer/installed ## the benchmarks: benchmarks/README.md
 	@.venv/bin/python -m benchmarks $(ARGS)
 
+site: .venv-site/installed ## the docs as a site, in site/index.html
+	@NO_MKDOCS_2_WARNING=1 .venv-site/bin/mkdocs build --strict --quiet $(ARGS)
+
 lock: ## renew the lock files (needs uv)
 	uv pip compile $(LOCK) --group dev -o requirements/dev.lock pyproject.toml
 	uv pip compile $(LOCK) --group build -c requirements/dev.lock -o requirements/runtime.lock pyproject.toml
 	uv pip compile $(LOCK) --extra dask -c requirements/dev.lock $(OTHERS) -o requirements/dask.lock pyproject.toml
 	uv pip compile $(LOCK) --group test --resolution lowest-direct -o requirements/lowest.lock pyproject.toml
 	uv pip compile $(LOCK) --group pyproject.toml:peer -o requirements/peer.lock
+	uv pip compile $(LOCK) --group pyproject.toml:site -o requirements/site.lock
 
 LOCK := --quiet --universal --no-strip-extras --python-version 3.11 --generate-hashes --no-annotate \
 	--no-emit-index-url --no-emit-find-links --custom-compile-command "make lock"
@@ -91,4 +95,10 @@ PIP := .venv/bin/python -m pip --disable-pip-version-check --quiet
 	@echo "installing inspect-ai, to compare with, into .venv-peer" >&2
 	@$(PYTHON) -m venv .venv-peer
 	@.venv-peer/bin/python -m pip --disable-pip-version-check --quiet install --require-hashes -r $<
+	@touch $@
+
+.venv-site/installed: requirements/site.lock
+	@echo "installing mkdocs into .venv-site" >&2
+	@$(PYTHON) -m venv .venv-site
+	@.venv-site/bin/python -m pip --disable-pip-version-check --quiet install --require-hashes -r $<
 	@touch $@

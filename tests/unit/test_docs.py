@@ -10,7 +10,7 @@ from merge_runner_analysis.published import published
 from tests.support.harness import PROJECT
 
 DOCS = PROJECT / "docs"
-PAGES_OF_THE_PROGRAM = ("commands", "model-list", "promises", "prompt-blocks", "tables")
+PAGES_OF_THE_PROGRAM = ("commands", "model-list", "promises", "prompt-blocks", "python", "tables")
 PAGES = [PROJECT / "README.md", *PROJECT.glob("plugins/*/README.md"), *DOCS.rglob("*.md")]
 GENERATED = {DOCS / f"{name}.md" for name in PAGES_OF_THE_PROGRAM}
 WRITTEN = [PROJECT / "README.md", *sorted({*DOCS.glob("*.md")} - GENERATED)]
