@@ -4,8 +4,8 @@ import re
 import shutil
 import subprocess
 import sys
-import tomllib
 import zipfile
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -17,7 +17,6 @@ from tests.support.harness import PROGRAM, PROJECT, Run, environment
 
 MODULE = (sys.executable, "-m", "merge_runner")
 BUILD = "import sys; from hatchling import build; print(build.build_{}(sys.argv[1]))"
-DESCRIBED = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
 
 
 def run(folder: Path, *command: object, **changes: str) -> Run:
@@ -37,7 +36,8 @@ def test_python_m_merge_runner_has_every_command_and_the_version(tmp_path):
     listed = run(tmp_path, *MODULE, "--help").out
     for name in typer.main.get_command(app).commands:
         assert re.search(rf"^ +{name} ", listed, re.MULTILINE)
-    assert __version__ == DESCRIBED["version"]
+    assert __version__ == metadata.version("merge-runner")
+    assert f"\nversion: {__version__}\n" in (PROJECT / "CITATION.cff").read_text()
     for program in (MODULE, [PROGRAM]):
         assert run(tmp_path, *program, "--version").out == f"merge-runner {__version__}\n"
 
