@@ -41,11 +41,14 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
     last = max(1, -(-trials // PAGE))
     page = min(whole(asked.get("page", "")) or 1, last)
     rows = site.catalogue.page(wanted, sort, page)
+    # An export has no filters. Why replies were invalid says whether they were, too.
+    facets = {} if site.is_still else facets_shown(site, site.catalogue.facets(wanted))
+    if not chosen.get("validity"):
+        facets.pop("validity", None)
     return site.render(
         "trials.html",
         here="trials",
-        # An export has no filters.
-        facets={} if site.is_still else facets_shown(site, site.catalogue.facets(wanted)),
+        facets=facets,
         chosen=chosen,
         headings=HEADINGS,
         carried=carried(asked),
