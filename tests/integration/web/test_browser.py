@@ -351,7 +351,7 @@ def test_a_phone_shows_a_decision_that_is_tapped_and_leads_back_by_day_and_by_ni
     assert serious(page) == []
     page.get_by_role("button", name="Close").click()
     page.get_by_role("link", name="What words mean").click()
-    expect(page.locator("#main dt", has_text="tunnel")).to_be_visible()
+    expect(page.locator("#main dt", has_text="verdict")).to_be_visible()
     paper = "getComputedStyle(document.body).backgroundColor"
     night = page.evaluate(paper)
     page.get_by_role("button", name="More", exact=True).click()
