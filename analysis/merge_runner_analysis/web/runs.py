@@ -137,7 +137,7 @@ def run_of(row: Row, config: Row, snapshot: ProgressSnapshot | None, later: str 
 def ended_as(run: Row) -> str:
     """How a run ended, in a word or two."""
     if run["state"] == "lost":
-        return "killed or crashed"
+        return "cut off"
     if run["state"] != "stopped":
         return "checking what is stored" if run["state"] == "checking" else str(run["state"])
     failed = f"{run['failed']} trials failed" if run["failed"] else "ended by an error"

@@ -11,6 +11,7 @@ from typing import Any
 from starlette.datastructures import QueryParams
 
 from merge_runner.prompts.blocks import BASELINE, title_of
+from merge_runner_analysis.web.catalogue import Facets
 from merge_runner_analysis.web.phrases import called, ordered
 from merge_runner_analysis.web.site import SCOPE, NotThere, Site
 
@@ -84,10 +85,7 @@ def scope_of(
     own = [row for row in rows if not driver or row["model"] == unmarked(driver)]
     prompts = list(dict.fromkeys(row["variant"] for row in own))
     conditions = ordered({row["condition"] for row in own})
-    sweeps = {}
-    for row in site.catalogue.ask("FROM sweeps ORDER BY started_at DESC"):
-        name = called(row["name"], json.loads(row["config"]))
-        sweeps[row["sweep_id"]] = f"{name}, {row['started_at']:%Y-%m-%d %H:%M} UTC"
+    sweeps = runs_of(site)
     usual = "" if any_prompt else next(iter(prompts), BASELINE)
     usual = BASELINE if usual and BASELINE in prompts else usual
     scope = Scope(
@@ -104,6 +102,22 @@ def scope_of(
         [(name, title_of(name)) for name in prompts],
         [(name, f"{name}: {site.in_words(name)}") for name in conditions],
     )
+
+
+def runs_of(site: Site) -> dict[str, str]:
+    """What each run is called in a list to choose from, the newest first."""
+    return {
+        row["sweep_id"]: f"{called(row['name'], json.loads(row['config']))}, "
+        f"{row['started_at']:%Y-%m-%d %H:%M} UTC"
+        for row in site.catalogue.ask("FROM sweeps ORDER BY started_at DESC")
+    }
+
+
+def facets_shown(site: Site, facets: Facets) -> dict[str, list[tuple[str, Any]]]:
+    """The values of facets to choose from, of which runs have their names."""
+    times = dict(facets["sweep"])
+    runs = [(run, f"{text} ({times[run]})") for run, text in runs_of(site).items() if run in times]
+    return {**facets, "sweep": runs}
 
 
 def carried(asked: Mapping[str, str]) -> dict[str, list[str]]:

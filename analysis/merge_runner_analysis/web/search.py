@@ -67,6 +67,8 @@ class Words:
     ) -> dict[str, Any]:
         """Decisions with all ``terms`` within ``limits``, of which ``hits`` are those of a page.
 
+        Those of scripted stand-ins come last.
+
         Each has the ``pieces`` of its words. ``crossed`` counts all of them by what was said, M or
         Y, and by what was planned.
         """
@@ -91,7 +93,8 @@ class Words:
             rows = records(
                 connection,
                 f"SELECT trial_id, spec_hash, outcome, hits.* {found} "
-                f"ORDER BY trial_id, spec_hash, hits.decision, hits.side LIMIT {PAGE} OFFSET ?",
+                "ORDER BY who, trial_id, spec_hash, hits.decision, hits.side "
+                f"LIMIT {PAGE} OFFSET ?",
                 [*values, PAGE * (page - 1)],
             )
             texts = dict(

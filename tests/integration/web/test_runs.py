@@ -154,6 +154,13 @@ def test_every_arm_and_every_cause_leads_to_the_trials_that_it_counts(written):
     assert causes == {None, "model: o3 → another", "plan: no_array", "plan: refusal"} | attempts
 
 
+def test_trials_are_filtered_by_their_errors_and_by_validity_where_an_address_does(written):
+    client = client_of(written)
+    for of, shown in (("", ["cause"]), ("?validity=fallbacks", ["cause", "validity"])):
+        page = client.get(f"/trials{of}").text
+        assert re.findall(r'id="facet-(validity|cause)"', page) == shown
+
+
 def test_an_alias_is_nothing_that_went_wrong_and_two_other_models_have_a_line_each(study):
     change(study, "UPDATE calls SET model_served = 'third' WHERE trial_id LIKE '%N_0_0%'")
     site = Site(study)

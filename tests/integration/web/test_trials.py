@@ -263,3 +263,4 @@ def test_trials_of_two_endpoints_are_listed_named_and_linked_apart_with_who_answ
         page = Page(client.get(f"/sweeps/{entry['sweep_id']}").text).text
         assert (f"baseline: {name}" in page, words in page) == (True, True)
     assert all(words in client.get(page).text for page in ("/", "/trials.csv"))
+    assert len(re.findall(r">baseline, [-:\d ]* UTC \(2\)<", client.get("/trials").text)) == 2

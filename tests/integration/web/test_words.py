@@ -114,6 +114,11 @@ def test_what_is_found_comes_in_pages(client, db):
     assert found(client, page=99) == every[PAGE:]
 
 
+def test_what_stand_ins_say_comes_last(copy):
+    damage(copy, "UPDATE trials SET scripted = true WHERE trial_id LIKE 'o3/%'")
+    assert [found(client_of(copy), page=page)[-1][0] for page in (1, 2)] == ["o4", "o3"]
+
+
 def test_words_of_new_trials_are_found_and_those_of_removed_ones_are_not(copy):
     client = client_of(copy)
     assert len(found(client, q="brake")) == 2

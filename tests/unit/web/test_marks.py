@@ -2,8 +2,9 @@
 
 import pytest
 
-from merge_runner_analysis.tables.model import Row
+from merge_runner_analysis.tables.model import Row, Table
 from merge_runner_analysis.web.marks import cells, measures_of
+from merge_runner_analysis.web.pages.prompts import differences
 
 
 @pytest.mark.parametrize(
@@ -16,3 +17,11 @@ def test_shares_of_crashes_that_differ_have_places_that_differ(crashed, places):
     marks = [cells(of, measures)["collisions"].mark for of in verdicts]
     assert [mark.at for mark in marks] == places
     assert not any(mark.arrow for mark in marks)
+
+
+@pytest.mark.parametrize(("p", "shape"), [(0.04, "like"), (0.05, "open"), (None, "open")])
+def test_what_a_prompt_changes_is_filled_by_its_corrected_p_whatever_its_interval(p, shape):
+    values = {"driver": "o3", "reference": "baseline", "difference": 1.0, "ci": (0.5, 1.5)}
+    row = Row("o3/A1/baseline/gap_m", ("o3/A1",), {**values, "p_holm": p})
+    drivers, _ = differences(Table("contrasts", (), [row]), {"o3"})
+    assert drivers["o3"]["A1 against baseline"]["gap_m"]["mark"].shape == shape

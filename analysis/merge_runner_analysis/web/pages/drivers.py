@@ -58,11 +58,12 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
             f"{', '.join(by_name) or 'none'}"
         )
     trials = scope.trials(name, scope.prompt)
-    was_asked = own and own.facts and own.facts["asked"]
-    awaited, first = _first(site, name, scope) if was_asked else (None, "")
     beside = by_name.get(asked.get("with", ""))
+    was_asked = own and own.facts and own.facts["asked"] and not beside
+    awaited, first = _first(site, name, scope) if was_asked else (None, "")
     compared, apart = _apart(site, own, beside, scope) if own and beside else (None, None)
-    conditions = by_condition(site, scope, [one for one in (own, beside) if one])
+    both = [one for one in (own, beside) if one]
+    conditions = by_condition(site, scope, both)
     # Of each condition, the humans' and the drivers' share of trials in which left goes first.
     shares = (
         [rate(cell["left_first"], cell["merged"]) if cell else rate(0, 0) for cell in cells]
@@ -94,7 +95,7 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         conditions=conditions,
         counted=_counted([cell for _, cells in conditions["rows"] for cell in cells if cell]),
         rates=zip(*shares, strict=True),
-        notes=noted([own] if own else []),
+        notes=noted(both),
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -15,12 +16,13 @@ from merge_runner_analysis.metrics import COLLISIONS
 from merge_runner_analysis.tables.formats import printed
 from merge_runner_analysis.tables.model import Row, Table
 from merge_runner_analysis.web.computed import computed_table
+from merge_runner_analysis.web.effect_rows import MIDDLE, difference_mark
 from merge_runner_analysis.web.judged import Driver, judged
-from merge_runner_analysis.web.marks import Mark
 from merge_runner_analysis.web.phrases import UNKNOWN, block_meaning, changes_text
 from merge_runner_analysis.web.scope import scope_of, unmarked
 from merge_runner_analysis.web.site import NotThere, Site
 from merge_runner_analysis.web.trial.prompt_parts import Part, digests_of, level_of, parts_of
+from merge_runner_analysis.wording import ALPHA
 
 # The blocks of a prompt, as its specs name them; a program has none.
 STORED = """
@@ -88,6 +90,7 @@ def prompts_page(site: Site, asked: Mapping[str, str]) -> str:
         left_out=partial(left_out, site),
         drivers=drivers,
         ends=ends,
+        middle=MIDDLE,
         collisions=COLLISIONS.name,
         baseline=BASELINE,
         reworded=any(one.prompt != BASELINE for played in driven.values() for one in played),
@@ -119,8 +122,8 @@ def differences(
 ) -> tuple[dict[str, dict[str, dict[str, Any]]], dict[str, float]]:
     """What each prompt changes, by driver of these, by both prompts, and by measure.
 
-    Each difference is as it is printed, with its mark, 0 in the middle of its axis, and what a link
-    to its trials needs. And where the axis of each measure ends on both sides, in its unit.
+    Each difference is as it is printed, with its mark, filled where its corrected p is below 5 %,
+    and what a link to its trials needs. And where the axis of each measure ends on both sides.
     """
     # A driver that is not judged has none.
     rows = [row for row in table.rows if row.values.get("difference") is not None]
@@ -133,9 +136,8 @@ def differences(
         name, (driver, _, prompt) = row.id.rpartition("/")[2], row.groups[0].rpartition("/")
         if unmarked(driver) not in chosen:
             continue
-        _, *limits = _values(row)
-        at, *places = (round(50 + 48 * v / (ends[name] or 1.0), 2) for v in _values(row))
-        apart = limits and (limits[0] > 0 or limits[1] < 0)
+        p: Any = row.values["p_holm"]
+        shape = "open" if p is None or p >= ALPHA else "like"
         compared = f"{prompt} against {row.values['reference']}"
         of_driver = drivers.setdefault(str(row.values["driver"]), {})
         of_driver.setdefault(compared, {})[name] = {
@@ -143,9 +145,7 @@ def differences(
             "row": row.id,
             "driver": driver,
             "prompt": prompt,
-            "mark": Mark(
-                "like" if apart else "open", at, (places[0], places[1]) if places else None
-            ),
+            "mark": replace(difference_mark(row, ends[name]), shape=shape),
         }
     return drivers, ends
 

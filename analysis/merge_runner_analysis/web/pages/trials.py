@@ -14,7 +14,7 @@ from merge_runner_analysis.web.listing import FACTOR
 from merge_runner_analysis.web.phrases import causes_text, plain
 from merge_runner_analysis.web.pictures import sparkline, speed_range
 from merge_runner_analysis.web.reading import Row
-from merge_runner_analysis.web.scope import carried
+from merge_runner_analysis.web.scope import carried, facets_shown
 from merge_runner_analysis.web.site import NotThere, Site, news_of
 from merge_runner_analysis.web.urls import CELL, whole
 
@@ -41,10 +41,14 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
     last = max(1, -(-trials // PAGE))
     page = min(whole(asked.get("page", "")) or 1, last)
     rows = site.catalogue.page(wanted, sort, page)
+    # An export has no filters. Why replies were invalid says whether they were, too.
+    facets = {} if site.is_still else facets_shown(site, site.catalogue.facets(wanted))
+    if not chosen.get("validity"):
+        facets.pop("validity", None)
     return site.render(
         "trials.html",
         here="trials",
-        facets={} if site.is_still else site.catalogue.facets(wanted),  # an export has no filters
+        facets=facets,
         chosen=chosen,
         headings=HEADINGS,
         carried=carried(asked),

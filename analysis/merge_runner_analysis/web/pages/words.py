@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from merge_runner_analysis.web.filters import HEADINGS as OF_TRIALS
 from merge_runner_analysis.web.filters import filter_of
-from merge_runner_analysis.web.scope import carried
+from merge_runner_analysis.web.scope import carried, facets_shown
 from merge_runner_analysis.web.search import (
     FACETS,
     LIMITS,
@@ -41,7 +41,7 @@ def words_page(site: Site, asked: Mapping[str, str]) -> str:
         carried=carried(asked),
         limits=LIMITS,
         found=found,
-        facets=found["facets"],
+        facets=facets_shown(site, found["facets"]),
         chosen=chosen,
         kept=chosen,
     )

@@ -67,7 +67,9 @@ replay.charts = (scene, ribbons, seek) => {
   // The moments: who merges, a collision, whatever else the page was told of.
   const mark = () => {
     const others = (scene.ghost?.marks ?? []).map((one) => ({ ...one, other: true }));
+    // What drivers choose stands in the ribbons.
     const all = [...trial.marks, ...others]
+      .filter(({ kind }) => kind !== "choice")
       .sort((a, b) => a.t - b.t)
       .map((one) => {
         const symbol = ({ merge: "▾", collision: "✸" }[one.kind] ?? "◆") + (one.side[0] ?? "").toUpperCase();
@@ -86,10 +88,8 @@ replay.charts = (scene, ribbons, seek) => {
         return line;
       }),
     );
-    // What drivers choose stands in the ribbons.
-    const told = all.filter(({ kind }) => !kind.includes(" choice"));
     at("moments").replaceChildren(
-      ...told.map(({ t, kind, symbol, words }) => {
+      ...all.map(({ t, kind, symbol, words }) => {
         const button = element("button", { type: "button", class: kind }, `${symbol} ${words}`);
         button.addEventListener("click", () => seek(t));
         return element("li", {}, button);
