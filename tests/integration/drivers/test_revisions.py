@@ -81,8 +81,13 @@ def test_the_class_names_its_revision_and_the_spec_has_it():
     assert [spec["revision"] for spec in specs] == [1, 2]
 
 
-async def test_an_edited_program_is_refused_until_its_revision_is_raised(merge_runner, tmp_path):
-    (tmp_path / "study.toml").write_text(STUDY)
+@pytest.mark.parametrize(
+    ("model", "trial"), [("braking", "braking"), ("emulator+braking", "emulator+braking")]
+)
+async def test_an_edited_program_is_refused_until_its_revision_is_raised(
+    merge_runner, tmp_path, model, trial
+):
+    (tmp_path / "study.toml").write_text(STUDY.replace("braking", model))
 
     async def sweep(revision, action, *more):
         (tmp_path / "mine.py").write_text(DRIVER.format(revision=revision, action=action))
@@ -93,7 +98,7 @@ async def test_an_edited_program_is_refused_until_its_revision_is_raised(merge_r
     assert (await sweep(1, -0.1, "--conditions", "L_4_0")).code == 0
     edited = await sweep(1, -0.2)
     assert edited.code == 2
-    assert "braking drives otherwise than in the trial braking/baseline/L_4_0/rep01" in edited.err
+    assert f"braking drives otherwise than in the trial {trial}/baseline/L_4_0/rep01" in edited.err
     assert "give its class another `revision`" in edited.err
     for revision, action, trials in ((1, -0.1, 2), (2, -0.2, 4)):
         assert (await sweep(revision, action)).code == 0
