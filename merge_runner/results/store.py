@@ -268,11 +268,15 @@ def results_digest(path: Path, sweep_ids: Sequence[str] | None = None) -> tuple[
     """
     digests: dict[TrialKey, Any] = {}
     with read_database(path) as connection:
+        wanted = f"SELECT trial_id, spec_hash FROM trials {only(sweep_ids)}"  # noqa: S608
+        chosen = None if sweep_ids is None else {*connection.execute(wanted).fetchall()}
         for table, columns in OF_THE_DIGEST.items():
-            # A trial's rows lie together in the table, which is too large to be sorted.
-            chosen = only(sweep_ids)
-            sql = f"SELECT trial_id, spec_hash, {columns} FROM {table} {chosen}"  # noqa: S608
+            # A trial's rows lie together in the table, which is too large to be sorted; a join
+            # would mix them.
+            sql = f"SELECT trial_id, spec_hash, {columns} FROM {table}"  # noqa: S608
             for key, rows in groupby(fetched(connection.execute(sql)), key=itemgetter(0, 1)):
+                if chosen is not None and key not in chosen:
+                    continue
                 digest = digests.setdefault(key, hashlib.sha256(key[0].encode()))
                 for values in sorted(rows, key=itemgetter(2, 4)):
                     digest.update(json.dumps(values[2:]).encode())

@@ -139,6 +139,22 @@ def test_the_digest_sees_every_result_and_no_order(tmp_path):
         assert results_digest(tmp_path / table)[0] != base, table
 
 
+def test_the_digest_of_all_sweeps_is_that_of_the_whole_database_whatever_its_size(store, path):
+    """DuckDB reads a table of several row groups in threads: a join mixes their rows."""
+    store.write("s1", [played()], patience_s=1)
+    with duckdb.connect(str(path)) as connection:
+        (rows,) = connection.execute("SELECT count(*) FROM states").fetchone()
+        copies = 3 * 122_880 // rows
+        for table in ("trials", "states", "sweep_trials"):
+            connection.execute(
+                f"INSERT INTO {table} SELECT {table}.* REPLACE (trial_id || '-' || range AS "
+                f"trial_id) FROM {table}, range({copies}) ORDER BY range"
+            )
+    whole = results_digest(path)
+    assert whole[1] == copies + 1
+    assert [results_digest(path, ["s1"]) for _ in range(3)] == [whole] * 3
+
+
 def test_the_metrics_are_those_computed_by_hand(store, path):
     record = played("L_4_-8")
     store.write("s1", [record, played("N_0_0", driver="constant")], patience_s=1)
