@@ -39,7 +39,7 @@ from merge_runner.errors import (
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LONG_WAIT_S
-from merge_runner.llm.http_outcome import REGISTRY, TransportFailure, if_nobody, set_base_url
+from merge_runner.llm.http_outcome import TransportFailure, if_nobody, set_base_url
 from merge_runner.llm.ledger import Ledger, scopes
 from merge_runner.paths import DEFAULT_DB, SHIPPED_RECORDINGS, command_at
 from merge_runner.records import ReplayMiss, TrialRecord, TrialSpec, canonical_json
@@ -558,8 +558,8 @@ async def _served_name(name: str, entry: ModelEntry, *, say: Callable[[str], Non
         models = ", ".join(listed) or "no model"
     except TransportFailure as exc:
         if exc.outcome == "no_connection":
-            raise ProviderDown(f"{driver}: {exc}: {if_nobody(name, entry)}") from exc
-        wrong = f"; if that is another server, {set_base_url(name, entry)}"
+            raise ProviderDown(f"{driver}: {exc}: {if_nobody(entry)}") from exc
+        wrong = f"; if that is another server, {set_base_url(entry)}"
         listed, models = [], f"models that it does not list ({exc}{wrong})"
     finally:
         telling.cancel()
@@ -567,7 +567,7 @@ async def _served_name(name: str, entry: ModelEntry, *, say: Callable[[str], Non
         variable = PROVIDERS.require(entry.provider).model_env
         raise UsageError(
             f"{driver} serves {models}: name one with "
-            f"{variable}, or with `id` of [{name}] in {REGISTRY}, which takes precedence"
+            f"{variable}, or with `id` of {entry.place}, which takes precedence"
         )
     say(f"{driver} serves {listed[0]}, which is asked")
     return listed[0]

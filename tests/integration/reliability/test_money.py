@@ -194,6 +194,7 @@ async def test_an_unknown_price_is_said_and_needs_yes(merge_runner, experiments)
         capped = await merge_runner(*sweep, "--yes", "--max-cost", 1, **env)
         assert capped.code == 2
         assert "--max-cost cannot hold" in capped.err
+        assert "give it a `price` in [mine] in experiments/models.toml" in capped.err
         assert server.requests == 0
         run = await merge_runner(*sweep, "--yes", **env)
     assert run.code == 0, run.err
