@@ -117,7 +117,9 @@ async def connected(where: str) -> AsyncIterator[Client]:
     try:
         import distributed
     except ModuleNotFoundError as exc:
-        raise UsageError("--dask needs the package distributed: pip install distributed") from exc
+        raise UsageError(
+            "--dask needs the package distributed: pip install 'merge-runner[dask]'"
+        ) from exc
 
     async with AsyncExitStack() as stack:
         stack.enter_context(_silenced(map(logging.getLogger, LOGGERS)))
