@@ -50,7 +50,7 @@ from merge_runner.results.recording import Miss, described, explain, recorded_pa
 from merge_runner.results.store import Store, sweep_facts
 from merge_runner.run.clients import check_batches, live_clients, open_rounds
 from merge_runner.run.cluster import DaskTasks, connected
-from merge_runner.run.estimate import Estimate, earlier_answers, estimate
+from merge_runner.run.estimate import Estimate, earlier_answers, estimate, usual_latencies_s
 from merge_runner.run.guard import MOST_INVALID, FirstDecisions
 from merge_runner.run.local_runner import (
     AGAIN,
@@ -278,13 +278,15 @@ class Sweep:
                 if name in arm.entries:
                     answered = sum(row.side == side for row in record.decisions) if record else 0
                     calls[spec.arm][name] += max(1.0, usual_prompts(arm) - answered)
+        facts = earlier_answers(self._plan, self._cache)
         expected = estimate(
             self._plan,
             self._options,
             trials=trials,
             stored=0 if whole else len(self._stored),
             calls=calls,
-            facts=earlier_answers(self._plan, self._cache),
+            facts=facts,
+            latencies_s=usual_latencies_s(self._plan, self._cache, facts),
         )
         cap_usd = self._options.max_cost_usd
         if cap_usd is None or whole:
