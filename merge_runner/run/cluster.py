@@ -399,6 +399,7 @@ class DaskTasks:
     _ledger: Ledger
     first: FirstDecisions
     waits: Sequence[Wait] = ()
+    held: int = 0
     workers: int = 0
     _run: str = field(default_factory=secrets.token_hex)
     _groups: deque[list[TrialSpec]] = field(default_factory=deque)

@@ -240,6 +240,7 @@ class Sweep:
         return Progress(
             plan=self._plan,
             planned=len(self._stored) + len(self.todo),
+            todo=Counter(spec.arm for spec in self.todo),
             stored=len(self._stored),
             runner=runner,
             ledger=self._ledger,
@@ -360,6 +361,7 @@ class Sweep:
                 suspended = str(record)
             else:
                 counts[record.status] += 1
+                progress.done[spec.arm] += 1
                 misses.extend(_misses(record))
                 flusher.add(record)
 
