@@ -269,7 +269,7 @@ class Log:
         ended = snapshot.ended + snapshot.failed - progress.stored
         line = f"trials: {ended}/{progress.planned - progress.stored} ended"
         line += f"; failed: {snapshot.failed}" if snapshot.failed else ""
-        line += f"; cost: {snapshot.cost_usd:.2f} USD" if snapshot.cost_usd >= CENT_USD else ""
+        line += f"; cost: {rows['cost']}" if snapshot.cost_usd >= CENT_USD else ""
         if line != self.said or progress.doing == "playing":
             waits = f"; waiting: {rows['waiting']}" if "waiting" in rows else ""
             say(

@@ -123,7 +123,9 @@ def test_a_log_says_in_short_what_is_new_and_its_last_line_once(capsys):
     log.show(shown)
     line = capsys.readouterr().err
     assert re.match(
-        r"trials: 0/10 ended; cost: 1\.50 USD; \d+ s, about \d+ s left; waiting: 1 for money", line
+        r"trials: 0/10 ended; cost: 1\.50 USD, 4\.25 of 20 over all runs; "
+        r"\d+ s, about \d+ s left; waiting: 1 for money",
+        line,
     )
     assert 100 < len(line) <= 121
     assert line.endswith(" ...\n")
@@ -132,7 +134,7 @@ def test_a_log_says_in_short_what_is_new_and_its_last_line_once(capsys):
     for _ in range(3):
         log.show(shown)
     assert re.fullmatch(
-        r"trials: 10/10 ended; failed: 1; cost: 1.50 USD; \d+ s.*\n", capsys.readouterr().err
+        r"trials: 10/10 ended; failed: 1; cost: 1.50 USD, .*; \d+ s.*\n", capsys.readouterr().err
     )
 
 
