@@ -123,9 +123,7 @@ def finished_tables(
     return [found[name] for name in wanted]
 
 
-def table(
-    study: Study | Path | str, name: str, selection: Selection | None = None
-) -> pd.DataFrame:
+def table(study: Study | Path | str, name: str, selection: Selection | None = None) -> pd.DataFrame:
     """A table of a study, or of a ``selection`` of a database, as a data frame at full precision.
 
     It has the rows of the table's CSV, and what the study adds that this process has planned into
