@@ -128,7 +128,7 @@ def test_make_says_the_exit_code_of_the_program(tmp_path):
 
 
 def test_make_opens_the_notebooks():
-    asked = run(PROJECT, "make", "-n", "notebook", "ARGS=--no-browser").out
+    asked = run(PROJECT, "make", "-n", "-B", "notebook", "ARGS=--no-browser").out
     assert asked.splitlines()[-1] == ".venv/bin/jupyter lab docs/notebooks --no-browser"
     assert ".venv/bin/python -m pip" in asked
     assert '".[notebook]"' in asked
