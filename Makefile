@@ -14,7 +14,7 @@ export Q
 # A make that a recipe runs, as the tests do, is another one: it inherits neither words nor variables.
 unexport MODEL SWEEP ARGS RECORDING PYTHON MAKEFLAGS MFLAGS MAKEOVERRIDES
 
-.PHONY: help sweep replay report view sql test lint check check-all bench site lock
+.PHONY: help sweep replay report view sql notebook test lint check check-all bench site lock
 
 help:
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
@@ -30,6 +30,9 @@ report: .venv/runtime ## tables, figures and the HTML report of what the databas
 
 view: .venv/runtime ## the explorer in a browser: ARGS=
 	@$(RUN) view $(ARGS)
+
+notebook: .venv/runtime .venv/notebook ## the notebooks of docs/notebooks in JupyterLab: ARGS=
+	@.venv/bin/jupyter lab docs/notebooks $(ARGS)
 
 sql: .venv/runtime ## a query over the results: Q="select ...", ARGS=
 	@$(RUN) sql "$$Q" $(ARGS)
@@ -89,6 +92,11 @@ PIP := .venv/bin/python -m pip --disable-pip-version-check --quiet
 .venv/dask: .venv/runtime requirements/dask.lock
 	@echo "installing the pinned packages of the extra dask into .venv" >&2
 	@$(PIP) install --require-hashes --no-deps -r requirements/dask.lock
+	@touch $@
+
+.venv/notebook: .venv/runtime
+	@echo "installing JupyterLab, the extra notebook, in its newest version into .venv" >&2
+	@$(PIP) install --no-build-isolation --editable ".[notebook]"
 	@touch $@
 
 .venv-peer/installed: requirements/peer.lock

@@ -12,10 +12,18 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from datetime import date
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 from urllib.parse import SplitResult, urlsplit
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    JsonValue,
+    PrivateAttr,
+    ValidationError,
+    model_validator,
+)
 
 from merge_runner.errors import UsageError, unknown_name
 from merge_runner.paths import SHIPPED_EXPERIMENTS
@@ -210,7 +218,7 @@ class BatchTerms(Frozen):
 
 
 class ModelEntry(Frozen):
-    """One model of ``experiments/models.toml``.
+    """One model of a ``models.toml``.
 
     ``id`` is what is sent (UNNAMED: what a server of one's own serves); a served model that is
     neither it nor one of ``aliases`` is a mismatch. ``parameters`` go into the request as they are,
@@ -250,6 +258,18 @@ class ModelEntry(Frozen):
     typical_output_tokens: Count = 1000
     typical_latency_s: Positive = 10.0
     note: str = ""
+    _place: str = PrivateAttr("its table of models.toml")
+
+    @property
+    def place(self) -> str:
+        """Where a user corrects it: table and file, as ``[o3] in models.toml``."""
+        return self._place
+
+    def standing_at(self, place: str) -> Self:
+        """Return it with another ``place``."""
+        copied = self.model_copy()
+        copied._place = one_line(place)
+        return copied
 
     @property
     def key_envs(self) -> tuple[str, ...]:
@@ -346,13 +366,14 @@ class Endpoint:
 
     ``identity`` enters every cache key: the provider's name at its default URL, ``emulator`` for
     our own server, otherwise the normalised base URL. ``auth_headers`` hold the secret and are
-    neither hashed nor stored.
+    neither hashed nor stored. ``place`` is that of its entry.
     """
 
     provider: str
     identity: str
     base_url: str
     auth_headers: Mapping[str, str] = field(repr=False)
+    place: str = "models.toml"
 
 
 def resolve_endpoint(name: str, entry: ModelEntry, env: Mapping[str, str] = os.environ) -> Endpoint:
@@ -380,7 +401,7 @@ def resolve_endpoint(name: str, entry: ModelEntry, env: Mapping[str, str] = os.e
     auth = entry.auth or provider.auth
     headers = {"authorization": f"Bearer {key}"} if auth == "bearer" else {auth: key}
     identity = endpoint_identity(entry, env)
-    return Endpoint(entry.provider, identity, base_url, headers if key else {})
+    return Endpoint(entry.provider, identity, base_url, headers if key else {}, entry.place)
 
 
 def endpoint_url(entry: ModelEntry, env: Mapping[str, str] = os.environ) -> str:

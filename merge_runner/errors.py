@@ -19,8 +19,13 @@ class UsageError(MergeRunnerError):
     exit_code = 2
 
 
-def unknown_name(kind: str, name: str, names: Iterable[str], hint: str = "") -> UsageError:
-    """Return the error for a name that is none of ``names``; it suggests the nearest of them."""
+def unknown_name(
+    kind: str, name: str, names: Iterable[str], hint: str = "", *, likely: str = ""
+) -> UsageError:
+    """Return the error for a name that is none of ``names``; it suggests the nearest of them.
+
+    What is most ``likely`` meant stands before them, and a ``hint`` behind them.
+    """
     from difflib import get_close_matches
 
     valid = list(names)
@@ -28,7 +33,9 @@ def unknown_name(kind: str, name: str, names: Iterable[str], hint: str = "") -> 
     near = get_close_matches(name, valid) or get_close_matches(name.rpartition(".")[2], valid)
     more = f" and {len(valid) - MOST_NAMES} more" if len(valid) > MOST_NAMES else ""
     return UsageError(
-        f"unknown {kind} {name!r}; valid: {', '.join(valid[:MOST_NAMES]) or 'none'}{more}"
+        f"unknown {kind} {name!r}"
+        + (f": {likely}" if likely else "")
+        + f"; valid: {', '.join(valid[:MOST_NAMES]) or 'none'}{more}"
         + (f" ({hint})" if hint else "")
         + (f". Did you mean {' or '.join(near)}?" if near else "")
     )

@@ -319,8 +319,13 @@ UNION ALL FROM (
 )
 UNION ALL SELECT format('{} of its trials were played by another sweep', count(*))
 FROM unplayed WHERE elsewhere HAVING count(*) > 0
+-- A later run of the same study goes on from it, and says so itself.
 UNION ALL SELECT format('{} of its trials are checked with a later sweep that has them too', count(*))
-FROM linked SEMI JOIN done USING (trial_id, spec_hash) HAVING count(*) > 0
+FROM linked SEMI JOIN done USING (trial_id, spec_hash) ANTI JOIN (
+    sweep_trials JOIN sweeps AS later USING (sweep_id)
+    JOIN sweeps AS own ON own.name = later.name AND own.started_at < later.started_at
+    JOIN subject ON subject.sweep_id = own.sweep_id
+) USING (trial_id, spec_hash) HAVING count(*) > 0
 UNION ALL SELECT format('{} replies of {} at {} have an id that the server gave more than once: its ids '
     'do not tell whether an answer was given twice', count(DISTINCT call_key), model_requested,
     coalesce(nullif(endpoint, ''), 'its endpoint'))

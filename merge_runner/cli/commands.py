@@ -521,8 +521,15 @@ def ledger(
         print_out(json.dumps(rows, ensure_ascii=False))
         return
     reasons = [{"sweep": row["sweep"], **reason} for row in rows for reason in row.pop("reasons")]
-    told = "\n".join(filter(None, map(as_table, (rows, reasons))))
+    told = "\n".join(filter(None, map(as_table, (_shown_spending(rows), reasons))))
     print_out(f"{told}\n{APART}" if told else "Nothing is spent.")
+
+
+def _shown_spending(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """What the ledgers hold, for a reader: without columns that are 0 or empty in all of them."""
+    kept = [name for name in rows[0] if any(row[name] for row in rows)] if rows else []
+    heads = {"open_attempts": "attempts of unknown cost"}
+    return [{heads.get(name, name): row[name] for name in kept} for row in rows]
 
 
 def models(as_json: cli.JsonOption = False) -> None:

@@ -44,7 +44,7 @@ class HumanOddsDriver:
     _chance: Random = field(init=False)
 
     def __post_init__(self) -> None:
-        self._chance = Random(self.seat.seed)  # noqa: S311 # a sample, no secret
+        self._chance = Random(self.seat.seed)
 
     async def decide(self, observation: Observation, number: int) -> Decision:
         """Hold the acceleration, or keep the speed."""
@@ -78,7 +78,7 @@ class HumanOddsDriver:
         number, sign = self.seat.number, 1 if self.seat.side == "left" else -1
         log_odds = number("odds_intercept") * sign
         log_odds += number("odds_headway") * headway_m + number("odds_velocity") * velocity_mps
-        own, other = self._chance, Random(self.seat.other_seed)  # noqa: S311 # a sample, no secret
+        own, other = self._chance, Random(self.seat.other_seed)
         return own.expovariate(1.0) < exp(min(log_odds, CERTAIN)) * other.expovariate(1.0)
 
     def _gap_m(self, headway_m: float, velocity_mps: float) -> float:

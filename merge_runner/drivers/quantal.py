@@ -33,7 +33,7 @@ class QuantalDriver:
     _chance: Random = field(init=False)
 
     def __post_init__(self) -> None:
-        self._chance = Random(self.seat.seed)  # noqa: S311 # a sample, no secret
+        self._chance = Random(self.seat.seed)
 
     async def decide(self, observation: Observation, number: int) -> Decision:
         """Draw an action."""

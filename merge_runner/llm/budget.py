@@ -124,6 +124,11 @@ class Budget:
         # of a lower order, before younger ones.
         self._queue: list[tuple[tuple[bool, int], asyncio.Event]] = []
 
+    @property
+    def waiting(self) -> set[int]:
+        """The trials that wait for money, to begin or for an attempt."""
+        return {trial for (_, trial), _ in self._queue}
+
     async def admit(self, trial: int) -> None:
         """Wait until a trial may begin; raises TrialSuspended when no trial's end can let it."""
         if self.cap_usd is not None and trial not in self.charged_usd:

@@ -72,6 +72,10 @@ _NEWER = """
 SELECT rowid, mode, filename, CAST(value AS BLOB) FROM Cache WHERE rowid > ? AND raw = 1
 AND length(key) = 64 AND NOT instr(key, ' ') AND typeof(value) = 'text' ORDER BY rowid LIMIT ?
 """
+_NEWEST = """
+SELECT CAST(key AS BLOB) FROM Cache NOT INDEXED WHERE typeof(key) = 'text' AND raw = 1
+AND length(CAST(key AS BLOB)) = 64 AND NOT instr(key, ' ') ORDER BY rowid DESC LIMIT ?
+"""
 _CALL = "SELECT key, raw, mode, filename, value FROM Cache WHERE rowid = ?"
 
 
@@ -307,6 +311,15 @@ class ResponseCache:
         except FAILURES as exc:
             raise self._failure("read", exc) from exc
         yield from self._overlay.values()
+
+    def newest(self, most: int) -> Iterator[CachedCall]:
+        """Yield the calls that the folder has answered last, the newest first, but damaged ones."""
+        for (key,) in self.rows(_NEWEST, most):
+            call = None
+            with contextlib.suppress(RecordingError):
+                call = self._kept(key.decode(errors="replace"))
+            if call is not None:
+                yield call
 
     def kinds(self) -> tuple[Kinds, Kinds]:
         """Return how many calls the recording and the folder have answered, by kind of request.

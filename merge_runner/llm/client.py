@@ -153,7 +153,7 @@ class LlmClient:
         if self.strict and served not in self.recorded.own_names:
             raise SweepStopped(
                 f"{self.driver}: {served} answered where {self.entry.id} was asked for, at {slot}: "
-                "leave --strict-model out, or name it in `aliases` in experiments/models.toml"
+                "leave --strict-model out, or name it in `aliases` of " + self.entry.place
             )
         return reply
 
@@ -455,12 +455,12 @@ class LlmClient:
             # An endpoint that has answered before may mean this prompt alone.
             sure = not (self.known or reason in UNSURE) or self._refused >= SEVERAL
             if reason is not None and (sure or outcome.action == "refused"):
-                why = why_refused(reason, self.name, self.entry, outcome)
+                why = why_refused(reason, self.entry, outcome)
                 return EndpointRefused(f"{driver}: {why}")
         # A server that is just starting is waited for, but only for seconds.
         is_late = self.entry.deadline_s - call.left_s >= NOBODY_S
         if outcome.name == "no_connection" and not self.passed and is_late:
-            return ProviderDown(f"{driver}: {message}: {if_nobody(self.name, self.entry)}")
+            return ProviderDown(f"{driver}: {message}: {if_nobody(self.entry)}")
         delay_s, closed = outcome.delay_s or 0.0, ""
         if outcome.action == "quota":
             closed = "the account's quota is exhausted"

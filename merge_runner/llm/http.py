@@ -186,9 +186,8 @@ class HttpTransport:
         sent = {**HEADERS, **headers, **self._endpoint.auth_headers}
         sent |= dict.fromkeys(ID_HEADERS, own_id)
         sent["connection"] = "close" if self.one_each else "keep-alive"
-        request = httpx.Request(
-            method, url_of(self._endpoint.base_url, path), headers=sent, content=body
-        )
+        url = url_of(self._endpoint.base_url, path, self._endpoint.place)
+        request = httpx.Request(method, url, headers=sent, content=body)
         try:
             async with asyncio.timeout(timeout_s):
                 reply = await self._carrier.handle_async_request(request)
@@ -347,12 +346,15 @@ def keep_alive(connection: socket.socket) -> None:
 
 
 @lru_cache
-def url_of(base_url: str, path: str) -> httpx.URL:
-    """Return the URL of a path at the configured host, which alone may get the key."""
+def url_of(base_url: str, path: str, place: str) -> httpx.URL:
+    """Return the URL of a path at the configured host, which alone may get the key.
+
+    Raises UsageError, with the ``place`` of the model's entry.
+    """
     with suppress(httpx.InvalidURL):
         if path.startswith("/"):
             return httpx.URL(base_url + path)
-    raise UsageError(f"{path[:60]!r} can be no path: correct the entry in experiments/models.toml")
+    raise UsageError(f"{path[:60]!r} can be no path: correct {place}")
 
 
 def proxy_secrets() -> Iterator[str]:

@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from tenacity import RetryCallState
 
 Action = Literal["accept", "retry", "fail", "quota", "refused"]
-REGISTRY = "experiments/models.toml"
 EXCERPT = 200
 FIRST_BACKOFF_S, LONGEST_BACKOFF_S = 0.5, 60.0
 # In 2001: a smaller number of s is no moment.
@@ -410,32 +409,31 @@ def reason_of(outcome: AttemptOutcome, url: str) -> str | None:
     return "reasoning_alone" if is_alone else None
 
 
-def why_refused(reason: str, name: str, entry: ModelEntry, outcome: AttemptOutcome) -> str:
+def why_refused(reason: str, entry: ModelEntry, outcome: AttemptOutcome) -> str:
     """Return a reason in words, with what to set and what came."""
-    place = f"[{name}] in {REGISTRY}"
     raw = outcome.raw
     why = REASONS["other_format" if reason == "text" else reason].format(
-        place=place,
-        key=" or ".join(entry.key_envs) or f"`key_env` of {place}",
+        place=entry.place,
+        key=" or ".join(entry.key_envs) or f"`key_env` of {entry.place}",
         id=entry.id,
         format=entry.format,
         encoding=raw and raw.headers.get("content-encoding"),
-        base_url=set_base_url(name, entry),
+        base_url=set_base_url(entry),
     )
     return f"{why} ({outcome.message or (raw and raw.excerpt)})"
 
 
-def if_nobody(name: str, entry: ModelEntry) -> str:
+def if_nobody(entry: ModelEntry) -> str:
     """Return what a user can do if no server answers."""
     what = PROVIDERS[entry.provider].if_nobody
-    return f"{what}, or {set_base_url(name, entry)}; then run the same command again"
+    return f"{what}, or {set_base_url(entry)}; then run the same command again"
 
 
-def set_base_url(name: str, entry: ModelEntry) -> str:
+def set_base_url(entry: ModelEntry) -> str:
     """Return how a user corrects the base URL of an entry."""
     provider = PROVIDERS[entry.provider]
     if entry.base_url is not None or provider.base_url_env is None:
-        return f"correct `base_url` of [{name}] in {REGISTRY}"
+        return f"correct `base_url` of {entry.place}"
     path = urlsplit(provider.base_url).path
     ending = f" (with {path} at its end)" if path else ""
     return f"set {provider.base_url_env} to the base URL of the service{ending}, or unset it"

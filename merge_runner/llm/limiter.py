@@ -61,7 +61,10 @@ class Limiter:
         tpm: int | None = None,
         pause: Pause | None = None,
         window_s: float = WINDOW_S,
+        place: str = "models.toml",
     ) -> None:
+        """``place`` is that of the model's entry, for the error of a request that never fits."""
+        self._place = place
         self._tpm = tpm
         self._window_s = window_s
         self._throttles: list[_Throttle] = []
@@ -86,8 +89,8 @@ class Limiter:
         if self._tpm is not None and tokens > self._tpm:
             raise UsageError(
                 f"one request may use {tokens} tokens, more than the limit of {self._tpm} tokens "
-                "a minute: raise --tpm to your account's limit or lower max_output_tokens in "
-                "experiments/models.toml"
+                "a minute: raise --tpm to your account's limit or lower max_output_tokens of "
+                + self._place
             )
         loop = asyncio.get_running_loop()
         turn = _Turn(order, next(self._arrivals), tokens, loop.create_future())

@@ -1,4 +1,4 @@
-"""The models of ``experiments/models.toml``, those that a user adds, and what each may be sent."""
+"""The models that ship, those that a user adds, and what each may be sent."""
 
 from __future__ import annotations
 
@@ -55,7 +55,10 @@ def read_entries(path: Path) -> dict[str, ModelEntry]:
     Raises UsageError.
     """
     tables = toml_of(read_text(path), str(path)).items()
-    return {name: validated(ModelEntry, table, f"{path}: [{name}]") for name, table in tables}
+    return {
+        name: validated(ModelEntry, table, f"{path}: [{name}]").standing_at(f"[{name}] in {path}")
+        for name, table in tables
+    }
 
 
 def read_models(path: Path) -> dict[str, ModelEntry]:
@@ -103,7 +106,8 @@ def with_parameter(name: str, entry: ModelEntry, parameter: str, level: JsonValu
     What is the provider's default already is not sent.
     """
     if parameter == CAP:
-        return validated(ModelEntry, {**dict(entry), CAP: level}, name)
+        capped = validated(ModelEntry, {**dict(entry), CAP: level}, name)
+        return capped.standing_at(entry.place)
     if parameter == EFFORT and entry.efforts:
         if level not in entry.efforts:
             raise unknown_name(f"{EFFORT} of {name}", str(level), entry.efforts)

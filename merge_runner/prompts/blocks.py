@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import dropwhile
@@ -360,10 +360,11 @@ def with_block(
     anchor: str | None = None,
     *,
     after: bool = False,
+    earlier: Collection[str] = (),
 ) -> dict[str, Block]:
     """The blocks of a prompt and one more, before or ``after`` its anchor.
 
-    After an anchor it stands behind what levels of words have added there already.
+    After an anchor it stands behind what levels of words, or ``earlier`` prompts, added there.
     Without an anchor it stands where it says itself, or before the first block of the paper that
     follows there; else at the end. Raises UsageError for a place that there is not.
     """
@@ -374,7 +375,8 @@ def with_block(
         anchor = next((each for each in later if each in blocks), None)
     names = list(blocks)
     place = len(names) if anchor is None else names.index(anchor) + after
-    while after and place < len(names) and "=" in names[place]:  # as in ``hurry=yes.1``
+    added_there = {*earlier, *(each for each in names if "=" in each)}  # as ``hurry=yes.1``
+    while after and place < len(names) and names[place] in added_there:
         place += 1
     # Where it stands is a part of its hash.
     added = replace(block, before=[*names, LAST][place])

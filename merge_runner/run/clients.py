@@ -64,7 +64,8 @@ def live_clients(
         stack.push_async_callback(transports[model].close)
         rates = options.rates(plan.entries[name])
         rpm, tpm = (limit and max(1, int(limit * share)) for limit in rates)
-        limiters.setdefault(model, Limiter(rpm=rpm, tpm=tpm, pause=pauses[plan.endpoints[name]]))
+        pause, place = pauses[plan.endpoints[name]], plan.entries[name].place
+        limiters.setdefault(model, Limiter(rpm=rpm, tpm=tpm, pause=pause, place=place))
     budget = Budget(ledger, options.max_cost_usd, trial_costs(plan, earlier, batch=options.batch))
     # Two names of one model may ask the same.
     under_way: dict[str, Call] = {}
@@ -131,8 +132,8 @@ def _check_money(plan: Plan, options: Options, ledger: Ledger) -> None:
         unknown = cost_usd(entry, Usage(input_tokens=1, output_tokens=1)) is None
         if options.max_cost_usd is not None and unknown:
             raise UsageError(
-                f"the price of {name} is unknown, so --max-cost cannot hold: give it a price in "
-                "experiments/models.toml"
+                f"the price of {name} is unknown, so --max-cost cannot hold: give it a `price` in "
+                + entry.place
             )
     if not plan.is_free:
         ledger.read()
@@ -187,7 +188,7 @@ def check_batches(plan: Plan, options: Options) -> None:
             )
             raise UsageError(
                 f"{plan.registered[name]} has no batch mode that is known; valid with --batch: "
-                f"{valid}. Leave --batch out, or give the entry in experiments/models.toml `batch "
+                f"{valid}. Leave --batch out, or give {entry.place} `batch "
                 "= { price_factor = 0.5, source = ... }` where its server has one in the same "
                 "format"
             )

@@ -117,7 +117,9 @@ async def connected(where: str) -> AsyncIterator[Client]:
     try:
         import distributed
     except ModuleNotFoundError as exc:
-        raise UsageError("--dask needs the package distributed: pip install distributed") from exc
+        raise UsageError(
+            "--dask needs the package distributed: pip install 'merge-runner[dask]'"
+        ) from exc
 
     async with AsyncExitStack() as stack:
         stack.enter_context(_silenced(map(logging.getLogger, LOGGERS)))
@@ -397,6 +399,7 @@ class DaskTasks:
     _ledger: Ledger
     first: FirstDecisions
     waits: Sequence[Wait] = ()
+    held: int = 0
     workers: int = 0
     _run: str = field(default_factory=secrets.token_hex)
     _groups: deque[list[TrialSpec]] = field(default_factory=deque)

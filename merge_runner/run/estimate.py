@@ -7,11 +7,12 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import chain
+from statistics import median
 
 from merge_runner.config import ModelEntry
 from merge_runner.llm.batch.providers import batch_terms
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.kinds import Answers
+from merge_runner.llm.kinds import Answers, kinds_of
 from merge_runner.llm.prices import cost_usd
 from merge_runner.prompts.blocks import render_prompt
 from merge_runner.records import SIDES, Usage, canonical_json
@@ -24,6 +25,9 @@ from merge_runner.study.crossing import Arm
 PROMPT_MARGIN = 1.25
 # Trials that turn out longer, and attempts that are charged but bring no answer.
 TRIAL_MARGIN = 1.5
+# Latencies are of the newest calls: of so many of each model, if they are among so many of all.
+ENOUGH, MOST_READ = 200, 10_000
+NONE_KNOWN: Mapping[str, float] = {}
 
 
 def earlier_answers(plan: Plan, cache: ResponseCache) -> dict[str, Usage | None]:
@@ -32,10 +36,7 @@ def earlier_answers(plan: Plan, cache: ResponseCache) -> dict[str, Usage | None]
     None: the endpoint has answered, but no such request; a model whose endpoint has never answered
     is missing. No mock model's answers count, and none that leaves its tokens out.
     """
-    like = {}
-    for name, entry in plan.entries.items():
-        sent = plan.parts.formats[entry.format].request(entry, "")
-        like[name] = entry.id, plan.endpoints[name], sent.path, canonical_json(sent.body)
+    like = _asked_as(plan)
     sums: dict[str, Answers] = {}
     for kind, answers in chain.from_iterable(kinds.items() for kinds in cache.kinds()):
         asked = kind.model, kind.endpoint, kind.path, kind.body
@@ -43,6 +44,33 @@ def earlier_answers(plan: Plan, cache: ResponseCache) -> dict[str, Usage | None]
             counts = kind.own and like[name] == asked
             sums[name] = sums.get(name, Answers()).plus(answers if counts else Answers())
     return {name: _mean(answers) for name, answers in sums.items()}
+
+
+def usual_latencies_s(
+    plan: Plan, cache: ResponseCache, facts: Mapping[str, Usage | None]
+) -> dict[str, float]:
+    """Return the median latency of the answers that ``facts`` measured, of the newest of them."""
+    like = _asked_as(plan)
+    found: dict[str, list[float]] = {name: [] for name, usage in facts.items() if usage is not None}
+    for call in cache.newest(MOST_READ) if found else ():
+        last = call.attempts[-1]
+        (kind,) = kinds_of([(call.request, last)])
+        asked = kind.model, kind.endpoint, kind.path, kind.body
+        if kind.own and last.latency_s is not None:
+            for name in (name for name in found if like[name] == asked):
+                found[name].append(last.latency_s)
+        if all(len(latencies_s) >= ENOUGH for latencies_s in found.values()):
+            break
+    return {name: median(latencies_s) for name, latencies_s in found.items() if latencies_s}
+
+
+def _asked_as(plan: Plan) -> dict[str, tuple[str, str, str, str]]:
+    """Return the id, endpoint, path and body without a prompt by which each model is asked."""
+    asked = {}
+    for name, entry in plan.entries.items():
+        sent = plan.parts.formats[entry.format].request(entry, "")
+        asked[name] = entry.id, plan.endpoints[name], sent.path, canonical_json(sent.body)
+    return asked
 
 
 def _mean(answers: Answers) -> Usage | None:
@@ -90,12 +118,14 @@ def estimate(
     trials: int,
     calls: Mapping[str, Mapping[str, float]],
     facts: Mapping[str, Usage | None],
+    latencies_s: Mapping[str, float] = NONE_KNOWN,
     stored: int = 0,
 ) -> Estimate:
     """Return the estimate for the ``trials`` that a live run of a plan has yet to ask for.
 
     ``calls`` is roughly how many each model has yet to answer, by arm. ``facts`` is what the cache
-    knows about each model's earlier answers to similar requests at its endpoint.
+    knows about each model's earlier answers to similar requests at its endpoint, ``latencies_s``
+    their median, in place of what the registry says.
     """
     number = read = written = 0
     usd = singly_usd = 0.0
@@ -118,7 +148,8 @@ def estimate(
             usd += asked_usd
             by_model[model] += asked_usd
             # An account's limits are those of a model, with whatever parameters it is asked.
-            call_s = max(entry.typical_latency_s / at_once, _limited_s(options, entry, usage))
+            latency_s = latencies_s.get(name, entry.typical_latency_s)
+            call_s = max(latency_s / at_once, _limited_s(options, entry, usage, latency_s))
             busy_s[model] += asked * call_s
     rounds = max((math.ceil(usual_prompts(arm)) for arm in plan.arms), default=0)
     return Estimate(
@@ -179,14 +210,14 @@ def _price_factor(entry: ModelEntry, batch: bool) -> float:
     return terms.price_factor if terms else 1.0
 
 
-def _limited_s(options: Options, entry: ModelEntry, usage: Usage) -> float:
+def _limited_s(options: Options, entry: ModelEntry, usage: Usage, latency_s: float) -> float:
     """Return how long the limits stretch a call, in s.
 
     Within a minute's window it counts with its output cap until its reply is in, and with its
     actual tokens from then on.
     """
     rpm, tpm = options.rates(entry)
-    waiting = min(entry.typical_latency_s / 60, 1.0)
+    waiting = min(latency_s / 60, 1.0)
     written = waiting * entry.max_output_tokens + (1 - waiting) * (usage.output_tokens or 0)
     tokens = (usage.input_tokens or 0) + written
     return max(60 / (rpm or math.inf), 60 * tokens / (tpm or math.inf))

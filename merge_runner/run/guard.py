@@ -9,7 +9,6 @@ from collections.abc import AsyncIterator, Collection
 from contextlib import asynccontextmanager
 
 from merge_runner.errors import NoValidDecision
-from merge_runner.llm.http_outcome import REGISTRY
 from merge_runner.records import Decision
 from merge_runner.text_safety import one_line
 
@@ -19,7 +18,7 @@ SHOWN = 300
 ADVICE = (
     "look at what the prompt asks for, and in which output format; some servers hold a small "
     "model to it by a grammar. Where replies are cut off or empty, set a higher "
-    f"`max_output_tokens` in {REGISTRY}"
+    "`max_output_tokens` in the model's table of models.toml"
 )
 
 

@@ -81,6 +81,11 @@ class LocalRunner:
         """What the calls wait for that are not in flight."""
         return [wait for client in self.clients.values() for wait in client.waits]
 
+    @property
+    def held(self) -> int:
+        """How many of the running trials wait for money."""
+        return len(set().union(*(client.money.waiting for client in self.clients.values())))
+
     def _is_idle(self) -> bool:
         """Whether no trial goes on by itself: all ask, and wait for the answers to others."""
         idle = sum(client.idle_askers for client in self.clients.values())

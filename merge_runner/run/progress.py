@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import sys
-from collections import Counter
+import textwrap
+from collections import Counter, defaultdict
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
@@ -15,7 +17,7 @@ from typing import TYPE_CHECKING, Literal
 
 from merge_runner.llm.call import Meter
 from merge_runner.llm.ledger import Ledger
-from merge_runner.run.plan import Plan
+from merge_runner.run.plan import Plan, usual_prompts
 from merge_runner.run.progress_file import (
     ProgressSnapshot,
     clear_dead,
@@ -33,6 +35,7 @@ PULSE_S = 0.05
 # In pulses: how often the file and a terminal are written, and plain lines.
 PUBLISHED_EVERY, PLAIN_EVERY = 20, 100
 REASONS_SHOWN = 3
+LONGEST_LINE, CENT_USD = 120, 0.005
 CLOSE_IT = "you may close this: the same command goes on"
 
 
@@ -41,6 +44,7 @@ class Progress:
     """Where a sweep stands; ``runner`` plays its trials.
 
     ``planned`` is the number of all trials, ``stored`` of those that were stored before this run.
+    ``todo`` has by arm the others, and ``done`` those of them that have ended.
     ``outcome_counts`` counts how the trials of this run ended: with a Status, or ``suspended``
     until there is more money. ``worst_stall_s`` is the longest delay of the event loop.
     """
@@ -49,6 +53,8 @@ class Progress:
     planned: int
     runner: Player
     ledger: Ledger
+    todo: Counter[str]
+    done: Counter[str] = field(default_factory=Counter)
     stored: int = 0
     cap_usd: float | None = None
     outcome_counts: Counter[str] = field(default_factory=Counter)
@@ -75,14 +81,12 @@ class Progress:
         ended = self.outcome_counts.total() - self.outcome_counts["suspended"] - failed
         batches = first_of(self.batches(), "others", REASONS_SHOWN)
         # How long a batch takes nobody knows.
-        left_s = (
-            None
-            if batches
-            else self._left_s(elapsed_s, ended + failed, meter.calls_live + meter.calls_cached)
-        )
+        left_s = None if batches else self._left_s(elapsed_s, ended + failed)
         before = f" (+{self.stored} stored before)" if self.stored else ""
         workers = "" if self.runner.workers is None else f" on {self.runner.workers} workers"
-        running = f"{self.runner.running} running{workers}"
+        held = self.runner.held
+        running = f"{max(0, self.runner.running - held)} running{workers}"
+        running += f", {held} wait for money" if held else ""
         total = self.planned - self.stored
         trials = f"{ended + failed}/{total} ended{before}, {running}"
         cost = f"{meter.cost_usd:.2f} USD"
@@ -110,32 +114,51 @@ class Progress:
             rows=tuple((name, printable(text)) for name, text in rows),
         )
 
-    def _left_s(self, elapsed_s: float, ended: int, calls: int) -> float | None:
+    def _left_s(self, elapsed_s: float, ended: int) -> float | None:
         """The estimated time left in s; None while there is nothing to estimate it from.
 
-        Trials that run in step all end late, so early in a run the calls are a better basis.
+        It is that of the slowest model. Trials that run in step all end late, so early in a run the
+        calls are a better basis.
         """
         total = self.planned - self.stored
-        expected_calls = sum(self.plan.usual_calls.values()) * total / self.plan.trials
-        by_calls = min(calls / expected_calls, 0.99) if expected_calls else 0.0
-        part = max(ended / total, by_calls) if ended < total else 0.0
+        if ended >= total:
+            return None
+        parts = [
+            max(self._trials(self.done, model) / trials, share)
+            for model, share in self._shares().items()
+            if self._trials(self.done, model) < (trials := self._trials(self.todo, model))
+        ]
+        part = min(parts, default=ended / total)
         return elapsed_s / part - elapsed_s if part else None
 
-    def _decided(self) -> Iterator[str]:
-        """How much of its decisions each model has made, or of all where one drives.
+    def _trials(self, by_arm: Counter[str], model: str) -> int:
+        """How many of these trials a model takes part in."""
+        registered = self.plan.registered
+        return sum(
+            by_arm[arm.label]
+            for arm in self.plan.arms
+            if model in {registered[name] for name in arm.entries}
+        )
+
+    def _shares(self) -> dict[str, float]:
+        """The share of its decisions that each model has made, of those that are left to it.
 
         How many a trial takes is known when it has ended: the share is of the usual number.
         """
-        part = (self.planned - self.stored) / self.plan.trials
-        expected, made = dict[str, float](), Counter[str]()
-        for name, calls in self.plan.usual_calls.items():
-            model = self.plan.registered[name]
-            expected[model] = expected.get(model, 0.0) + calls * part
-            if meter := self.runner.meters.get(name):
-                made[model] += meter.calls_live + meter.calls_cached
-        for model, calls in expected.items():
-            share = min(made[model] / calls, 0.99) if calls else 0.0
-            yield f"{f'{model}: ' * (len(expected) > 1)}about {share:.0%} of the decisions"
+        expected, made = defaultdict[str, float](float), Counter[str]()
+        for arm in self.plan.arms:
+            for name in filter(arm.entries.get, arm.asked.values()):
+                model = self.plan.registered[name]
+                expected[model] += self.todo[arm.label] * usual_prompts(arm)
+        for name, meter in self.runner.meters.items():
+            made[self.plan.registered.get(name, name)] += meter.calls_live + meter.calls_cached
+        return {m: min(made[m] / calls, 0.99) for m, calls in expected.items() if calls}
+
+    def _decided(self) -> Iterator[str]:
+        """How much of its decisions each model has made, or of all where one drives."""
+        shares = self._shares()
+        for model, share in shares.items():
+            yield f"{f'{model}: ' * (len(shares) > 1)}about {share:.0%} of the decisions"
 
     def _warnings(self) -> Iterator[str]:
         if problem := self.unstored():
@@ -225,18 +248,33 @@ def terminal_text(progress: Progress) -> Text:
 
 @dataclass
 class Log:
-    """The progress as short lines, where no terminal shows it: without what is as it should be."""
+    """The progress as short lines, where no terminal shows it: without what is as it should be.
+
+    What is a warning, or may be known once, is a line of its own.
+    """
 
     said: str = ""
+    once: set[str] = field(default_factory=set)
 
     def show(self, progress: Progress) -> None:
         """Say where the sweep stands; once the trials have ended, only what is new."""
-        rows = progress.snapshot("").rows
-        usual = {("failed", "0"), ("cost", "0.00 USD")}
-        shown = (row for row in rows if row not in usual and row[0] not in {"calls", "time"})
-        line = "; ".join(text if name == "decided" else f"{name}: {text}" for name, text in shown)
+        snapshot = progress.snapshot("")
+        for name, text in snapshot.rows:
+            # Numbers of the same warning change.
+            same = re.sub(r"\d+", "", text)
+            if (name == "WARNING" or text == CLOSE_IT) and same not in self.once:
+                say(f"{name}: {text}")
+                self.once.add(same)
+        rows = dict(reversed(snapshot.rows))  # the first of each name
+        ended = snapshot.ended + snapshot.failed - progress.stored
+        line = f"trials: {ended}/{progress.planned - progress.stored} ended"
+        line += f"; failed: {snapshot.failed}" if snapshot.failed else ""
+        line += f"; cost: {rows['cost']}" if snapshot.cost_usd >= CENT_USD else ""
         if line != self.said or progress.doing == "playing":
-            say(f"{line}; {dict(rows)['time']}")
+            waits = f"; waiting: {rows['waiting']}" if "waiting" in rows else ""
+            say(
+                textwrap.shorten(f"{line}; {rows['time']}{waits}", LONGEST_LINE, placeholder=" ...")
+            )
         self.said = line
 
 

@@ -39,7 +39,7 @@ from merge_runner.errors import (
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LONG_WAIT_S
-from merge_runner.llm.http_outcome import REGISTRY, TransportFailure, if_nobody, set_base_url
+from merge_runner.llm.http_outcome import TransportFailure, if_nobody, set_base_url
 from merge_runner.llm.ledger import Ledger, scopes
 from merge_runner.paths import DEFAULT_DB, SHIPPED_RECORDINGS, command_at
 from merge_runner.records import ReplayMiss, TrialRecord, TrialSpec, canonical_json
@@ -50,7 +50,7 @@ from merge_runner.results.recording import Miss, described, explain, recorded_pa
 from merge_runner.results.store import Store, sweep_facts
 from merge_runner.run.clients import check_batches, live_clients, open_rounds
 from merge_runner.run.cluster import DaskTasks, connected
-from merge_runner.run.estimate import Estimate, earlier_answers, estimate
+from merge_runner.run.estimate import Estimate, earlier_answers, estimate, usual_latencies_s
 from merge_runner.run.guard import MOST_INVALID, FirstDecisions
 from merge_runner.run.local_runner import (
     AGAIN,
@@ -240,6 +240,7 @@ class Sweep:
         return Progress(
             plan=self._plan,
             planned=len(self._stored) + len(self.todo),
+            todo=Counter(spec.arm for spec in self.todo),
             stored=len(self._stored),
             runner=runner,
             ledger=self._ledger,
@@ -278,13 +279,15 @@ class Sweep:
                 if name in arm.entries:
                     answered = sum(row.side == side for row in record.decisions) if record else 0
                     calls[spec.arm][name] += max(1.0, usual_prompts(arm) - answered)
+        facts = earlier_answers(self._plan, self._cache)
         expected = estimate(
             self._plan,
             self._options,
             trials=trials,
             stored=0 if whole else len(self._stored),
             calls=calls,
-            facts=earlier_answers(self._plan, self._cache),
+            facts=facts,
+            latencies_s=usual_latencies_s(self._plan, self._cache, facts),
         )
         cap_usd = self._options.max_cost_usd
         if cap_usd is None or whole:
@@ -358,6 +361,7 @@ class Sweep:
                 suspended = str(record)
             else:
                 counts[record.status] += 1
+                progress.done[spec.arm] += 1
                 misses.extend(_misses(record))
                 flusher.add(record)
 
@@ -558,8 +562,8 @@ async def _served_name(name: str, entry: ModelEntry, *, say: Callable[[str], Non
         models = ", ".join(listed) or "no model"
     except TransportFailure as exc:
         if exc.outcome == "no_connection":
-            raise ProviderDown(f"{driver}: {exc}: {if_nobody(name, entry)}") from exc
-        wrong = f"; if that is another server, {set_base_url(name, entry)}"
+            raise ProviderDown(f"{driver}: {exc}: {if_nobody(entry)}") from exc
+        wrong = f"; if that is another server, {set_base_url(entry)}"
         listed, models = [], f"models that it does not list ({exc}{wrong})"
     finally:
         telling.cancel()
@@ -567,7 +571,7 @@ async def _served_name(name: str, entry: ModelEntry, *, say: Callable[[str], Non
         variable = PROVIDERS.require(entry.provider).model_env
         raise UsageError(
             f"{driver} serves {models}: name one with "
-            f"{variable}, or with `id` of [{name}] in {REGISTRY}, which takes precedence"
+            f"{variable}, or with `id` of {entry.place}, which takes precedence"
         )
     say(f"{driver} serves {listed[0]}, which is asked")
     return listed[0]

@@ -38,6 +38,10 @@ class Player(Protocol):
         """How many trials are under way."""
 
     @property
+    def held(self) -> int:
+        """How many of them wait for money, as far as this process knows."""
+
+    @property
     def workers(self) -> int | None:
         """On how many workers they are; None: in this process."""
 

@@ -15,8 +15,9 @@ from pydantic import JsonValue
 from merge_runner.config import PERFECT, ModelEntry, ScenarioConfig, both_sides, ego_side, validated
 from merge_runner.drivers.pace import pace_of
 from merge_runner.drivers.registry import EMULATOR, PROGRAMS, Program
-from merge_runner.errors import UsageError
+from merge_runner.errors import UsageError, unknown_name
 from merge_runner.llm.models import known_parameters, with_parameter
+from merge_runner.planted_effect import PREFIX
 from merge_runner.prompts.blocks import BASELINE, VARIANTS, composed
 from merge_runner.records import SIDES, Side, other_side
 from merge_runner.registry import require
@@ -186,8 +187,8 @@ def _check_names(file: StudyFile, registry: Mapping[str, ModelEntry]) -> None:
         for level in levels:
             require(listed, f"level of {name} in [texts.{name}]:", level)
     for name in (*file.factors, *file.effect):
-        hint = f"declare its texts as [texts.{name}.LEVEL]; models and skip stand above [factors]"
-        require(valid | file.texts, "factor", name, hint)
+        if name not in valid | file.texts:
+            raise _unknown_factor(name, [*valid, *file.texts])
     for name in file.given_to:
         if name in file.texts:
             raise UsageError(f"given_to of {name} stands with its words: in [texts.{name}.LEVEL]")
@@ -197,6 +198,15 @@ def _check_names(file: StudyFile, registry: Mapping[str, ModelEntry]) -> None:
     taken += [f"{PERCEPTION}.{name}" for name in file.perception if name == PERFECT_ONE]
     if taken:
         raise UsageError(f"[{taken[0]}] needs another name: there is one of this name already")
+
+
+def _unknown_factor(name: str, valid: Iterable[str]) -> UsageError:
+    """The error for a factor that there is not; parameters of the emulator are not suggested."""
+    likely = f"words are declared under [texts.{name}.LEVEL]"
+    if name == MODEL or name in StudyFile.model_fields:
+        likely = "models, skip and other keys of the study stand above [factors]"
+    shown = [each for each in valid if not each.startswith(PREFIX)]
+    return unknown_name("factor", name, shown, likely=likely)
 
 
 def _skipped(

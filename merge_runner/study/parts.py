@@ -306,6 +306,7 @@ def _changed(
     """The blocks of a prompt that is changed to the one of this name; raises UsageError."""
     kind = f"block of the prompt {name}"
     blocks = dict(before)
+    earlier = [each for each, block in before.items() if block.before is not None]
     for each in change.remove:
         require(blocks, kind, each)
         del blocks[each]
@@ -322,5 +323,6 @@ def _changed(
             block = BLOCKS.require(added.block, f"the prompt {name} adds it")
         if anchor is not None:
             require(blocks, kind, anchor)
-        blocks = with_block(blocks, block_name, block, anchor, after=added.after is not None)
+        after = added.after is not None
+        blocks = with_block(blocks, block_name, block, anchor, after=after, earlier=earlier)
     return blocks

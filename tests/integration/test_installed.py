@@ -127,6 +127,13 @@ def test_make_says_the_exit_code_of_the_program(tmp_path):
     assert missed.code == 2
 
 
+def test_make_opens_the_notebooks():
+    asked = run(PROJECT, "make", "-n", "-B", "notebook", "ARGS=--no-browser").out
+    assert asked.splitlines()[-1] == ".venv/bin/jupyter lab docs/notebooks --no-browser"
+    assert ".venv/bin/python -m pip" in asked
+    assert '".[notebook]"' in asked
+
+
 def test_make_hands_nothing_to_an_inner_make(tmp_path):
     inner = tmp_path / "Makefile"
     inner.write_text((PROJECT / "Makefile").read_text().split("help:")[0] + "\ninner:\n\t@env\n")

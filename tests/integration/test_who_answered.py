@@ -13,7 +13,9 @@ from merge_runner.llm.cache import ResponseCache
 from merge_runner.records import SCRIPTED_FIELD, Attempt, Slot, is_scripted, make_request
 from merge_runner.results.database import in_memory, schema_sql
 from merge_runner.results.recording import export_recording, read_recording
-from merge_runner.results.store import results_digest
+from merge_runner.results.store import query, results_digest
+from merge_runner.run.estimate import earlier_answers, usual_latencies_s
+from merge_runner.run.plan import make_plan
 from merge_runner.run.stored_replay import audit_database
 from tests.support.harness import FAST, PROJECT, as_a_model, watched
 
@@ -118,13 +120,13 @@ def test_what_a_model_writes_does_not_make_it_a_stand_in(reply, scripted):
 
 @pytest.fixture
 def estimated(merge_runner):
-    """What a whole sweep of o3 is estimated at, and whose earlier answers were measured."""
+    """What a whole sweep of o3 is estimated at, whether by earlier answers, and its minutes."""
 
     async def estimate(**changes):
         run = await merge_runner("sweep", "baseline", "--model", "o3", "--dry-run", "--json",
                                  **{"OPENAI_API_KEY": "x", **changes})  # fmt: skip
         assert run.code == 0, run.err
-        return run.summary["cost_usd"], run.summary["measured"]
+        return tuple(run.summary[name] for name in ("cost_usd", "measured", "minutes"))
 
     return estimate
 
@@ -149,7 +151,7 @@ async def test_a_stand_in_is_said_to_answer_and_does_not_change_what_a_model_is_
 
 
 async def test_answers_at_another_effort_or_place_do_not_change_it_either(
-    merge_runner, estimated, tmp_path
+    merge_runner, estimated, tmp_path, monkeypatch
 ):
     async with watched(as_a_model, honest=False) as server:
         there = pointed_at(f"{server.url}/v1")
@@ -159,6 +161,15 @@ async def test_answers_at_another_effort_or_place_do_not_change_it_either(
     assert marks(tmp_path / "results/merge.duckdb") == [(False, False, 200)]
     assert (await estimated(**there))[1], "of these there is something to measure"
     assert not (await estimated())[1]
+    assert (await estimated(**there))[2] < (await estimated())[2], "by the latency of these"
+    for variable, url in there.items():
+        monkeypatch.setenv(variable, url)
+    plan, cache = make_plan("baseline", "o3"), ResponseCache(tmp_path / "cache/responses")
+    db = tmp_path / "results/merge.duckdb"
+    ((median_s,),) = query(db, "SELECT median(latency_s) FROM calls")[1]
+    facts = earlier_answers(plan, cache)
+    assert usual_latencies_s(plan, cache, facts) == {"o3": pytest.approx(median_s)}
+    cache.close()
     registry = (PROJECT / "experiments/models.toml").read_text()
     (tmp_path / "experiments").mkdir()
     (tmp_path / "experiments/models.toml").write_text(registry.replace('"medium"', '"high"'))

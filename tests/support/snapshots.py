@@ -1,5 +1,6 @@
 """The progress of a sweep of the emulator, as far as a display asks for it."""
 
+from collections import Counter
 from types import SimpleNamespace
 
 from merge_runner.llm.ledger import Spending
@@ -10,13 +11,14 @@ SPENDING = Spending(spent_usd=4.0, reserved_usd=0.25)
 LEDGER = SimpleNamespace(spending=SPENDING, committed_usd=SPENDING.committed_usd)
 
 
-def runner(*meters, running=0, waits=()):
+def runner(*meters, running=0, waits=(), held=0):
     """Plays nothing, and has counted this."""
-    named = {str(number): meter for number, meter in enumerate(meters)}
-    return SimpleNamespace(meters=named, waits=waits, running=running, workers=None)
+    named = dict(zip(("emulator", "another"), meters, strict=False))
+    return SimpleNamespace(meters=named, waits=waits, running=running, held=held, workers=None)
 
 
 def progress(runner, planned=10, **changes):
     """Of ten trials where nothing else is said, so that about 210 calls are expected."""
     plan = make_plan("baseline", "emulator")
+    changes.setdefault("todo", Counter(baseline=planned))
     return Progress(plan, planned, runner, LEDGER, **changes)

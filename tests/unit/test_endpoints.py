@@ -1,3 +1,4 @@
+import re
 import tomllib
 from datetime import date
 
@@ -13,7 +14,9 @@ from merge_runner.config import (
 )
 from merge_runner.errors import UsageError
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.models import read_models, shutdown_notes
+from merge_runner.llm.http import url_of
+from merge_runner.llm.http_outcome import if_nobody
+from merge_runner.llm.models import read_models, shutdown_notes, with_parameter
 from tests.support.harness import PROJECT
 
 REGISTRY = PROJECT / "experiments/models.toml"
@@ -114,6 +117,23 @@ def test_a_warning_comes_thirty_days_before_a_model_closes_and_from_then_on(toda
     assert said.startswith(note)
     assert said.endswith("; its successor is n")
     assert not [*shutdown_notes({"other": entry()}, date.fromisoformat(today))]
+
+
+def test_an_entry_names_the_file_that_it_was_read_from_with_whatever_parameters(tmp_path):
+    path = tmp_path / "models.toml"
+    path.write_text(
+        '[mine]\nprovider = "openai"\nformat = "openai-chat"\nid = "m"\nmax_output_tokens = 10\n'
+        'base_url = "http://gpu/v1"\nkey_env = "MY_KEY"\n'
+    )
+    mine, place = read_models(path)["mine"], f"[mine] in {path}"
+    capped = with_parameter("mine", mine, "max_output_tokens", 5)
+    warm = with_parameter("mine", capped, "temperature", 1.0).model_copy(update={"id": "n"})
+    assert warm.place == place
+    assert with_parameter("mine", mine, "max_output_tokens", 10) == mine
+    assert if_nobody(warm).startswith(f"check the network, or correct `base_url` of {place}; ")
+    endpoint = resolve_endpoint("mine", warm, {"MY_KEY": "k"})
+    with pytest.raises(UsageError, match=f"'m' can be no path: correct {re.escape(place)}"):
+        url_of(endpoint.base_url, "m", endpoint.place)
 
 
 def test_a_registry_that_is_missing_is_an_error(tmp_path):

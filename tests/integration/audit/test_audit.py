@@ -271,6 +271,15 @@ def test_what_another_sweep_has_played_since_is_not_missing(db):
     note = f"goes on from the run of {began:%Y-%m-%d %H:%M}: 1 of its trials were stored before"
     assert note in found.notes
     assert f"{found.audits[1]['subject']} and {stopped}" not in found.notes
+    checked = "1 of its trials are checked with a later sweep that has them too"
+    assert checked not in found.notes
+    other = stopped.replace("baseline-", "other-")
+    damage(
+        db,
+        f"UPDATE sweeps SET sweep_id = '{other}', name = 'other' WHERE sweep_id = '{stopped}'",
+        f"UPDATE sweep_trials SET sweep_id = '{other}' WHERE sweep_id = '{stopped}'",
+    )
+    assert checked in audit("--db", db).notes
 
 
 def caching(kept: dict[str, dict], **changes: object):

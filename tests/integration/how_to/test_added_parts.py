@@ -1,6 +1,8 @@
 """A driver, a condition, a block and a metric that a study adds, as docs/extend.md says."""
 
 import json
+import subprocess
+import sys
 
 import pytest
 
@@ -70,6 +72,12 @@ def run(folder, prepare):
 @pytest.fixture
 def rows(folder):
     return lambda sql: query(folder / "results/merge.duckdb", sql)[1]
+
+
+def test_the_driver_passes_the_lint_of_those_that_ship():
+    ruff = [sys.executable, "-m", "ruff", "check", "--stdin-filename"]
+    file = "merge_runner/drivers/impulsive.py"
+    subprocess.run([*ruff, file, "-"], input=CODE["driver"], text=True, cwd=PROJECT, check=True)
 
 
 def test_a_driver_decides_at_its_own_rate_and_is_drawn_from_its_seed(rows, run, folder):

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import math
 from functools import partial
+from types import SimpleNamespace
 from uuid import uuid4
 
 import pytest
@@ -13,8 +14,11 @@ from hypothesis import strategies as st
 from merge_runner.errors import CacheFailed, RecordingError, TrialSuspended, UsageError
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.llm.call import Meter
 from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.records import Attempt, Slot, make_request
+from merge_runner.run.local_runner import LocalRunner
+from merge_runner.run.plan import make_plan
 from tests.support.cases import cases
 from tests.support.harness import each
 
@@ -192,6 +196,22 @@ async def test_money_that_is_left_is_spent_although_an_older_trial_never_asks_fo
     await budget.admit(1)
     await budget.admit(2)
     await attempt(budget, 2, 3.0, 3.0)
+
+
+async def test_trials_that_wait_for_money_are_counted_once(ledger):
+    budget = Budget(ledger, 3.0, each(2.0))
+    client = SimpleNamespace(meter=Meter(), money=budget)
+    runner = LocalRunner(make_plan("baseline"), {"one": client, "other": client}, 9)
+    await budget.admit(1)
+    both = [asyncio.create_task(budget.admit(trial)) for trial in (2, 2, 3)]
+    await asyncio.sleep(0)
+    assert (budget.waiting, runner.held) == ({2, 3}, 2)
+    budget.leave(1)
+    await asyncio.gather(*both[:2])
+    assert (budget.waiting, runner.held) == ({3}, 1)
+    budget.leave(2)
+    await both[2]
+    assert runner.held == 0
 
 
 @pytest.mark.parametrize("usd", [-9.0, -math.inf])

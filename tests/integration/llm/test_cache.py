@@ -535,6 +535,8 @@ def test_all_calls_are_counted_but_damaged_ones(cache, folder, monkeypatch, batc
             damaged = f"UPDATE Cache SET value = {value} WHERE key = ?"
             database.execute(damaged, [kept[row].request.key])
     assert cache.kinds()[1] == counted(kept[::2])
+    assert [*cache.newest(9)] == [kept[4], kept[2], kept[0]]
+    assert [*cache.newest(1)] == [kept[4]]
 
 
 def test_endpoints_are_listed_per_model_the_folders_where_the_overlay_has_none(folder):

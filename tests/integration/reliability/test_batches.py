@@ -120,6 +120,7 @@ async def test_what_cannot_go_in_batches_is_refused_in_one_line(merge_runner):
     run = await merge_runner(*sweep, "--model", "local", LOCAL_MODEL="m", EMULATOR_BASE_URL="")
     said, _, valid = run.err.splitlines()[-1].partition("; valid with --batch: ")
     assert "local has no batch mode that is known" in said
+    assert re.search(r"or give \[local\] in /.*/experiments/models.toml `batch =", valid)
     assert "o3" in valid
     assert not {"emulator", "random"} & {*valid.partition(". ")[0].split(", ")}
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import re
 import shutil
 
 import pytest
@@ -194,6 +195,7 @@ async def test_an_unknown_price_is_said_and_needs_yes(merge_runner, experiments)
         capped = await merge_runner(*sweep, "--yes", "--max-cost", 1, **env)
         assert capped.code == 2
         assert "--max-cost cannot hold" in capped.err
+        assert "give it a `price` in [mine] in experiments/models.toml" in capped.err
         assert server.requests == 0
         run = await merge_runner(*sweep, "--yes", **env)
     assert run.code == 0, run.err
@@ -230,7 +232,11 @@ async def test_what_is_set_aside_is_shown_with_its_reasons_and_released_by_name(
         assert (await merge_runner(*ONE, **account(server))).code == 0
     told = await merge_runner("ledger")
     driver = f"o3 at {server.url.removeprefix('http://')}"
-    assert "\nbaseline/o3/set0  0." in told.out
+    assert re.match(
+        r"sweep +spent_usd +reserved_usd +attempts of unknown cost\n"
+        r"baseline/o3/set0  0\.\d+ +0\.\d+ +2\n",
+        told.out,
+    ), told.out
     assert f"\nbaseline/o3/set0  {driver}  server_error  2         0." in told.out
     assert "  L_4_0 rep 1 " in told.out
     (account_before,) = json.loads((await merge_runner("ledger", "--json")).out)
@@ -247,3 +253,4 @@ async def test_what_is_set_aside_is_shown_with_its_reasons_and_released_by_name(
     assert after["spent_usd"] == account_before["spent_usd"]
     shown = await merge_runner("ledger")
     assert "server_error" not in shown.out
+    assert shown.out.split("\n")[0].split() == ["sweep", "spent_usd"]

@@ -52,7 +52,7 @@ async def test_what_cannot_be_on_a_cluster_is_told_in_one_line(merge_runner, tmp
                 pass
     (tmp_path / "distributed.py").write_text("raise ModuleNotFoundError('no distributed')")
     run = await merge_runner(*SMALL, "--dask", "local:2", PYTHONPATH=str(tmp_path))
-    told = "error: --dask needs the package distributed: pip install distributed\n"
+    told = "error: --dask needs the package distributed: pip install 'merge-runner[dask]'\n"
     assert (run.code, run.err) == (2, told)
     run = await merge_runner(*SMALL, "--replay", "--dask", "local:2")
     told = "a replay needs no cluster"

@@ -36,7 +36,7 @@ async def test_a_sweep_stores_every_trial_and_its_summary_is_five_lines(merge_ru
     assert re.fullmatch(r"calls: \d+ asked; cost 0.0000 USD", calls)
     assert who == "The model `emulator` is a scripted stand-in, no language model."
     assert checked == "checked: no problems; database: results/merge.duckdb"
-    assert run.err.splitlines()[-1].startswith("trials: 11/11 ended, 0 running; ")
+    assert run.err.splitlines()[-1].startswith("trials: 11/11 ended; ")
     assert run.err.count("trials: 11/11 ended") == 1
     named = await merge_runner(
         "sweep", "--reps", 2, "--conditions", "L_4_0", "--name", "the second"

@@ -14,7 +14,7 @@ from merge_runner.config import ModelEntry
 from merge_runner.paths import DEFAULT_DB, home_of
 from merge_runner.results.store import query, results_digest
 from merge_runner.study.file import TEMPLATE, write_folder
-from tests.support.harness import PROJECT
+from tests.support.harness import PROJECT, a_model
 
 
 @pytest.fixture
@@ -132,6 +132,15 @@ async def test_results_lie_beside_the_study_wherever_it_is_started(merge_runner,
     assert "hesitant" in tables.out
     named = await merge_runner("tables", "--study", file, "--db", DEFAULT_DB)
     assert "there is no database results/merge.duckdb" in named.err
+
+
+async def test_an_error_names_the_study_s_own_file_of_models(merge_runner, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/study.toml").write_text("models = ['small']\n[repetitions]\nbaseline = 1\n")
+    (tmp_path / "mine/models.toml").write_text(a_model("small"))
+    run = await merge_runner("sweep", "mine/study.toml", "--tpm", 1)
+    assert run.code == 2
+    assert "lower max_output_tokens of [small] in mine/models.toml" in run.err.splitlines()[-1]
 
 
 def test_a_study_of_a_folder_experiments_has_its_results_beside_that_folder(tmp_path, monkeypatch):

@@ -87,7 +87,7 @@ def test_what_no_call_of_a_run_would_fare_better_with(case):
     assert reason_of(outcome, "http://localhost/v1/chat/completions") == reason
     if reason is not None:
         entry = ModelEntry(provider="local", format="openai-chat", id="m", max_output_tokens=10)
-        assert "\n" not in why_refused(reason, "local", entry, outcome)
+        assert "\n" not in why_refused(reason, entry, outcome)
 
 
 @pytest.mark.parametrize(("url", "reason"), table("http_outcomes", "urls").items())

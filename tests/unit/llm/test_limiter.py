@@ -230,7 +230,8 @@ async def test_a_pause_is_shared_by_all_limiters_of_one_key():
 
 
 async def test_a_request_above_the_token_limit_is_refused_with_advice():
-    limiter = Limiter(tpm=100)
-    with pytest.raises(UsageError, match=r"101 tokens.*100 tokens.*--tpm"):
+    limiter = Limiter(tpm=100, place="[m] in my.toml")
+    advice = r"101 tokens.*100 tokens.*--tpm.*max_output_tokens of \[m\] in my\.toml"
+    with pytest.raises(UsageError, match=advice):
         await limiter.acquire(101)
     await limiter.acquire(100)

@@ -110,6 +110,13 @@ def test_the_estimate_takes_the_limits_into_account(limited, minutes):
     assert expected.cost_usd == pytest.approx(2310 * EACH_USD, rel=0.05)
 
 
+def test_the_time_is_by_the_latency_that_was_measured():
+    plan, options = make_plan("baseline", "o3"), Options(*PLACES, in_flight=1, rpm=10**6, tpm=10**9)
+    calls = {"baseline": {"o3": 600.0}}
+    expected = estimate(plan, options, trials=60, calls=calls, facts={}, latencies_s={"o3": 2.0})
+    assert expected.minutes == 600 * 2 / 60 / 2  # both drivers ask at once
+
+
 def test_the_estimate_is_by_what_was_measured():
     plan = make_plan("ablations", "o3", 2, variants=["baseline", "A1"])
     calls = {"baseline": {"o3": 210.0}, "A1": {"o3": 630.0}}

@@ -1,11 +1,12 @@
 """What is shown while a sweep runs."""
 
 import re
+from collections import Counter
 from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from merge_runner.llm.call import Meter
+from merge_runner.llm.call import Meter, Wait
 from merge_runner.records import Attempt, Usage
 from merge_runner.run.estimate import Estimate
 from merge_runner.run.estimate_lines import estimate_lines
@@ -38,6 +39,7 @@ def test_every_figure_is_that_of_the_meters():
     shown.planned += 7
     shown.stored += 7
     shown.outcome_counts.update(finished=2, failed=1, suspended=1)
+    shown.done.update(baseline=3)
     fields = dict(rows(shown))
     assert fields["trials"] == "3/10 ended (+7 stored before), 5 running"
     assert fields["failed"] == "1"
@@ -64,7 +66,7 @@ def test_the_calls_tell_the_time_left_while_no_trial_has_ended():
 def test_each_model_of_several_shows_its_share_of_the_decisions():
     plan = make_plan("baseline", ["emulator", "random"])
     of_each = {"emulator": Meter(calls_live=231), "random": Meter(calls_cached=9999)}
-    shown = progress(runner(), plan.trials)
+    shown = progress(runner(), plan.trials, todo=Counter(spec.arm for spec in plan.trial_specs()))
     shown.plan, shown.runner.meters = plan, of_each
     assert [text for name, text in rows(shown) if name == "decided"] == [
         "emulator: about 10% of the decisions",
@@ -74,22 +76,80 @@ def test_each_model_of_several_shows_its_share_of_the_decisions():
     assert "decided" not in dict(rows(shown))
 
 
+def test_the_time_left_is_that_of_the_slowest_model_that_has_trials_left():
+    plan = make_plan("baseline", ["emulator", "random", "constant"])
+    todo = Counter(spec.arm for spec in plan.trial_specs())
+    calls = plan.usual_calls["random"]
+    fast = {"emulator": Meter(calls_live=2 * round(calls)), "random": Meter(calls_live=calls // 4)}
+    shown = progress(runner(), plan.trials, began_at=ago(100), todo=todo)
+    shown.plan, shown.runner.meters = plan, fast
+
+    def left_s():
+        spent_s, left_s = times(dict(rows(shown))["time"])
+        return left_s * 100 / spent_s
+
+    shown.done.update(emulator=todo["emulator"] - 1)
+    shown.outcome_counts.update(finished=todo["emulator"] - 1)
+    assert left_s() == pytest.approx(300, rel=0.05)
+    # A model whose trials have ended with fewer calls than usual is not waited for.
+    fast["emulator"].calls_live = 1
+    shown.done["emulator"] += 1
+    assert left_s() == pytest.approx(300, rel=0.05)
+    fast["random"].calls_live = 0
+    assert "left" not in dict(rows(shown))["time"]
+    # Programs alone are left: their trials tell.
+    shown.done["random"] = todo["random"]
+    shown.outcome_counts["finished"] = todo["emulator"] + todo["random"]
+    assert left_s() == pytest.approx(50, rel=0.05)
+
+
+def test_trials_that_wait_for_money_are_not_running():
+    waiting = dict(rows(progress(runner(running=105, held=103))))
+    assert waiting["trials"] == "0/10 ended, 2 running, 103 wait for money"
+
+
 def test_a_log_says_in_short_what_is_new_and_its_last_line_once(capsys):
-    shown = progress(runner(running=3), began_at=ago(10))
+    waits = [Wait("for money " + "for ever " * 20), Wait("for another"), Wait("for another")]
+    shown = progress(runner(running=3, waits=waits), began_at=ago(10), cap_usd=20)
     shown.runner.meters = {"emulator": Meter(calls_live=70)}
     log = Log()
     log.show(shown)
     assert re.fullmatch(
-        r"trials: 0/10 ended, 3 running; about 33% of the decisions; \d+ s, about \d+ s left\n",
+        r"trials: 0/10 ended; \d+ s, about \d+ s left; waiting: 2 for another\n",
         capsys.readouterr().err,
     )
+    shown.runner.meters["emulator"].cost_usd = 1.5
+    shown.runner.waits = waits[:1]
+    log.show(shown)
+    line = capsys.readouterr().err
+    assert re.match(
+        r"trials: 0/10 ended; cost: 1\.50 USD, 4\.25 of 20 over all runs; "
+        r"\d+ s, about \d+ s left; waiting: 1 for money",
+        line,
+    )
+    assert 100 < len(line) <= 121
+    assert line.endswith(" ...\n")
     shown.outcome_counts.update(finished=9, failed=1)
     shown.doing = "checking"
     for _ in range(3):
         log.show(shown)
     assert re.fullmatch(
-        r"trials: 10/10 ended, 3 running; failed: 1; \d+ s\n", capsys.readouterr().err
+        r"trials: 10/10 ended; failed: 1; cost: 1.50 USD, .*; \d+ s.*\n", capsys.readouterr().err
     )
+
+
+def test_a_log_has_a_warning_once_in_a_line_of_its_own(capsys):
+    shown, log = progress(runner(Meter())), Log()
+    shown.batches = lambda: ["round 1"]
+    for number in (3, 4):
+        shown.unstored = lambda number=number: f"{number} trials wait to be stored"
+        log.show(shown)
+    warning, close, first, second = capsys.readouterr().err.splitlines()
+    assert warning == "WARNING: 3 trials wait to be stored"
+    assert close == "waiting: you may close this: the same command goes on"
+    assert [re.sub(r"\d+ s", "", line) for line in (first, second)] == [
+        "trials: 0/10 ended; ; waiting: round 1"
+    ] * 2
 
 
 def test_batches_are_shown_and_that_nobody_need_wait():
@@ -107,7 +167,7 @@ def test_replies_that_cost_more_than_is_counted_are_a_warning():
     meter = Meter(calls_live=3)
     meter.underpriced["priority"] = 2
     warning = dict(rows(progress(runner(meter))))["WARNING"]
-    assert warning.startswith("0: replies are of the service tier 'priority'")
+    assert warning.startswith("emulator: replies are of the service tier 'priority'")
     assert "tiers = { priority = 2.0 }" in warning
 
 

@@ -1,6 +1,7 @@
 """What a running sweep tells other processes in the file beside its database."""
 
 import os
+from collections import Counter
 from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
 
@@ -24,7 +25,7 @@ LEDGER = SimpleNamespace(spending=Spending())
 
 def snapshot(sweep_id="s", **changes):
     plan = make_plan("baseline", "constant", repetitions=2, conditions=["N_0_0"])
-    plain = Progress(plan, 2, LocalRunner(plan, {}, 0), LEDGER).snapshot(sweep_id)
+    plain = Progress(plan, 2, LocalRunner(plan, {}, 0), LEDGER, Counter()).snapshot(sweep_id)
     return plain.model_copy(update=changes)
 
 

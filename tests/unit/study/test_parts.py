@@ -68,6 +68,22 @@ def test_a_ready_block_stands_behind_the_situation_unless_it_is_put_elsewhere(
     assert "\n\nTime gap (" in prompt(plan, "more")
 
 
+def test_what_is_added_after_a_block_stands_behind_what_earlier_prompts_added_there(plan_of):
+    added = '{{ after = "C3.human", text = "You {}." }}'
+    plan = plan_of(
+        '[factors]\nprompt = ["late"]\nmood = ["calm", "angry"]\n'
+        f"[prompts.taxi]\nadd = [{added.format('drive a taxi')}]\n"
+        '[prompts.late]\nbased_on = "taxi"\n'
+        f"add = [{added.format('hurry')}, {added.format('are late')}]\n"
+        f"[texts.mood.angry]\nadd = [{added.format('are angry')}]\n"
+    )
+    lines = prompt(plan, "late mood=angry").split("\n\n")
+    place = lines.index("You drive a taxi.")
+    assert lines[place - 1].startswith("Drive the way a human driver")
+    # Of one list the second stands first.
+    assert lines[place + 1 : place + 4] == ["You are late.", "You hurry.", "You are angry."]
+
+
 def test_an_edited_prompt_is_another_spec_at_once(plan_of):
     texts = ["You are late.", "You are early."]
     plans = [plan_of(persona(text)) for text in texts]
