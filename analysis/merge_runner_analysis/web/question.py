@@ -85,7 +85,8 @@ class Change:
 class Answer:
     """The claim, what else there is to say, charts, and the effects behind them.
 
-    ``asked`` is the question in words, for a study that has none of its own.
+    ``asked`` is the question in words, for a study that has none of its own; ``crossed`` a factor
+    at whose levels another one may be shown.
     """
 
     asked: str
@@ -96,6 +97,7 @@ class Answer:
     trials: int
     halves: bool
     charts: list[Chart]
+    crossed: str
     crossings: str
     changes: list[Change]
     others: list[Change]
@@ -146,6 +148,7 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
         sum(count_of(row, "n") for row in _of_one_factor(shown, drawn)),
         any(row.values["k"] is None for row in known) and metric == LEFT_FIRST.name,
         [chart for chart in charts if chart],
+        names[-1] if len(names) > 1 else "",
         unbroken(_interactions(tested, {str(row.values["factor"]) for row in known})),
         _changes(tested, sides, metric),
         _changes(others, sides, metric),
@@ -236,13 +239,23 @@ def _could(rows: Sequence[Row]) -> str:
 
 
 def _seen(rows: Sequence[Row], what: str = "A change") -> str:
-    known = [
-        value_of(row, "detectable") for row in rows if row.values.get("detectable") is not None
-    ]
+    """``A change of 4.26 points by hurry, 5.05 by opponent or more would have been seen ...``.
+
+    Of a factor with several levels it is the largest, and of more than FEW factors, too.
+    """
+    known = [row for row in rows if row.values.get("detectable") is not None]
     if not known:
         return ""
-    least = f"{number(max(known))} {unit_of(rows[0])}"
-    return f"{what} of {least} or more would have been seen in four of five studies."
+    least: dict[str, float] = {}
+    for row in known:
+        factor = str(row.values["factor"])
+        least[factor] = max(least.get(factor, 0.0), value_of(row, "detectable"))
+    size = f"{number(max(least.values()))} {unit_of(known[0])}"
+    if 1 < len(least) <= FEW:
+        size = ", ".join(
+            f"{number(of)} {unit_of(known[0])} by {name}" for name, of in least.items()
+        )
+    return f"{what} of {size} or more would have been seen in four of five studies."
 
 
 def _factors(rows: Iterable[Row]) -> list[str]:

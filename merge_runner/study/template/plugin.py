@@ -1,6 +1,6 @@
 """What this study adds. Raise a driver's revision when you edit its rule: it is played anew."""
 
-from merge_runner.drivers.base import Seat
+from merge_runner.drivers.program_seat import ProgramSeat
 from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.records import Decision, Observation
 from merge_runner_analysis.metrics import Metric, register
@@ -11,7 +11,7 @@ class HesitantDriver:
 
     revision = 1
 
-    def __init__(self, seat: Seat) -> None:
+    def __init__(self, seat: ProgramSeat) -> None:
         self.seat = seat
 
     async def decide(self, observation: Observation, number: int) -> Decision:
