@@ -1,11 +1,11 @@
 """What became of the calls and decisions of each trial: tables, pages and the report count here."""
 
-from merge_runner.records import NO_DECISION
+from merge_runner.records import ANSWERS, NO_DECISION
 
 # One row a trial. A call is asked at one decision, in attempts from 1 on; the last one is its
-# answer, which a lost call has not. ``answers`` are replies, ``others`` those of another model, as
-# the condition on a row of calls has it that stands for it. ``failures`` has in lines what each
-# answer lacks, a valid plan or the decision asked for.
+# answer, which a lost call has not; ``faults`` are attempts without one. ``answers`` are replies,
+# ``others`` those of another model, as the condition on a row of calls has it that stands for it.
+# ``failures`` has in lines what each answer lacks, a valid plan or the decision asked for.
 COUNTED = f"""
 SELECT trial_id, spec_hash,
     coalesce(decisions, 0) AS decisions, coalesce(asked, 0) AS asked,
@@ -24,7 +24,8 @@ FROM trials LEFT JOIN (
     FROM decisions GROUP BY ALL
 ) USING (trial_id, spec_hash) LEFT JOIN (
     SELECT trial_id, spec_hash, count(*) AS attempts, count(*) FILTER (attempt = 1) AS calls,
-        count(*) FILTER (attempt > 1) AS retried, count(*) FILTER (outcome <> 'ok') AS faults,
+        count(*) FILTER (attempt > 1) AS retried,
+        count(*) FILTER (outcome NOT IN {ANSWERS}) AS faults,
         count(*) FILTER (outcome = 'unknown') AS unknown,
         count(*) FILTER (http_status = 200) AS answers,
         count(*) FILTER (http_status = 200 AND {{others}}) AS others,

@@ -12,6 +12,7 @@ import duckdb
 import pytest
 
 from merge_runner.errors import UsageError
+from merge_runner.records import ANSWERS
 from merge_runner.results.database import write_database
 from merge_runner.results.store import Store, query, sweep_facts
 from merge_runner.run.progress_file import remove_snapshot, write_snapshot
@@ -111,7 +112,7 @@ def test_the_page_has_the_numbers_of_the_database_and_every_rate_leads_to_its_tr
     with duckdb.connect(str(written), read_only=True) as connection:
         ((answers, attempts, failures),) = connection.execute(
             "SELECT (SELECT count(*) FROM calls WHERE http_status = 200), count(*), "
-            "count(*) FILTER (outcome <> 'ok') FROM attempts"
+            f"count(*) FILTER (outcome NOT IN {ANSWERS}) FROM attempts"
         ).fetchall()
         invalid = connection.execute(
             "SELECT DISTINCT trial_id FROM decisions WHERE NOT valid ORDER BY ALL"

@@ -97,9 +97,9 @@ SEEN = "A change of 10.00 points or more would have been seen in four of five st
             [effect(p=0.2), effect("persona", 0.3, difference=1.0)],
             "No change of who goes first is shown by hurry and persona.",
             "Hurry=yes is not shown to change it: +13.00 points [6.00, 20.00], corrected p = "
-            "0.200. Persona=yes is not shown to change it: +1.00 points [−6.00, 8.00], corrected p = "
-            "0.300. A change of 10.00 points by hurry, 10.00 points by persona or more would have "
-            "been seen in four of five studies.",
+            "0.200. Persona=yes is not shown to change it: +1.00 points [−6.00, 8.00], corrected p "
+            "= 0.300. A change of 10.00 points by hurry, 10.00 points by persona or more would "
+            "have been seen in four of five studies.",
         ),
         (
             [effect(n=12)],

@@ -38,7 +38,7 @@ TRUST = [
         ("missing decisions", "no_decision", "asked", "decisions asked",
          "a valid plan without the tactical decision that was asked for", {"cause": MISSING}),
         ("failed requests (retried)", "faults", "attempts", "requests",
-         "no answer, a refusal, or one that was cut off", {}),
+         "no answer came; a request is sent again, or its trial fails", {}),
         ("wrong model", "others", "answers", "answers",
          "it is neither the one asked for nor a declared alias of it", {}),
         ("reused replies", "shared", "replies", "replies",
