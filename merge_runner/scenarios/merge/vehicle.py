@@ -2,9 +2,42 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from math import sqrt
 
-from merge_runner.config import Resistance
+from merge_runner.config import Resistance, ScenarioConfig
+
+
+@dataclass(slots=True)
+class Vehicle:
+    """The samples of one vehicle from step 0 on, in SI units.
+
+    The acceleration of a step stands with the sample at its end. ``merged`` is the step in which it
+    was at the merge point, and how many s after its beginning.
+    """
+
+    positions: list[float]
+    velocities: list[float]
+    accelerations: list[float] = field(default_factory=lambda: [0.0])
+    merged: tuple[int, float] | None = None
+
+    def drive(self, action: float | None, config: ScenarioConfig, merge_point_m: float) -> float:
+        """Drive a step with an action in [-1, 1], None: cruise; returns the new position."""
+        position, velocity = self.positions[-1], self.velocities[-1]
+        step_s, acceleration = config.step_s, 0.0
+        if action is not None:
+            commanded = action * config.max_acceleration_mps2
+            acceleration = net_acceleration(commanded, velocity, config.resistance)
+        new_position, new_velocity = advance(position, velocity, acceleration, step_s)
+        if position < merge_point_m <= new_position:
+            left_m = merge_point_m - position
+            self.merged = len(self.positions) - 1, time_to_reach(left_m, velocity, acceleration)
+        self.positions.append(new_position)
+        self.velocities.append(new_velocity)
+        # Where the vehicle stopped within the step, what it executed is less than the command.
+        stopped = velocity + acceleration * step_s < 0
+        self.accelerations.append(-velocity / step_s if stopped else acceleration)
+        return new_position
 
 
 def advance(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
@@ -11,20 +10,7 @@ from merge_runner.records import SIDES, Observation, Side, StateRow, Status
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.conditions import Condition
 from merge_runner.scenarios.merge.geometry import Track
-from merge_runner.scenarios.merge.vehicle import advance, net_acceleration, time_to_reach
-
-
-@dataclass(slots=True)
-class _Vehicle:
-    """The samples of one vehicle from step 0 on, in SI units, and when it was at the merge point.
-
-    The acceleration of a step stands with the sample at its end.
-    """
-
-    positions: list[float]
-    velocities: list[float]
-    accelerations: list[float] = field(default_factory=lambda: [0.0])
-    merged_s: float | None = None
+from merge_runner.scenarios.merge.vehicle import Vehicle
 
 
 class World:
@@ -49,12 +35,13 @@ class World:
         self._config, self._track = config, track
         self.step = 0
         self._vehicles = {
-            side: _Vehicle([position], [speed])
+            side: Vehicle([position], [speed])
             for side, (position, speed) in (starts or dict(places)).items()
         }
         if max(positions) >= track.merge_point_m:
             raise UsageError(f"{condition}: a vehicle is at the merge point before both are driven")
-        together = collided(config, track, *self._positions())
+        at = [self._vehicles[side].positions[0] for side in SIDES]
+        together = collided(config, track, *at)
         self.status: Status | None = "collided" if together else None
 
     @property
@@ -75,36 +62,24 @@ class World:
 
     def advance(self, actions: Mapping[Side, float | None]) -> None:
         """Drive one step with normalised actions in [-1, 1]; None lets a vehicle cruise."""
-        config, dt = self._config, self._config.step_s
-        for side, vehicle in self._vehicles.items():
-            position, velocity = vehicle.positions[-1], vehicle.velocities[-1]
-            action, acceleration = actions[side], 0.0
-            if action is not None:
-                commanded = action * config.max_acceleration_mps2
-                acceleration = net_acceleration(commanded, velocity, config.resistance)
-            new_position, new_velocity = advance(position, velocity, acceleration, dt)
-            if position < self._track.merge_point_m <= new_position:
-                left_m = self._track.merge_point_m - position
-                vehicle.merged_s = self.time_s + time_to_reach(left_m, velocity, acceleration)
-            vehicle.positions.append(new_position)
-            vehicle.velocities.append(new_velocity)
-            # Where the vehicle stopped within the step, what it executed is less than the command.
-            stopped = velocity + acceleration * dt < 0
-            vehicle.accelerations.append(-velocity / dt if stopped else acceleration)
+        config, track, vehicles = self._config, self._track, self._vehicles
+        left_m = vehicles["left"].drive(actions["left"], config, track.merge_point_m)
+        right_m = vehicles["right"].drive(actions["right"], config, track.merge_point_m)
         self.step += 1
-        left_m, right_m = self._positions()
-        if collided(config, self._track, left_m, right_m):
+        if collided(config, track, left_m, right_m):
             self.status = "collided"
-        elif max(left_m, right_m) >= self._track.end_m:
+        elif max(left_m, right_m) >= track.end_m:
             self.status = "finished"
         elif self.step >= config.timeout_steps:
             self.status = "timeout"
 
     def merged_first(self) -> Side | None:
         """Who reached the merge point first; None after a collision or if nobody did."""
-        times = {s: v.merged_s for s, v in self._vehicles.items() if v.merged_s is not None}
-        if self.status == "collided" or not times:
+        merged = {s: v.merged for s, v in self._vehicles.items() if v.merged is not None}
+        if self.status == "collided" or not merged:
             return None
+        dt = self._config.step_s
+        times = {side: _time(step, dt) + within_s for side, (step, within_s) in merged.items()}
         return min(times, key=times.__getitem__)
 
     def observe(self, side: Side, step: int | None = None) -> Observation:
@@ -145,10 +120,6 @@ class World:
                 )
                 rows.append(row)
         return tuple(rows)
-
-    def _positions(self) -> tuple[float, float]:
-        """Where the left and the right vehicle are now."""
-        return self._vehicles["left"].positions[-1], self._vehicles["right"].positions[-1]
 
     def _history(self, samples: list[float], before: float) -> tuple[float, ...]:
         wanted = self._config.memory_samples
