@@ -25,6 +25,7 @@ from threading import Lock
 from typing import Annotated, Any, Literal
 
 import diskcache
+from diskcache.core import MODE_RAW
 from pydantic import Field, TypeAdapter, ValidationError
 
 from merge_runner.errors import CacheFailed, MergeRunnerError, RecordingError, UsageError
@@ -58,6 +59,7 @@ _LOOK_UP = """
 SELECT key, mode, filename, value FROM Cache WHERE raw = 1 AND key IN (?1, ?2)
 UNION ALL SELECT NULL, attempt, NULL, since FROM open WHERE call = ?1 AND outcome = 'in flight'
 """
+_ADD = "INSERT INTO Cache (key, raw, mode, value) VALUES (?, 1, 1, ?) ON CONFLICT DO NOTHING"
 _KEYS = """
 SELECT CAST(key AS BLOB) FROM Cache WHERE typeof(key) = 'text' AND key >= ? AND key < ? ORDER BY key
 """
@@ -137,6 +139,7 @@ class ResponseCache:
         self._disk = TextDisk(str(folder))
         self._writer = BatchWriter(self._run_each)
         self.write = self._writer.write
+        self.summed: object = None  # the ledger that knows its sums in the transaction under way
         if read_only:
             require(folder)
         try:
@@ -193,8 +196,8 @@ class ResponseCache:
             return None, ()
         texts = {name: row for name, *row in rows if name is not None}
         if key in texts:
-            return _verified(key, self._text(*texts[key]), request), ()
-        tried = _attempts(self._text(*texts[_UNANSWERED + key])) if texts else ()
+            return _verified(key, _text(*texts[key]), request), ()
+        tried = _attempts(_text(*texts[_UNANSWERED + key])) if texts else ()
         begun = sorted(row for row in rows if row[0] is None and row[1] > len(tried))
         unseen = (
             Attempt(number, "unknown", started_at=since, error=UNSEEN)
@@ -251,7 +254,7 @@ class ResponseCache:
         """Run operations in one durable transaction, in this thread."""
         try:
             with self._texts.transact():
-                execute = self._texts._sql
+                execute, self.summed = self._texts._sql, None
                 results = [operation(execute) for operation in operations]
                 if self._file != self._opened:
                     raise FileNotFoundError("it is no longer there")
@@ -273,7 +276,7 @@ class ResponseCache:
     def read(self, name: str) -> str | None:
         """Return the text under a name, or None; raises RecordingError where it is damaged."""
         rows = self.rows(_GET, name)
-        return self._text(*rows[0]) if rows else None
+        return _text(*rows[0]) if rows else None
 
     def replace(self, name: str, text: str, _: Execute) -> None:
         """Keep a text under a name that is no call key, behind a checksum; an operation."""
@@ -297,7 +300,7 @@ class ResponseCache:
             for row in self._reading.execute(_CALLS):
                 try:
                     ((key, raw, *value),) = self.rows(_CALL, *row)
-                    key, text = self._disk.get(key, raw), self._text(*value)
+                    key, text = self._disk.get(key, raw), _text(*value)
                     entry = _verified(key, text)
                     check_body(entry.request.body)
                     yield entry
@@ -339,7 +342,7 @@ class ResponseCache:
         calls = []
         for _, mode, filename, value in rows:
             with contextlib.suppress(RecordingError, *DAMAGED):  # it is told where it is used
-                entry = CachedCall.from_json(self._text(mode, filename, value.decode()))
+                entry = CachedCall.from_json(_text(mode, filename, value.decode()))
                 calls.append((entry.request, entry.attempts[-1]))
         newest = rows[-1][0] if rows else 0
         for row in rows_of(kinds_of(calls), newest):
@@ -372,12 +375,12 @@ class ResponseCache:
         One that is damaged goes to quarantine.
         """
         key, text = entry.request.key, _behind_checksum(entry.to_json())
-        if not self._texts.add(key, text):
+        if not execute(_ADD, (key, text)).rowcount:
             try:
                 return self._kept(key) or entry
             except RecordingError:
                 self._move_aside([key], execute)
-                self._texts.add(key, text)
+                execute(_ADD, (key, text))
         if len(entry.attempts) > 1:
             self._texts.delete(_UNANSWERED + key)
         return entry
@@ -408,10 +411,6 @@ class ResponseCache:
 
     def _tried(self, key: str) -> Attempts:
         return _attempts(self.read(_UNANSWERED + key) or "[]")
-
-    def _text(self, mode: object, filename: object, value: object) -> str:
-        """Return the text of a row; raises RecordingError where it is damaged."""
-        return _checked(self._disk.fetch(mode, filename, value))
 
     def rows(self, sql: str, *values: object) -> Rows:
         """Return the rows of a query; raises CacheFailed, or RecordingError for what is no text."""
@@ -497,9 +496,16 @@ def _behind_checksum(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:CHECKSUM_LENGTH] + text
 
 
-def _checked(text: str) -> str:
-    """Return what was put behind a checksum; raises RecordingError where that is wrong."""
-    content = text[CHECKSUM_LENGTH:]
-    if text != _behind_checksum(content):
+def _text(mode: object, filename: object, value: object) -> str:
+    """Return the text of a row, which was put behind a checksum.
+
+    Raises RecordingError where it is damaged, or none of ours.
+    """
+    if filename is not None or mode != MODE_RAW:
+        raise RecordingError("the cache holds a pickle or names a file: it is not ours")
+    if not isinstance(value, str):
+        raise RecordingError("the recorded reply is damaged: it is no text")
+    content = value[CHECKSUM_LENGTH:]
+    if value != _behind_checksum(content):
         raise RecordingError("the recorded reply is damaged: its checksum is wrong")
     return content

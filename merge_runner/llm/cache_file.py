@@ -32,6 +32,12 @@ SETTINGS = diskcache.DEFAULT_SETTINGS | {
     "disk_min_file_size": 2**40,  # everything in the one SQLite file
     "sqlite_mmap_size": 0,  # what is mapped counts as this process's memory
 }
+# diskcache's triggers that count rows and bytes, as an eviction would need: four more statements
+# for each reply.
+COUNTS = tuple(
+    f"Settings_{what}"
+    for what in ("count_insert", "count_delete", "size_insert", "size_update", "size_delete")
+)
 FAILURES = (OSError, sqlite3.Error, UnicodeDecodeError)
 # ``spent`` has sums, since a sum over all attempts at each reservation would take ever longer.
 TABLES = (
@@ -66,21 +72,25 @@ class TextDisk(diskcache.Disk):  # type: ignore[misc] # diskcache ships no types
             raise TypeError("the cache stores texts alone")
         return 0, MODE_RAW, None, value
 
-    def fetch(self, mode: object, filename: object, value: object, read: bool = False) -> str:
-        """Return the text of a row; raises RecordingError unless it holds one."""
-        if filename is not None or mode != MODE_RAW:
-            raise RecordingError("the cache holds a pickle or names a file: it is not ours")
-        if not isinstance(value, str):
-            raise RecordingError("the recorded reply is damaged: it is no text")
-        return value
+    def fetch(self, *_: object, **__: object) -> str:
+        """Give nothing to diskcache itself: rows are read as ``cache`` checks them."""
+        raise RecordingError("diskcache reads no values here")
 
     def remove(self, file_path: object) -> None:
         """Leave a file that a row names where it is: we wrote none."""
 
 
 def open_texts(folder: Path) -> diskcache.Cache:
-    """Return the diskcache of a folder, whose file is made if there is none."""
-    return diskcache.Cache(str(folder), timeout=BUSY_S, disk=TextDisk, **SETTINGS)
+    """Return the diskcache of a folder, whose file is made if there is none, without its counts."""
+    texts = diskcache.Cache(str(folder), timeout=BUSY_S, disk=TextDisk, **SETTINGS)
+    count = "SELECT count(*) FROM sqlite_master WHERE type = 'trigger' AND tbl_name = 'Cache'"
+    if texts._sql(count).fetchone() != (0,):
+        with texts.transact(retry=True):
+            for name in COUNTS:
+                texts._sql(f"DROP TRIGGER IF EXISTS {name}")
+                # It would make one anew that is gone. No row of this table is ever deleted.
+                texts._sql(f"CREATE TRIGGER {name} DELETE ON Settings BEGIN SELECT 0; END")
+    return texts
 
 
 def refuse_others(folder: Path) -> bytes:

@@ -153,6 +153,23 @@ class Ledger:
         self.spending = Spending(spent_usd, reserved_usd, attempts, overrun_usd, overruns)
         self.committed_usd = spent_usd + reserved_usd + elsewhere_usd
 
+    def _sum_once(self, execute: Execute) -> None:
+        """Sum before the first change that this ledger makes in a transaction."""
+        if self.store.summed is not self:
+            self._sum(execute(_SUMS, (self.scope, self._others)))
+            self.store.summed = self
+
+    def _add(self, spent_usd: float, reserved_usd: float, attempts: int) -> None:
+        """Count what has changed since the sums of a transaction were taken."""
+        spending = self.spending
+        self.spending = replace(
+            spending,
+            spent_usd=spending.spent_usd + spent_usd,
+            reserved_usd=spending.reserved_usd + reserved_usd,
+            open_attempts=spending.open_attempts + attempts,
+        )
+        self.committed_usd += spent_usd + reserved_usd
+
     def reserve(
         self,
         key: str,
@@ -163,15 +180,13 @@ class Ledger:
         execute: Execute,
     ) -> bool:
         """Reserve the worst case of an attempt; False if that exceeds the cap; an operation."""
-        self._sum(execute(_SUMS, (self.scope, self._others)))
+        self._sum_once(execute)
         if cap_usd is not None and self.committed_usd + usd > cap_usd + TOLERANCE_USD:
             return False
         since = datetime.now(UTC).isoformat(timespec="milliseconds")
         place = (asked.driver, asked.slot, asked.honest_usd, since, "in flight")
         execute(_OPEN, (self.scope, key, number, usd, *place))
-        self.committed_usd += usd
-        reserved_usd, attempts = self.spending.reserved_usd + usd, self.spending.open_attempts + 1
-        self.spending = replace(self.spending, reserved_usd=reserved_usd, open_attempts=attempts)
+        self._add(0.0, usd, 1)
         return True
 
     async def ask(self, key: str, usd: float, asked: Asked) -> bool:
@@ -200,7 +215,6 @@ class Ledger:
             execute(_KEEP, (attempt.outcome, key, attempt.number))
         else:
             self.pay(key, attempt.number, attempt.cost_usd, driver, execute)
-        self._sum(execute(_SUMS, (self.scope, self._others)))
         return kept
 
     def pay(
@@ -210,13 +224,17 @@ class Ledger:
 
         Returns the driver, the cost, and by how much that exceeds the worst case.
         """
-        over = (0.0, 0.0)
+        self._sum_once(execute)
         closed = execute(_CLOSE, (key, number)).fetchall()
         # None: a user has released it. That of a line is of the sweep that has submitted its batch.
         scope, aside_usd, honest_usd = closed[0] if closed else (self.scope, usd, usd)
-        if usd > aside_usd + TOLERANCE_USD:
-            over = (usd - aside_usd, usd / max(honest_usd, TOLERANCE_USD))
+        exceeds = usd > aside_usd + TOLERANCE_USD
+        over = (usd - aside_usd, usd / max(honest_usd, TOLERANCE_USD)) if exceeds else (0.0, 0.0)
         execute(_PAY, (scope, driver, usd, *over))
+        if exceeds or not closed or scope != self.scope:
+            self._sum(execute(_SUMS, (self.scope, self._others)))
+        else:
+            self._add(usd, -aside_usd, -1)
         return driver, usd, over[0]
 
     def reserved_usd(self, key: str) -> float:

@@ -289,6 +289,25 @@ def test_nothing_is_ever_evicted_and_each_write_is_synchronous(cache, stock):
     assert stock.sqlite_synchronous == 2
 
 
+def test_a_file_with_the_counts_of_diskcache_goes_on_without_them(folder):
+    """They are triggers, and other programs that open the file with diskcache make none anew."""
+    counting = "SELECT name FROM sqlite_master WHERE type = 'trigger' AND tbl_name = 'Cache'"
+    with contextlib.closing(ResponseCache(folder)) as cache:
+        cache.put_now([entry(1)])
+    with contextlib.closing(sqlite3.connect(folder / "cache.db")) as database, database:
+        for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'"):
+            database.execute(f"DROP TRIGGER {name}")
+    with diskcache.Cache(str(folder)) as stock:
+        assert len(stock._sql(counting).fetchall()) == 5
+    for _ in range(2):
+        with contextlib.closing(ResponseCache(folder)) as cache:
+            cache.put_now([entry(2)])
+            assert list(cache.entries()) == [entry(1), entry(2)]
+            assert cache.rows(counting) == []
+        with diskcache.Cache(str(folder)) as stock:
+            assert not stock._sql(counting).fetchall()
+
+
 PLANTED = {
     "durability ends": ("sqlite_journal_mode", "off"),
     "durability ends, in other letters": ("sqlite_SYNCHRONOUS", 0),
