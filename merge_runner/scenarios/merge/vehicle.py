@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import sqrt
 
@@ -21,23 +22,35 @@ class Vehicle:
     accelerations: list[float] = field(default_factory=lambda: [0.0])
     merged: tuple[int, float] | None = None
 
-    def drive(self, action: float | None, config: ScenarioConfig, merge_point_m: float) -> float:
-        """Drive a step with an action in [-1, 1], None: cruise; returns the new position."""
+    def drive(
+        self, actions: Sequence[float | None], config: ScenarioConfig, merge_point_m: float
+    ) -> list[float]:
+        """Drive a step with each action in [-1, 1], None: cruise; returns the new positions."""
+        step_s, first = config.step_s, len(self.positions)
         position, velocity = self.positions[-1], self.velocities[-1]
-        step_s, acceleration = config.step_s, 0.0
-        if action is not None:
-            commanded = action * config.max_acceleration_mps2
-            acceleration = net_acceleration(commanded, velocity, config.resistance)
-        new_position, new_velocity = advance(position, velocity, acceleration, step_s)
-        if position < merge_point_m <= new_position:
-            left_m = merge_point_m - position
-            self.merged = len(self.positions) - 1, time_to_reach(left_m, velocity, acceleration)
-        self.positions.append(new_position)
-        self.velocities.append(new_velocity)
-        # Where the vehicle stopped within the step, what it executed is less than the command.
-        stopped = velocity + acceleration * step_s < 0
-        self.accelerations.append(-velocity / step_s if stopped else acceleration)
-        return new_position
+        for step, action in enumerate(actions, first - 1):
+            acceleration = 0.0
+            if action is not None:
+                commanded = action * config.max_acceleration_mps2
+                acceleration = net_acceleration(commanded, velocity, config.resistance)
+            before_m, before_mps = position, velocity
+            position, velocity = advance(before_m, before_mps, acceleration, step_s)
+            if before_m < merge_point_m <= position:
+                left_m = merge_point_m - before_m
+                self.merged = step, time_to_reach(left_m, before_mps, acceleration)
+            self.positions.append(position)
+            self.velocities.append(velocity)
+            # Where the vehicle stopped within the step, what it executed is less than the command.
+            stopped = before_mps + acceleration * step_s < 0
+            self.accelerations.append(-before_mps / step_s if stopped else acceleration)
+        return self.positions[first:]
+
+    def end(self, step: int) -> None:
+        """Leave out what was driven after a step, at which the trial ended."""
+        for samples in (self.positions, self.velocities, self.accelerations):
+            del samples[step + 1 :]
+        if self.merged is not None and self.merged[0] >= step:
+            self.merged = None
 
 
 def advance(

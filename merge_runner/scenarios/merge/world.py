@@ -53,25 +53,29 @@ class World:
         """Whether the vehicle has left its tunnel; until then it cruises by itself."""
         return self._vehicles[side].positions[-1] > self._track.tunnel_exit_m - 1e-9
 
-    def drive(self, left: Sequence[float | None], right: Sequence[float | None]) -> None:
-        """Drive some steps with the actions of both sides, or until the trial ends."""
-        for of_left, of_right in zip(left, right, strict=True):
-            self.advance({"left": of_left, "right": of_right})
-            if self.status is not None:
-                return
-
     def advance(self, actions: Mapping[Side, float | None]) -> None:
         """Drive one step with normalised actions in [-1, 1]; None lets a vehicle cruise."""
+        self.drive([actions["left"]], [actions["right"]])
+
+    def drive(self, left: Sequence[float | None], right: Sequence[float | None]) -> None:
+        """Drive some steps with the actions of both sides, or until the trial ends."""
         config, track, vehicles = self._config, self._track, self._vehicles
-        left_m = vehicles["left"].drive(actions["left"], config, track.merge_point_m)
-        right_m = vehicles["right"].drive(actions["right"], config, track.merge_point_m)
-        self.step += 1
-        if collided(config, track, left_m, right_m):
-            self.status = "collided"
-        elif max(left_m, right_m) >= track.end_m:
-            self.status = "finished"
-        elif self.step >= config.timeout_steps:
-            self.status = "timeout"
+        places = (
+            vehicles["left"].drive(left, config, track.merge_point_m),
+            vehicles["right"].drive(right, config, track.merge_point_m),
+        )
+        for left_m, right_m in zip(*places, strict=True):
+            self.step += 1
+            if collided(config, track, left_m, right_m):
+                self.status = "collided"
+            elif left_m >= track.end_m or right_m >= track.end_m:
+                self.status = "finished"
+            elif self.step >= config.timeout_steps:
+                self.status = "timeout"
+            if self.status is not None:
+                for vehicle in vehicles.values():
+                    vehicle.end(self.step)
+                return
 
     def merged_first(self) -> Side | None:
         """Who reached the merge point first; None after a collision or if nobody did."""

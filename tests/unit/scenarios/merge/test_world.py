@@ -94,6 +94,21 @@ def test_each_side_executes_its_own_action_less_the_resistance_unless_it_cruises
     assert [trace(resisted, side)[1][3:] for side in SIDES] == [(9.8, -1.0), (10.0, 0.0)]
 
 
+@settings(max_examples=60)
+@given(names, scenarios, st.lists(st.tuples(actions, actions), min_size=1, max_size=400))
+def test_steps_that_are_driven_at_once_are_as_if_one_by_one_up_to_the_end(name, scenario, pairs):
+    at_once, one_by_one = (World(scenario, CONDITIONS[name], TRACK) for _ in range(2))
+    at_once.drive(*zip(*pairs, strict=True))
+    for left, right in pairs:
+        if one_by_one.status is None:
+            one_by_one.advance({"left": left, "right": right})
+    assert at_once.states() == one_by_one.states()
+    for side in SIDES:
+        assert at_once.observe(side) == one_by_one.observe(side)
+    ends = [(world.status, world.step, world.merged_first()) for world in (at_once, one_by_one)]
+    assert ends[0] == ends[1]
+
+
 @pytest.mark.parametrize(
     ("actions", "scenario", "steps", "end"),
     [
