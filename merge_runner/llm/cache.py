@@ -22,7 +22,7 @@ from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
 from threading import Lock
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import diskcache
 from diskcache.core import MODE_RAW
@@ -42,9 +42,20 @@ from merge_runner.llm.cache_file import (
     require,
     upgrade,
 )
-from merge_runner.llm.durable import BatchWriter, Execute, ModelLocks, Operation, Rows, connect
-from merge_runner.llm.kinds import ADD, TABLE, Kinds, kinds_in, kinds_of, rows_of
+from merge_runner.llm.durable import (
+    BatchWriter,
+    Execute,
+    ModelLocks,
+    Operation,
+    ResultT,
+    Rows,
+    alone,
+    connect,
+)
 from merge_runner.records import DAMAGED, Attempt, ChatRequest, check_body, check_call
+
+if TYPE_CHECKING:
+    from merge_runner.llm.kinds import Kinds
 
 CHECKSUM_LENGTH = 32
 BATCH = 1_000
@@ -69,11 +80,6 @@ typeof(key) != 'text' OR raw IS NOT 1 OR length(CAST(key AS BLOB)) = 64 AND NOT 
 )"""
 _CALLS = f"SELECT rowid FROM Cache NOT INDEXED WHERE {_IS_CALL}"  # noqa: S608 # constants
 _NUMBER = f"SELECT count(*) FROM Cache WHERE {_IS_CALL}"  # noqa: S608 # constants
-# As bytes, since a damaged text may be none.
-_NEWER = """
-SELECT rowid, mode, filename, CAST(value AS BLOB) FROM Cache WHERE rowid > ? AND raw = 1
-AND length(key) = 64 AND NOT instr(key, ' ') AND typeof(value) = 'text' ORDER BY rowid LIMIT ?
-"""
 _CALL = "SELECT key, raw, mode, filename, value FROM Cache WHERE rowid = ?"
 
 
@@ -107,7 +113,7 @@ class _Stored:
 
 
 _STORED: TypeAdapter[_Stored] = TypeAdapter(_Stored)
-Overlay = tuple[Mapping[str, CachedCall], Kinds]
+Overlay = tuple[Mapping[str, CachedCall], "Kinds"]
 """A recording: its entries by key, and how many there are of each kind."""
 
 
@@ -162,24 +168,21 @@ class ResponseCache:
             raise UsageError(f"the cache {folder} cannot be used: {exc}. {NEW_CACHE}") from exc
 
     @cached_property
-    def _recording(self) -> Overlay:
+    def recording(self) -> Overlay:
+        """The recording, opened when it is first asked for."""
         opened = self._open_overlay
         return self._with_overlay.enter_context(opened()) if opened else ({}, {})
-
-    @property
-    def _overlay(self) -> Mapping[str, CachedCall]:
-        return self._recording[0]
 
     def get(self, key: str, request: ChatRequest | None = None) -> CachedCall | None:
         """Return the entry of a call, whose ``request`` is given where it is known.
 
         Raises RecordingError where it is damaged or made up.
         """
-        return self._overlay.get(key) or self._kept(key, request)
+        return self.recording[0].get(key) or self._kept(key, request)
 
     def in_recording(self, key: str) -> bool:
         """Whether the recording holds an entry of a call key."""
-        return key in self._overlay
+        return key in self.recording[0]
 
     def look_up(
         self, key: str, request: ChatRequest | None = None
@@ -189,15 +192,15 @@ class ResponseCache:
         ``request`` is the call's where it is known. Raises RecordingError where what is recorded is
         damaged or made up.
         """
-        if recorded := self._overlay.get(key):
+        if recorded := self.recording[0].get(key):
             return recorded, ()
         rows = self.rows(_LOOK_UP, key, _UNANSWERED + key)
         if not rows:
             return None, ()
         texts = {name: row for name, *row in rows if name is not None}
         if key in texts:
-            return _verified(key, _text(*texts[key]), request), ()
-        tried = _attempts(_text(*texts[_UNANSWERED + key])) if texts else ()
+            return _verified(key, text_of(*texts[key]), request), ()
+        tried = _attempts(text_of(*texts[_UNANSWERED + key])) if texts else ()
         begun = sorted(row for row in rows if row[0] is None and row[1] > len(tried))
         unseen = (
             Attempt(number, "unknown", started_at=since, error=UNSEEN)
@@ -271,12 +274,12 @@ class ResponseCache:
         except CacheFailed:
             raise
         except (MergeRunnerError, *DAMAGED):
-            return self.run_now([partial(_alone, operation) for operation in operations])
+            return self.run_now([partial(alone, operation) for operation in operations])
 
     def read(self, name: str) -> str | None:
         """Return the text under a name, or None; raises RecordingError where it is damaged."""
         rows = self.rows(_GET, name)
-        return _text(*rows[0]) if rows else None
+        return text_of(*rows[0]) if rows else None
 
     def replace(self, name: str, text: str, _: Execute) -> None:
         """Keep a text under a name that is no call key, behind a checksum; an operation."""
@@ -300,7 +303,7 @@ class ResponseCache:
             for row in self._reading.execute(_CALLS):
                 try:
                     ((key, raw, *value),) = self.rows(_CALL, *row)
-                    key, text = self._disk.get(key, raw), _text(*value)
+                    key, text = self._disk.get(key, raw), text_of(*value)
                     entry = _verified(key, text)
                     check_body(entry.request.body)
                     yield entry
@@ -309,56 +312,12 @@ class ResponseCache:
                         left_out.append(str(exc))
         except FAILURES as exc:
             raise self._failure("read", exc) from exc
-        yield from self._overlay.values()
-
-    def kinds(self) -> tuple[Kinds, Kinds]:
-        """Return how many calls the recording and the folder have answered, by kind of request.
-
-        Those of the folder since it was last asked for are counted first.
-        """
-        if self._texts is None:
-            return self._recording[1], kinds_of(
-                (entry.request, entry.attempts[-1]) for entry in self.entries()
-            )
-        after = 0
-        while after := self.run_now([partial(self._count_newer, after)])[0]:
-            pass
-        return self._recording[1], kinds_in(self.rows("SELECT * FROM kinds"))
+        yield from self.recording[0].values()
 
     @property
     def number(self) -> int:
         """The number of calls in the folder, with damaged ones."""
         return int(self.rows(_NUMBER)[0][0])
-
-    def _count_newer(self, after: int, execute: Execute) -> int:
-        """Count some calls that are not counted yet, and whose number is higher; an operation.
-
-        No call is ever removed, so that a newer one has a higher number than all before it. Returns
-        the number after which to go on, 0 where there are no more.
-        """
-        execute(TABLE)
-        ((last,),) = execute("SELECT coalesce(max(last), 0) FROM kinds").fetchall()
-        rows = execute(_NEWER, (max(last, after), BATCH)).fetchall()
-        calls = []
-        for _, mode, filename, value in rows:
-            with contextlib.suppress(RecordingError, *DAMAGED):  # it is told where it is used
-                entry = CachedCall.from_json(_text(mode, filename, value.decode()))
-                calls.append((entry.request, entry.attempts[-1]))
-        newest = rows[-1][0] if rows else 0
-        for row in rows_of(kinds_of(calls), newest):
-            execute(ADD, row)
-        return newest if len(rows) == BATCH else 0
-
-    def recorded(self, name: str, **fields: str) -> set[str]:
-        """Return what ``name`` is in requests with a reply and these ``fields``.
-
-        They are those of the recording, else of the folder.
-        """
-        for kinds in self.kinds():
-            wanted = [k for k in kinds if all(getattr(k, f) == of for f, of in fields.items())]
-            if wanted:
-                return {getattr(kind, name) for kind in wanted}
-        return set()
 
     def close(self) -> None:
         """Close the folder and the recording before it, and free its locks."""
@@ -457,21 +416,10 @@ def import_folder(folder: Path, cache: ResponseCache) -> tuple[int, int]:
     return added, there
 
 
-def _alone(operation: Operation, execute: Execute) -> object:
-    """Run an operation in a savepoint of a transaction; an error of its own is returned.
-
-    It is undone then, and the others of the transaction go on. Raises what is wrong with the disk.
-    """
-    execute("SAVEPOINT operation")
-    result: object
-    try:
-        result = operation(execute)
-    except CacheFailed:
-        raise
-    except (MergeRunnerError, *DAMAGED) as exc:
-        execute("ROLLBACK TO operation")
-        result = exc
-    execute("RELEASE operation")
+def both(first: Callable[[Execute], ResultT], then: Operation, execute: Execute) -> ResultT:
+    """Run two operations as one, with the result of the first."""
+    result = first(execute)
+    then(execute)
     return result
 
 
@@ -496,7 +444,7 @@ def _behind_checksum(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:CHECKSUM_LENGTH] + text
 
 
-def _text(mode: object, filename: object, value: object) -> str:
+def text_of(mode: object, filename: object, value: object) -> str:
     """Return the text of a row, which was put behind a checksum.
 
     Raises RecordingError where it is damaged, or none of ours.

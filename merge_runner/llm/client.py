@@ -39,7 +39,7 @@ from merge_runner.llm.http_outcome import (
 )
 from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger
 from merge_runner.llm.limiter import Limiter
-from merge_runner.llm.prices import cost_usd, is_underpriced
+from merge_runner.llm.prices import DEARER_TIERS, cost_usd, is_underpriced
 from merge_runner.llm.recorded import RecordedReplies
 from merge_runner.records import (
     SCRIPTED_HEADER,
@@ -106,6 +106,8 @@ class LlmClient:
     meter: Meter = field(init=False)
     _wire: WireFormat = field(init=False)
     money: Budget = field(init=False)
+    _tier: str | None = field(init=False)
+    _dearer: set[str] = field(init=False)
     _refused: int = 0
     _alone: asyncio.Lock = field(default_factory=asyncio.Lock)
     _stopping: bool = False
@@ -118,6 +120,8 @@ class LlmClient:
             self.name, self.entry, self.endpoint, self._wire, self.cache
         )
         self.meter = self.recorded.meter
+        self._tier = as_text(self.entry.parameters.get("service_tier"))
+        self._dearer = {tier for tier in DEARER_TIERS if is_underpriced(self.entry, tier)}
         # Without a name a ledger keeps nothing.
         self.money = self.budget or Budget(Ledger(self.cache, ""))
 
@@ -203,10 +207,9 @@ class LlmClient:
         worst = Usage(
             input_tokens=len(request.body.encode()), output_tokens=self.entry.max_output_tokens
         )
-        tier = as_text(self.entry.parameters.get("service_tier"))
         dearest_usd = cost_usd(self.entry, worst) or 0.0
-        if tier is not None:
-            dearest_usd = max(dearest_usd, cost_usd(self.entry, worst, tier) or 0.0)
+        if self._tier is not None:
+            dearest_usd = max(dearest_usd, cost_usd(self.entry, worst, self._tier) or 0.0)
         asked = Asked(self.driver, str(request.slot), dearest_usd)
         call = Call(request, order, asked, worst, self.entry.deadline_s)
         call.attempts, call.earlier = [*(earlier or ())], len(earlier or ())
@@ -420,7 +423,7 @@ class LlmClient:
         call.attempts.append(record)
         self.meter.count_attempt(record)
         tier = outcome.reading.service_tier
-        if tier and is_underpriced(self.entry, tier):
+        if tier in self._dearer:
             self.meter.underpriced[tier] += 1
         aside_usd = paid.aside_usd or math.inf  # none: a user has released it meanwhile
         if (record.cost_usd or 0.0) > aside_usd + TOLERANCE_USD:

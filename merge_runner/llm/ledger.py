@@ -14,15 +14,15 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any
 
 from merge_runner.errors import CacheFailed, RecordingError, UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.cache_file import FILE
-from merge_runner.llm.durable import Execute, ResultT, Rows
+from merge_runner.llm.durable import Execute, Rows
 from merge_runner.records import Attempt
 
 TOLERANCE_USD = 1e-9  # sums of floats
@@ -107,11 +107,11 @@ def scopes(store: ResponseCache) -> list[str]:
 
 
 class Ledger:
-    """The spending of one sweep; ``scope`` names it in the cache. ``spending`` is its last state.
+    """The spending of one sweep; ``scope`` names it in the cache. ``spending`` is as last summed.
 
-    Several processes may run the sweep: every change sums anew. The ledger of a model that costs
-    nothing has no name, and keeps no record. What ``others`` hold counts under the same cap:
-    ``committed_usd`` is the most that may have been spent under it.
+    Several processes may run the sweep: every transaction sums anew. The ledger of a model that
+    costs nothing has no name, and keeps no record. What ``others`` hold counts under the same cap:
+    ``committed_usd`` is the most that may have been spent under it by now.
     """
 
     is_shared_out = False  # by a coordinator, which is asked before each attempt
@@ -159,17 +159,6 @@ class Ledger:
             self._sum(execute(_SUMS, (self.scope, self._others)))
             self.store.summed = self
 
-    def _add(self, spent_usd: float, reserved_usd: float, attempts: int) -> None:
-        """Count what has changed since the sums of a transaction were taken."""
-        spending = self.spending
-        self.spending = replace(
-            spending,
-            spent_usd=spending.spent_usd + spent_usd,
-            reserved_usd=spending.reserved_usd + reserved_usd,
-            open_attempts=spending.open_attempts + attempts,
-        )
-        self.committed_usd += spent_usd + reserved_usd
-
     def reserve(
         self,
         key: str,
@@ -186,7 +175,7 @@ class Ledger:
         since = datetime.now(UTC).isoformat(timespec="milliseconds")
         place = (asked.driver, asked.slot, asked.honest_usd, since, "in flight")
         execute(_OPEN, (self.scope, key, number, usd, *place))
-        self._add(0.0, usd, 1)
+        self.committed_usd += usd
         return True
 
     async def ask(self, key: str, usd: float, asked: Asked) -> bool:
@@ -196,26 +185,17 @@ class Ledger:
     def ended(self, key: str, usd: float | None) -> None:
         """Say there what an attempt at a call has cost; None: unknown."""
 
-    def settle(
-        self,
-        key: str,
-        attempt: Attempt,
-        driver: str,
-        keep: Callable[[Execute], ResultT],
-        execute: Execute,
-    ) -> ResultT:
-        """Keep what an attempt at a call brought, and settle what it cost; an operation.
+    def settle(self, key: str, attempt: Attempt, driver: str, execute: Execute) -> None:
+        """Settle what an attempt at a call cost; an operation.
 
-        Its reservation stays where the cost is unknown. Returns what is kept.
+        Its reservation stays where the cost is unknown.
         """
-        kept = keep(execute)
         if not self.scope:
-            return kept
+            return
         if attempt.cost_usd is None:  # it may have been charged
             execute(_KEEP, (attempt.outcome, key, attempt.number))
         else:
             self.pay(key, attempt.number, attempt.cost_usd, driver, execute)
-        return kept
 
     def pay(
         self, key: str, number: int, usd: float, driver: str, execute: Execute
@@ -234,7 +214,7 @@ class Ledger:
         if exceeds or not closed or scope != self.scope:
             self._sum(execute(_SUMS, (self.scope, self._others)))
         else:
-            self._add(usd, -aside_usd, -1)
+            self.committed_usd += usd - aside_usd
         return driver, usd, over[0]
 
     def reserved_usd(self, key: str) -> float:

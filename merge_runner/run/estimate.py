@@ -11,7 +11,7 @@ from itertools import chain
 from merge_runner.config import ModelEntry
 from merge_runner.llm.batch.providers import batch_terms
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.kinds import Answers
+from merge_runner.llm.kinds import Answers, counted
 from merge_runner.llm.prices import cost_usd
 from merge_runner.prompts.blocks import render_prompt
 from merge_runner.records import SIDES, Usage, canonical_json
@@ -37,7 +37,7 @@ def earlier_answers(plan: Plan, cache: ResponseCache) -> dict[str, Usage | None]
         sent = plan.parts.formats[entry.format].request(entry, "")
         like[name] = entry.id, plan.endpoints[name], sent.path, canonical_json(sent.body)
     sums: dict[str, Answers] = {}
-    for kind, answers in chain.from_iterable(kinds.items() for kinds in cache.kinds()):
+    for kind, answers in chain.from_iterable(kinds.items() for kinds in counted(cache)):
         asked = kind.model, kind.endpoint, kind.path, kind.body
         for name in (name for name, wanted in like.items() if wanted[:2] == asked[:2]):
             counts = kind.own and like[name] == asked

@@ -183,7 +183,8 @@ class LocalRunner:
         finally:
             self._asking[order] -= 1
         decision = question.decide(prompt, reply)
-        self.first.count(question.model, decision)
+        if question.model not in self.first.valid:
+            self.first.count(question.model, decision)
         return side, decision
 
 

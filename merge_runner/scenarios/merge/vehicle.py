@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from math import sqrt
+from math import inf, sqrt
 
 from merge_runner.config import Resistance, ScenarioConfig
 
@@ -14,13 +14,13 @@ class Vehicle:
     """The samples of one vehicle from step 0 on, in SI units.
 
     The acceleration of a step stands with the sample at its end. ``merged`` is the step in which it
-    was at the merge point, and how many s after its beginning.
+    was at the merge point (inf: in none), and how many s after the beginning of that.
     """
 
     positions: list[float]
     velocities: list[float]
     accelerations: list[float] = field(default_factory=lambda: [0.0])
-    merged: tuple[int, float] | None = None
+    merged: tuple[float, float] = inf, 0.0
 
     def drive(
         self, actions: Sequence[float | None], config: ScenarioConfig, merge_point_m: float
@@ -44,13 +44,6 @@ class Vehicle:
             stopped = before_mps + acceleration * step_s < 0
             self.accelerations.append(-before_mps / step_s if stopped else acceleration)
         return self.positions[first:]
-
-    def end(self, step: int) -> None:
-        """Leave out what was driven after a step, at which the trial ended."""
-        for samples in (self.positions, self.velocities, self.accelerations):
-            del samples[step + 1 :]
-        if self.merged is not None and self.merged[0] >= step:
-            self.merged = None
 
 
 def advance(

@@ -73,17 +73,17 @@ class World:
             elif self.step >= config.timeout_steps:
                 self.status = "timeout"
             if self.status is not None:
-                for vehicle in vehicles.values():
-                    vehicle.end(self.step)
-                return
+                return  # what the vehicles drove beyond this step is of no trial
 
     def merged_first(self) -> Side | None:
         """Who reached the merge point first; None after a collision or if nobody did."""
-        merged = {s: v.merged for s, v in self._vehicles.items() if v.merged is not None}
-        if self.status == "collided" or not merged:
+        times = {}
+        for side, vehicle in self._vehicles.items():
+            step, within_s = vehicle.merged
+            if step < self.step:
+                times[side] = _time(step, self._config.step_s) + within_s
+        if self.status == "collided" or not times:
             return None
-        dt = self._config.step_s
-        times = {side: _time(step, dt) + within_s for side, (step, within_s) in merged.items()}
         return min(times, key=times.__getitem__)
 
     def observe(self, side: Side, step: int | None = None) -> Observation:
@@ -131,6 +131,6 @@ class World:
         return (before,) * lacking + tuple(samples[-wanted:])
 
 
-def _time(step: int, step_s: float) -> float:
+def _time(step: float, step_s: float) -> float:
     """The time of a step, without the binary dust of a product like 3 * 0.2."""
     return round(step * step_s, 9)

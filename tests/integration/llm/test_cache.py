@@ -18,9 +18,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from merge_runner.errors import MergeRunnerError, RecordingError, UsageError
+from merge_runner.llm import kinds
 from merge_runner.llm.cache import CachedCall, ResponseCache, import_folder
 from merge_runner.llm.cache_file import TABLES, TextDisk
-from merge_runner.llm.kinds import kinds_of
 from merge_runner.llm.ledger import Ledger
 from merge_runner.records import Attempt, ChatRequest, Slot, Usage, make_request
 from tests.support.cases import cases
@@ -45,7 +45,7 @@ def by_key(*entries):
 
 def counted(entries):
     """How many of these calls there are of each kind."""
-    return kinds_of((each.request, each.attempts[-1]) for each in entries)
+    return kinds.kinds_of((each.request, each.attempts[-1]) for each in entries)
 
 
 def overlaid(entries):
@@ -81,7 +81,7 @@ def other(cache, folder):
 
 
 def endpoints(cache, model):
-    return sorted(cache.recorded("endpoint", model=model))
+    return sorted(kinds.recorded_values(cache, "endpoint", model=model))
 
 
 def left_out(cache):
@@ -533,27 +533,27 @@ def test_calls_are_counted_by_kind_once_whichever_process_kept_them(cache, other
     tokens = Usage(input_tokens=100, output_tokens=7)
     first = [entry(n, endpoint=server, usage=tokens) for n in (1, 2) for server in "ab"]
     cache.put_now(first, tried=[(entry(9).request.key, (Attempt(1, "timeout"),))])
-    assert other.kinds() == cache.kinds() == ({}, counted(first))
+    assert kinds.counted(other) == kinds.counted(cache) == ({}, counted(first))
     # A reply takes the place of what was tried last, which no longer has a row.
     later = [entry(9), entry(3, usage=tokens), entry(4, scripted=True)]
     for each in later:
         cache.put_now([each])
-    assert cache.kinds() == other.kinds() == ({}, counted([*first, *later]))
+    assert kinds.counted(cache) == kinds.counted(other) == ({}, counted([*first, *later]))
     assert [kind.own for kind in counted(later)] == [True, True, False]
     monkeypatch.setattr(CachedCall, "from_json", lambda text: pytest.fail("it is read again"))
-    assert cache.kinds() == ({}, counted([*first, *later]))
+    assert kinds.counted(cache) == ({}, counted([*first, *later]))
 
 
 @pytest.mark.parametrize("batch", [1, 2, 1000])
 def test_all_calls_are_counted_but_damaged_ones(cache, folder, monkeypatch, batch):
-    monkeypatch.setattr("merge_runner.llm.cache.BATCH", batch)
+    monkeypatch.setattr("merge_runner.llm.kinds.BATCH", batch)
     kept = [entry(number) for number in range(1, 6)]
     cache.put_now(kept)
     with contextlib.closing(sqlite3.connect(folder / "cache.db")) as database, database:
         for row, value in ((1, "'damaged'"), (3, "CAST(X'80' AS TEXT)")):
             damaged = f"UPDATE Cache SET value = {value} WHERE key = ?"
             database.execute(damaged, [kept[row].request.key])
-    assert cache.kinds()[1] == counted(kept[::2])
+    assert kinds.counted(cache)[1] == counted(kept[::2])
 
 
 def test_endpoints_are_listed_per_model_the_folders_where_the_overlay_has_none(folder):
