@@ -36,6 +36,7 @@ from merge_runner.llm.cache_file import (
     FORMAT,
     NEW_CACHE,
     TextDisk,
+    close_texts,
     make,
     open_texts,
     refuse_others,
@@ -49,7 +50,6 @@ from merge_runner.llm.durable import (
     Operation,
     ResultT,
     Rows,
-    alone,
     connect,
 )
 from merge_runner.records import DAMAGED, Attempt, ChatRequest, check_body, check_call
@@ -220,12 +220,11 @@ class ResponseCache:
         kept.
         """
         entries = list(entries)
-        for entry in entries:
-            self.set_damage_aside(entry.request.key)
+        aside = [partial(self.set_damage_aside, entry.request.key) for entry in entries]
         kept = [partial(self.keep, entry) for entry in entries]
         others = [partial(self.remove, _UNANSWERED + entry.request.key) for entry in entries]
         others += [partial(self.keep_attempts, *each) for each in tried]
-        return self.run_now([*kept, *others, *money])[: len(kept)]
+        return self.run_now([*aside, *kept, *others, *money])[len(aside) :][: len(kept)]
 
     def add_missing(self, entries: Iterable[CachedCall]) -> tuple[int, int]:
         """Keep the entries that the cache lacks; returns (added, already there)."""
@@ -235,18 +234,6 @@ class ResponseCache:
             added += sum(map(operator.is_, self.put_now(batch), batch))
             seen += len(batch)
         return added, seen - added
-
-    def set_damage_aside(self, key: str) -> list[str]:
-        """Move a damaged entry or list of attempts to quarantine as it is; returns their names."""
-        if damaged := self._damaged(key):
-            self.run_now([partial(self._move_aside, damaged)])
-        return damaged
-
-    async def quarantine(self, key: str) -> list[str]:
-        """Do the same in the next durable batch."""
-        if damaged := self._damaged(key):
-            await self.write(partial(self._move_aside, damaged))
-        return damaged
 
     def all_unanswered(self) -> dict[str, Attempts]:
         """Return the attempts at all calls without an answer, by call key."""
@@ -268,13 +255,17 @@ class ResponseCache:
             raise self._failure("written", hidden or exc) from exc
 
     def _run_each(self, operations: Sequence[Operation]) -> list[Any]:
-        """Run operations in one durable transaction, each with its result or its own error."""
+        """Run operations in one durable transaction; where one fails, each in one of its own.
+
+        Its result is then an error of its own.
+        """
         try:
             return self.run_now(operations)
         except CacheFailed:
             raise
-        except (MergeRunnerError, *DAMAGED):
-            return self.run_now([partial(alone, operation) for operation in operations])
+        except (MergeRunnerError, *DAMAGED) as exc:
+            alone = len(operations) == 1
+            return [exc] if alone else [self._run_each([each])[0] for each in operations]
 
     def read(self, name: str) -> str | None:
         """Return the text under a name, or None; raises RecordingError where it is damaged."""
@@ -326,7 +317,7 @@ class ResponseCache:
         self.locks.close()
         self._reading.close()  # first, since the last one to write ends the journal
         if self._texts is not None:
-            self._texts.close()
+            close_texts(self._texts)
 
     def keep(self, entry: CachedCall, execute: Execute) -> CachedCall:
         """Keep an entry unless there is one, and return what is kept; an operation.
@@ -338,7 +329,7 @@ class ResponseCache:
             try:
                 return self._kept(key) or entry
             except RecordingError:
-                self._move_aside([key], execute)
+                self._move_aside(key, execute)
                 execute(_ADD, (key, text))
         if len(entry.attempts) > 1:
             self._texts.delete(_UNANSWERED + key)
@@ -348,21 +339,25 @@ class ResponseCache:
         """Keep the attempts at a call that has no answer yet; an operation."""
         self.replace(_UNANSWERED + key, ATTEMPTS.dump_json(attempts).decode(), execute)
 
-    def _damaged(self, key: str) -> list[str]:
+    def set_damage_aside(self, key: str, execute: Execute) -> list[str]:
+        """Move a damaged entry or list of attempts to quarantine as it is; an operation.
+
+        Returns their names.
+        """
         damaged = []
         for name, check in ((key, self._kept), (_UNANSWERED + key, self._tried)):
             try:
                 check(key)
             except RecordingError:
                 damaged.append(name)
+                self._move_aside(name, execute)
         return damaged
 
-    def _move_aside(self, names: list[str], execute: Execute) -> None:
-        """Rename rows, whatever they hold; an operation."""
-        for name in names:
-            aside = _DAMAGED + name
-            aside += f" {len(before) + 1}" if (before := self.names(aside)) else ""
-            execute("UPDATE Cache SET key = ? WHERE key = ? AND raw = 1", [aside, name])
+    def _move_aside(self, name: str, execute: Execute) -> None:
+        """Rename a row, whatever it holds; an operation."""
+        aside = _DAMAGED + name
+        aside += f" {len(before) + 1}" if (before := self.names(aside)) else ""
+        execute("UPDATE Cache SET key = ? WHERE key = ? AND raw = 1", [aside, name])
 
     def _kept(self, key: str, request: ChatRequest | None = None) -> CachedCall | None:
         text = self.read(key)

@@ -7,6 +7,7 @@ gives texts alone, and a file with other settings than ours is refused before di
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sqlite3
 import tempfile
@@ -33,7 +34,7 @@ SETTINGS = diskcache.DEFAULT_SETTINGS | {
     "sqlite_mmap_size": 0,  # what is mapped counts as this process's memory
 }
 # diskcache's triggers that count rows and bytes, as an eviction would need: four more statements
-# for each reply.
+# for each reply. The rows are counted once, when it is closed; no row of ours has a size.
 COUNTS = tuple(
     f"Settings_{what}"
     for what in ("count_insert", "count_delete", "size_insert", "size_update", "size_delete")
@@ -91,6 +92,15 @@ def open_texts(folder: Path) -> diskcache.Cache:
                 # It would make one anew that is gone. No row of this table is ever deleted.
                 texts._sql(f"CREATE TRIGGER {name} DELETE ON Settings BEGIN SELECT 0; END")
     return texts
+
+
+def close_texts(texts: diskcache.Cache) -> None:
+    """Close it when its rows are counted; where that cannot be written, it is as it was opened."""
+    with contextlib.suppress(*FAILURES):
+        ((rows,),) = texts._sql("SELECT count(*) FROM Cache").fetchall()
+        if len(texts) != rows:
+            texts.reset("count", rows)
+    texts.close()
 
 
 def refuse_others(folder: Path) -> bytes:

@@ -39,7 +39,7 @@ from merge_runner.llm.http_outcome import (
 )
 from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger
 from merge_runner.llm.limiter import Limiter
-from merge_runner.llm.prices import DEARER_TIERS, cost_usd, is_underpriced
+from merge_runner.llm.prices import cost_usd, underpriced_tiers
 from merge_runner.llm.recorded import RecordedReplies
 from merge_runner.records import (
     SCRIPTED_HEADER,
@@ -107,7 +107,7 @@ class LlmClient:
     _wire: WireFormat = field(init=False)
     money: Budget = field(init=False)
     _tier: str | None = field(init=False)
-    _dearer: set[str] = field(init=False)
+    _underpriced: set[str] = field(init=False)
     _refused: int = 0
     _alone: asyncio.Lock = field(default_factory=asyncio.Lock)
     _stopping: bool = False
@@ -121,7 +121,7 @@ class LlmClient:
         )
         self.meter = self.recorded.meter
         self._tier = as_text(self.entry.parameters.get("service_tier"))
-        self._dearer = {tier for tier in DEARER_TIERS if is_underpriced(self.entry, tier)}
+        self._underpriced = underpriced_tiers(self.entry)
         # Without a name a ledger keeps nothing.
         self.money = self.budget or Budget(Ledger(self.cache, ""))
 
@@ -286,7 +286,7 @@ class LlmClient:
     async def _quarantine(self, call: Call) -> None:
         """Move what is damaged of a call to quarantine, and take what is left of its attempts."""
         key = call.request.key
-        for name in await self.cache.quarantine(key):
+        for name in await self.cache.write(partial(self.cache.set_damage_aside, key)):
             self.meter.damaged.append(name)
             self.meter.notes.append(
                 f"{self.driver}: {call.asked.slot}: what is recorded is damaged; it is set aside "
@@ -423,7 +423,7 @@ class LlmClient:
         call.attempts.append(record)
         self.meter.count_attempt(record)
         tier = outcome.reading.service_tier
-        if tier in self._dearer:
+        if tier in self._underpriced:
             self.meter.underpriced[tier] += 1
         aside_usd = paid.aside_usd or math.inf  # none: a user has released it meanwhile
         if (record.cost_usd or 0.0) > aside_usd + TOLERANCE_USD:

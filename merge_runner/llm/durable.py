@@ -20,8 +20,7 @@ from itertools import repeat
 from pathlib import Path
 from typing import Any, TypeVar
 
-from merge_runner.errors import CacheFailed, MergeRunnerError, UsageError
-from merge_runner.records import DAMAGED
+from merge_runner.errors import UsageError
 
 BUSY_S = 600.0  # another process may be writing long replies to a slow disk
 # Live runs share it, and who releases what is set aside holds it alone.
@@ -54,24 +53,6 @@ def connect(file: Path, mode: str = "ro") -> sqlite3.Connection:
     return sqlite3.connect(
         uri, uri=True, timeout=BUSY_S, isolation_level=None, check_same_thread=False
     )
-
-
-def alone(operation: Operation, execute: Execute) -> object:
-    """Run an operation in a savepoint of a transaction; an error of its own is returned.
-
-    It is undone then, and the others of the transaction go on. Raises what is wrong with the disk.
-    """
-    execute("SAVEPOINT operation")
-    result: object
-    try:
-        result = operation(execute)
-    except CacheFailed:
-        raise
-    except (MergeRunnerError, *DAMAGED) as exc:
-        execute("ROLLBACK TO operation")
-        result = exc
-    execute("RELEASE operation")
-    return result
 
 
 class BatchWriter:

@@ -6,23 +6,14 @@ import asyncio
 import sys
 import traceback
 from collections import Counter
-from collections.abc import (
-    Callable,
-    Mapping,
-    Sequence,
-)
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import accumulate
 from pathlib import Path
 
 from merge_runner.drivers.language_model import Question
-from merge_runner.errors import (
-    ProviderDown,
-    StoreError,
-    StoreLocked,
-    TrialSuspended,
-)
+from merge_runner.errors import ProviderDown, StoreError, StoreLocked, TrialSuspended
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.call import Wait
 from merge_runner.llm.client import LlmClient

@@ -98,6 +98,11 @@ def stock(cache, folder):
         yield opened
 
 
+def aside(cache, key):
+    """The names of what is damaged of a call, and set aside."""
+    return cache.run_now([partial(cache.set_damage_aside, key)])[0]
+
+
 texts = st.text(st.characters(exclude_categories=["Cs"]))
 counts = st.none() | st.integers(0, 10**9)
 numbers = st.none() | st.floats(0, 2**31 - 1)
@@ -306,6 +311,7 @@ def test_a_file_with_the_counts_of_diskcache_goes_on_without_them(folder):
             assert cache.rows(counting) == []
         with diskcache.Cache(str(folder)) as stock:
             assert not stock._sql(counting).fetchall()
+            assert stock.check() == []
 
 
 PLANTED = {
@@ -361,11 +367,11 @@ def test_a_damaged_entry_is_an_error_and_no_reply(cache, stock):
 async def test_damaged_attempts_are_set_aside_and_good_ones_are_not(cache, stock):
     key = entry(1).request.key
     await cache.write(partial(cache.keep_attempts, key, entry(1).attempts))
-    assert cache.set_damage_aside(key) == []
+    assert aside(cache, key) == []
     name = next(name for name in stock if name.startswith("attempts "))
     stock[name] = "no JSON"
-    assert cache.set_damage_aside(key) == [name]
-    assert cache.set_damage_aside(key) == []
+    assert aside(cache, key) == [name]
+    assert aside(cache, key) == []
     assert cache.look_up(key) == (None, ())
     assert stock[f"damaged {name}"] == "no JSON"
 
@@ -441,7 +447,7 @@ def test_an_odd_row_is_told_set_aside_as_it_is_and_the_rest_goes_on(cache, folde
     reasons = []
     assert list(cache.entries(reasons)) == [good]
     assert len(reasons) == 1
-    assert cache.set_damage_aside(key) == [key]
+    assert aside(cache, key) == [key]
     assert row_of(folder, f"damaged {key}") == before
     assert cache.get(key) is None
     assert cache.put_now([odd]) == [odd]
@@ -453,7 +459,7 @@ def test_what_is_damaged_again_lies_beside_what_was_before(cache, folder):
     for text in ("one", "two", "three"):
         cache.put_now([entry(1)])
         changed(folder, "UPDATE Cache SET value = :text WHERE key = :key", key=key, text=text)
-        assert cache.set_damage_aside(key) == [key]
+        assert aside(cache, key) == [key]
     names = (f"damaged {key}", f"damaged {key} 2", f"damaged {key} 3")
     assert [row_of(folder, name)[3] for name in names] == [b"one", b"two", b"three"]
 
@@ -490,7 +496,7 @@ def test_any_one_changed_byte_of_the_file_is_harmless_or_an_error_of_ours(model_
             for each in FULL:
                 with contextlib.suppress(RecordingError):
                     found |= by_key(*filter(None, [cache.get(each.request.key)]))
-                cache.set_damage_aside(each.request.key)
+                aside(cache, each.request.key)
                 assert cache.put_now([each]) == [each]
         assert all(each in FULL for each in found.values())
 

@@ -88,7 +88,7 @@ class CacheMachine(RuleBasedStateMachine):
         process = self.running[number]
         if question in process.in_flight_calls:
             return
-        process.cache.set_damage_aside(key)
+        process.cache.run_now([partial(process.cache.set_damage_aside, key)])
         known = process.cache.get(key)
         if question in self.answered:
             assert known == self.answered[question], "what is answered is not asked again"
