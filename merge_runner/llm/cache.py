@@ -29,29 +29,8 @@ from diskcache.core import MODE_RAW
 from pydantic import Field, TypeAdapter, ValidationError
 
 from merge_runner.errors import CacheFailed, MergeRunnerError, RecordingError, UsageError
-from merge_runner.llm.cache_file import (
-    BEFORE,
-    FAILURES,
-    FILE,
-    FORMAT,
-    NEW_CACHE,
-    TextDisk,
-    close_texts,
-    make,
-    open_texts,
-    refuse_others,
-    require,
-    upgrade,
-)
-from merge_runner.llm.durable import (
-    BatchWriter,
-    Execute,
-    ModelLocks,
-    Operation,
-    ResultT,
-    Rows,
-    connect,
-)
+from merge_runner.llm.cache_file import FAILURES, FILE, NEW_CACHE, close_texts, open_texts, prepare
+from merge_runner.llm.durable import BatchWriter, Execute, ModelLocks, Operation, Rows, connect
 from merge_runner.records import DAMAGED, Attempt, ChatRequest, check_body, check_call
 
 if TYPE_CHECKING:
@@ -142,22 +121,11 @@ class ResponseCache:
         self.folder = folder
         self.locks = ModelLocks(folder)
         self._open_overlay, self._with_overlay = overlay, contextlib.ExitStack()
-        self._disk = TextDisk(str(folder))
         self._writer = BatchWriter(self._run_each)
         self.write = self._writer.write
         self.summed: object = None  # the ledger that knows its sums in the transaction under way
-        if read_only:
-            require(folder)
         try:
-            if not read_only:
-                make(folder)
-            if refuse_others(folder) == BEFORE.encode() and not before:
-                if read_only:
-                    raise UsageError(
-                        f"the cache {folder} has format {BEFORE}: a sweep or a replay with it "
-                        f"brings it to format {FORMAT}"
-                    )
-                upgrade(folder)
+            prepare(folder, read_only=read_only, before=before)
             self._opened = self._file
             self._one_query = Lock()
             with contextlib.ExitStack() as unless_opened:
@@ -294,8 +262,11 @@ class ResponseCache:
             for row in self._reading.execute(_CALLS):
                 try:
                     ((key, raw, *value),) = self.rows(_CALL, *row)
-                    key, text = self._disk.get(key, raw), text_of(*value)
-                    entry = _verified(key, text)
+                    if not (raw and isinstance(key, str)):
+                        raise RecordingError(
+                            "the cache holds a key that is no text: it is not ours"
+                        )
+                    entry = _verified(key, text_of(*value))
                     check_body(entry.request.body)
                     yield entry
                 except (RecordingError, *DAMAGED) as exc:
@@ -411,7 +382,7 @@ def import_folder(folder: Path, cache: ResponseCache) -> tuple[int, int]:
     return added, there
 
 
-def both(first: Callable[[Execute], ResultT], then: Operation, execute: Execute) -> ResultT:
+def both(first: Operation, then: Operation, execute: Execute) -> Any:  # noqa: ANN401 # of any
     """Run two operations as one, with the result of the first."""
     result = first(execute)
     then(execute)

@@ -33,12 +33,6 @@ SETTINGS = diskcache.DEFAULT_SETTINGS | {
     "disk_min_file_size": 2**40,  # everything in the one SQLite file
     "sqlite_mmap_size": 0,  # what is mapped counts as this process's memory
 }
-# diskcache's triggers that count rows and bytes, as an eviction would need: four more statements
-# for each reply. The rows are counted once, when it is closed; no row of ours has a size.
-COUNTS = tuple(
-    f"Settings_{what}"
-    for what in ("count_insert", "count_delete", "size_insert", "size_update", "size_delete")
-)
 FAILURES = (OSError, sqlite3.Error, UnicodeDecodeError)
 # ``spent`` has sums, since a sum over all attempts at each reservation would take ever longer.
 TABLES = (
@@ -82,13 +76,17 @@ class TextDisk(diskcache.Disk):  # type: ignore[misc] # diskcache ships no types
 
 
 def open_texts(folder: Path) -> diskcache.Cache:
-    """Return the diskcache of a folder, whose file is made if there is none, without its counts."""
+    """Return the diskcache of a folder, whose file is made if there is none.
+
+    Its triggers, which count rows and bytes as an eviction would need, are four more statements for
+    each reply: it goes without. Rows are counted when it is closed, and none has a size.
+    """
     texts = diskcache.Cache(str(folder), timeout=BUSY_S, disk=TextDisk, **SETTINGS)
-    count = "SELECT count(*) FROM sqlite_master WHERE type = 'trigger' AND tbl_name = 'Cache'"
-    if texts._sql(count).fetchone() != (0,):
+    triggers = "SELECT name FROM sqlite_master WHERE type = 'trigger' AND tbl_name = 'Cache'"
+    if names := texts._sql(triggers).fetchall():
         with texts.transact(retry=True):
-            for name in COUNTS:
-                texts._sql(f"DROP TRIGGER IF EXISTS {name}")
+            for name in ('"' + name.replace('"', '""') + '"' for (name,) in names):
+                texts._sql(f"DROP TRIGGER {name}")
                 # It would make one anew that is gone. No row of this table is ever deleted.
                 texts._sql(f"CREATE TRIGGER {name} DELETE ON Settings BEGIN SELECT 0; END")
     return texts
@@ -161,6 +159,24 @@ def upgrade(folder: Path) -> None:
                 database.execute(f"INSERT INTO main.{table} SELECT * FROM before.{table}")  # noqa: S608
             sql = "UPDATE Cache SET value = ? WHERE key = ? AND raw = 1"
             database.execute(sql, [FORMAT, FORMAT_KEY])
+
+
+def prepare(folder: Path, *, read_only: bool, before: bool) -> None:
+    """Make a folder that is not there, and upgrade one of the format before, or raise UsageError.
+
+    One that is ``read_only`` must be there, and only where ``before`` is True of that format.
+    """
+    if read_only:
+        require(folder)
+    else:
+        make(folder)
+    if refuse_others(folder) == BEFORE.encode() and not before:
+        if read_only:
+            raise UsageError(
+                f"the cache {folder} has format {BEFORE}: a sweep or a replay with it brings it to "
+                f"format {FORMAT}"
+            )
+        upgrade(folder)
 
 
 def require(folder: Path) -> None:

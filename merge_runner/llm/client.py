@@ -207,10 +207,8 @@ class LlmClient:
         worst = Usage(
             input_tokens=len(request.body.encode()), output_tokens=self.entry.max_output_tokens
         )
-        dearest_usd = cost_usd(self.entry, worst) or 0.0
-        if self._tier is not None:
-            dearest_usd = max(dearest_usd, cost_usd(self.entry, worst, self._tier) or 0.0)
-        asked = Asked(self.driver, str(request.slot), dearest_usd)
+        usd = cost_usd(self.entry, worst) or 0.0, cost_usd(self.entry, worst, self._tier) or 0.0
+        asked = Asked(self.driver, str(request.slot), max(usd))
         call = Call(request, order, asked, worst, self.entry.deadline_s)
         call.attempts, call.earlier = [*(earlier or ())], len(earlier or ())
         call.damaged = earlier is None
@@ -244,10 +242,7 @@ class LlmClient:
             call.earlier = len(call.attempts)
         elif not self.passed:  # nobody waits for an answer that may take hours
             return await self._first(call)
-        try:
-            return await self._attempt(call)
-        except TryAgain as exc:
-            return await self._try_again(call, exc)
+        return await self._answer(call)
 
     async def _first(self, call: Call) -> ChatReply:
         """Make a call alone, or with others where one has been answered meanwhile."""
@@ -261,10 +256,7 @@ class LlmClient:
         else:
             self._alone.release()
         try:
-            try:
-                return await self._attempt(call)
-            except TryAgain as exc:
-                return await self._try_again(call, exc)
+            return await self._answer(call)
         except SweepStopped:
             alone = False  # the next call would only be refused in the same way
             raise
@@ -295,12 +287,14 @@ class LlmClient:
         _, earlier = self.cache.look_up(key)
         call.attempts, call.earlier = [*earlier], len(earlier)
 
-    async def _try_again(self, call: Call, first: TryAgain) -> ChatReply:
-        """Make attempts after a failed first one, until one brings an answer."""
+    async def _answer(self, call: Call) -> ChatReply:
+        """Make attempts until one brings an answer."""
+        try:
+            return await self._attempt(call)
+        except TryAgain as exc:
+            failed = [exc]
         # Only here, since it costs time and memory that most calls need not spend.
         from tenacity import AsyncRetrying, retry_if_exception_type
-
-        failed = [first]
 
         async def next_attempt() -> ChatReply:
             if failed:

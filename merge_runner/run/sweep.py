@@ -53,12 +53,13 @@ from merge_runner.run.clients import check_batches, live_clients, open_rounds
 from merge_runner.run.cluster import DaskTasks, connected
 from merge_runner.run.estimate import Estimate, earlier_answers, estimate
 from merge_runner.run.guard import MOST_INVALID, FirstDecisions
-from merge_runner.run.local_runner import AGAIN, BATCH, Flusher, LocalRunner
+from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import Options, Plan, usual_prompts
 from merge_runner.run.progress import Progress, as_dict, first_of, show_progress, write_standing
 from merge_runner.run.replay import Replay
 from merge_runner.run.stored_replay import refuse_changed_programs
 from merge_runner.run.trials import Player
+from merge_runner.run.writer import AGAIN, BATCH, Flusher
 
 INTERRUPTED = 130
 GO_ON = "Run the same command again to go on."

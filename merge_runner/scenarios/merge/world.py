@@ -77,11 +77,9 @@ class World:
 
     def merged_first(self) -> Side | None:
         """Who reached the merge point first; None after a collision or if nobody did."""
-        times = {}
-        for side, vehicle in self._vehicles.items():
-            step, within_s = vehicle.merged
-            if step < self.step:
-                times[side] = _time(step, self._config.step_s) + within_s
+        merged = {side: vehicle.merged for side, vehicle in self._vehicles.items()}
+        step_s = self._config.step_s
+        times = {s: _time(at, step_s) + on for s, (at, on) in merged.items() if at < self.step}
         if self.status == "collided" or not times:
             return None
         return min(times, key=times.__getitem__)

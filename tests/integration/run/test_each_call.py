@@ -34,8 +34,8 @@ PRICE = {"input": 1.0, "output": 1.0, "source": "contract"}
 FEW_S, MANY_S = 3, 8  # in each of which both drivers ask
 
 ROOT = f"{Path(merge_runner.__file__).parent}/"
-# What shows, checks or answers is no part of the way of a call, nor is what it calls.
-ELSEWHERE = ("audit/", "cli/", "emulator/", "planted_effect.py", "run/progress.py")
+# What shows, checks, answers or stores is no part of the way of a call, nor is what it calls.
+ELSEWHERE = ("audit/", "cli/", "emulator/", "planted_effect.py", "run/progress.py", "run/writer.py")
 
 
 def drawn_path() -> set[str]:
