@@ -237,6 +237,19 @@ async def test_what_is_released_counts_no_longer(ledger, cache):
     await set_aside(Budget(again, 1.0), 1, 0.5)
 
 
+def test_what_is_settled_counts_at_once_whoever_has_reserved_or_released_it(ledger, cache):
+    other = Ledger(cache, "another sweep")
+    for key in ("line", "released", "own"):
+        now(other, other.reserve, key, 1, 0.25, None, O3)
+    now(ledger, ledger.settle, "line", tried(0.125), O3.driver)
+    assert (ledger.committed_usd, other.read().committed_usd) == (0, 0.625)
+    now(other, other.settle, "own", tried(0.125), O3.driver)
+    assert other.committed_usd == other.read().committed_usd == 0.5
+    other.release()
+    now(other, other.settle, "released", tried(0.0625), O3.driver)
+    assert other.committed_usd == other.read().committed_usd == 0.3125
+
+
 async def test_a_task_s_share_gives_way_to_what_the_task_has_spent_and_open(ledger, tmp_path):
     cache = ResponseCache(tmp_path)
     task = Ledger(cache, "task")

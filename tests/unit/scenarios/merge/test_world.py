@@ -147,6 +147,15 @@ def test_who_merged_first_is_told_apart_within_one_step():
     assert (world.status, world.merged_first()) == ("finished", "left")
 
 
+def test_who_is_at_the_merge_point_only_after_the_end_has_not_merged():
+    """The left vehicle, from 50 m at 10 m/s, is there in the step after 4.8 s."""
+    for timeout_s, end in ((4.8, ("timeout", 24, None)), (5.0, ("timeout", 25, "left"))):
+        scenario = ScenarioConfig(vehicle_length_m=0.5, timeout_s=timeout_s)
+        world = World(scenario, Condition(1.0, 0.0), TRACK)
+        world.drive([0.0] * 30, [0.0] * 30)
+        assert (world.status, world.step, world.merged_first()) == end
+
+
 @pytest.mark.parametrize("history_start", ["cruise", "empty"])
 @pytest.mark.parametrize("steps", [0, 1, 3, 12])
 def test_histories_hold_the_last_ten_steps_before_now_after_cruising_or_nothing(
