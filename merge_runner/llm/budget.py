@@ -17,12 +17,14 @@ from __future__ import annotations
 import asyncio
 import bisect
 import math
+from asyncio import Future
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from operator import itemgetter
 
 from merge_runner.errors import TrialSuspended
+from merge_runner.llm.cache import both
 from merge_runner.llm.durable import Execute, ResultT
 from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger
 from merge_runner.records import Attempt
@@ -76,13 +78,11 @@ class PaidAttempt:
         self.queued = False
         self.budget.queued_usd -= self.aside_usd
 
-    async def settle(self, attempt: Attempt, keep: Callable[[Execute], ResultT]) -> ResultT:
+    def settle(self, attempt: Attempt, keep: Callable[[Execute], ResultT]) -> Future[ResultT]:
         """Keep what the attempt brought, and settle what it cost, in one durable transaction."""
-        ledger = self.budget.ledger
-        settle = partial(ledger.settle, self.key, attempt, self.asked.driver, keep)
-        kept = await ledger.store.write(settle)
-        self.cost_usd = attempt.cost_usd
-        return kept
+        self.cost_usd, ledger = attempt.cost_usd, self.budget.ledger
+        settle = partial(ledger.settle, self.key, attempt, self.asked.driver)
+        return ledger.store.write(partial(both, keep, settle))
 
     def close(self) -> None:
         """Give back what the attempt, which has ended, did not spend."""
@@ -240,7 +240,7 @@ class Budget:
 
     def _suspended(self, what: str) -> TrialSuspended:
         """Return the error of a trial that cannot be paid."""
-        spending, kept_usd = self.ledger.spending, self._needed_usd()
+        spending, kept_usd = self.ledger.read(), self._needed_usd()
         reserved_usd = spending.reserved_usd + self.queued_usd
         elsewhere_usd = self.ledger.committed_usd - spending.committed_usd
         is_elsewhere = elsewhere_usd > TOLERANCE_USD

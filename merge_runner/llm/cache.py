@@ -22,28 +22,19 @@ from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
 from threading import Lock
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import diskcache
+from diskcache.core import MODE_RAW
 from pydantic import Field, TypeAdapter, ValidationError
 
 from merge_runner.errors import CacheFailed, MergeRunnerError, RecordingError, UsageError
-from merge_runner.llm.cache_file import (
-    BEFORE,
-    FAILURES,
-    FILE,
-    FORMAT,
-    NEW_CACHE,
-    TextDisk,
-    make,
-    open_texts,
-    refuse_others,
-    require,
-    upgrade,
-)
+from merge_runner.llm.cache_file import FAILURES, FILE, NEW_CACHE, close_texts, open_texts, prepare
 from merge_runner.llm.durable import BatchWriter, Execute, ModelLocks, Operation, Rows, connect
-from merge_runner.llm.kinds import ADD, TABLE, Kinds, kinds_in, kinds_of, rows_of
 from merge_runner.records import DAMAGED, Attempt, ChatRequest, check_body, check_call
+
+if TYPE_CHECKING:
+    from merge_runner.llm.kinds import Kinds
 
 CHECKSUM_LENGTH = 32
 BATCH = 1_000
@@ -58,6 +49,7 @@ _LOOK_UP = """
 SELECT key, mode, filename, value FROM Cache WHERE raw = 1 AND key IN (?1, ?2)
 UNION ALL SELECT NULL, attempt, NULL, since FROM open WHERE call = ?1 AND outcome = 'in flight'
 """
+_ADD = "INSERT INTO Cache (key, raw, mode, value) VALUES (?, 1, 1, ?) ON CONFLICT DO NOTHING"
 _KEYS = """
 SELECT CAST(key AS BLOB) FROM Cache WHERE typeof(key) = 'text' AND key >= ? AND key < ? ORDER BY key
 """
@@ -67,11 +59,6 @@ typeof(key) != 'text' OR raw IS NOT 1 OR length(CAST(key AS BLOB)) = 64 AND NOT 
 )"""
 _CALLS = f"SELECT rowid FROM Cache NOT INDEXED WHERE {_IS_CALL}"  # noqa: S608 # constants
 _NUMBER = f"SELECT count(*) FROM Cache WHERE {_IS_CALL}"  # noqa: S608 # constants
-# As bytes, since a damaged text may be none.
-_NEWER = """
-SELECT rowid, mode, filename, CAST(value AS BLOB) FROM Cache WHERE rowid > ? AND raw = 1
-AND length(key) = 64 AND NOT instr(key, ' ') AND typeof(value) = 'text' ORDER BY rowid LIMIT ?
-"""
 _NEWEST = """
 SELECT CAST(key AS BLOB) FROM Cache NOT INDEXED WHERE typeof(key) = 'text' AND raw = 1
 AND length(CAST(key AS BLOB)) = 64 AND NOT instr(key, ' ') ORDER BY rowid DESC LIMIT ?
@@ -109,7 +96,7 @@ class _Stored:
 
 
 _STORED: TypeAdapter[_Stored] = TypeAdapter(_Stored)
-Overlay = tuple[Mapping[str, CachedCall], Kinds]
+Overlay = tuple[Mapping[str, CachedCall], "Kinds"]
 """A recording: its entries by key, and how many there are of each kind."""
 
 
@@ -138,21 +125,11 @@ class ResponseCache:
         self.folder = folder
         self.locks = ModelLocks(folder)
         self._open_overlay, self._with_overlay = overlay, contextlib.ExitStack()
-        self._disk = TextDisk(str(folder))
         self._writer = BatchWriter(self._run_each)
         self.write = self._writer.write
-        if read_only:
-            require(folder)
+        self.summed: object = None  # the ledger that knows its sums in the transaction under way
         try:
-            if not read_only:
-                make(folder)
-            if refuse_others(folder) == BEFORE.encode() and not before:
-                if read_only:
-                    raise UsageError(
-                        f"the cache {folder} has format {BEFORE}: a sweep or a replay with it "
-                        f"brings it to format {FORMAT}"
-                    )
-                upgrade(folder)
+            prepare(folder, read_only=read_only, before=before)
             self._opened = self._file
             self._one_query = Lock()
             with contextlib.ExitStack() as unless_opened:
@@ -163,24 +140,21 @@ class ResponseCache:
             raise UsageError(f"the cache {folder} cannot be used: {exc}. {NEW_CACHE}") from exc
 
     @cached_property
-    def _recording(self) -> Overlay:
+    def recording(self) -> Overlay:
+        """The recording, opened when it is first asked for."""
         opened = self._open_overlay
         return self._with_overlay.enter_context(opened()) if opened else ({}, {})
-
-    @property
-    def _overlay(self) -> Mapping[str, CachedCall]:
-        return self._recording[0]
 
     def get(self, key: str, request: ChatRequest | None = None) -> CachedCall | None:
         """Return the entry of a call, whose ``request`` is given where it is known.
 
         Raises RecordingError where it is damaged or made up.
         """
-        return self._overlay.get(key) or self._kept(key, request)
+        return self.recording[0].get(key) or self._kept(key, request)
 
     def in_recording(self, key: str) -> bool:
         """Whether the recording holds an entry of a call key."""
-        return key in self._overlay
+        return key in self.recording[0]
 
     def look_up(
         self, key: str, request: ChatRequest | None = None
@@ -190,15 +164,15 @@ class ResponseCache:
         ``request`` is the call's where it is known. Raises RecordingError where what is recorded is
         damaged or made up.
         """
-        if recorded := self._overlay.get(key):
+        if recorded := self.recording[0].get(key):
             return recorded, ()
         rows = self.rows(_LOOK_UP, key, _UNANSWERED + key)
         if not rows:
             return None, ()
         texts = {name: row for name, *row in rows if name is not None}
         if key in texts:
-            return _verified(key, self._text(*texts[key]), request), ()
-        tried = _attempts(self._text(*texts[_UNANSWERED + key])) if texts else ()
+            return _verified(key, text_of(*texts[key]), request), ()
+        tried = _attempts(text_of(*texts[_UNANSWERED + key])) if texts else ()
         begun = sorted(row for row in rows if row[0] is None and row[1] > len(tried))
         unseen = (
             Attempt(number, "unknown", started_at=since, error=UNSEEN)
@@ -218,12 +192,11 @@ class ResponseCache:
         kept.
         """
         entries = list(entries)
-        for entry in entries:
-            self.set_damage_aside(entry.request.key)
+        aside = [partial(self.set_damage_aside, entry.request.key) for entry in entries]
         kept = [partial(self.keep, entry) for entry in entries]
         others = [partial(self.remove, _UNANSWERED + entry.request.key) for entry in entries]
         others += [partial(self.keep_attempts, *each) for each in tried]
-        return self.run_now([*kept, *others, *money])[: len(kept)]
+        return self.run_now([*aside, *kept, *others, *money])[len(aside) :][: len(kept)]
 
     def add_missing(self, entries: Iterable[CachedCall]) -> tuple[int, int]:
         """Keep the entries that the cache lacks; returns (added, already there)."""
@@ -234,18 +207,6 @@ class ResponseCache:
             seen += len(batch)
         return added, seen - added
 
-    def set_damage_aside(self, key: str) -> list[str]:
-        """Move a damaged entry or list of attempts to quarantine as it is; returns their names."""
-        if damaged := self._damaged(key):
-            self.run_now([partial(self._move_aside, damaged)])
-        return damaged
-
-    async def quarantine(self, key: str) -> list[str]:
-        """Do the same in the next durable batch."""
-        if damaged := self._damaged(key):
-            await self.write(partial(self._move_aside, damaged))
-        return damaged
-
     def all_unanswered(self) -> dict[str, Attempts]:
         """Return the attempts at all calls without an answer, by call key."""
         keys = (name.removeprefix(_UNANSWERED) for name in self.names(_UNANSWERED))
@@ -255,7 +216,7 @@ class ResponseCache:
         """Run operations in one durable transaction, in this thread."""
         try:
             with self._texts.transact():
-                execute = self._texts._sql
+                execute, self.summed = self._texts._sql, None
                 results = [operation(execute) for operation in operations]
                 if self._file != self._opened:
                     raise FileNotFoundError("it is no longer there")
@@ -266,18 +227,22 @@ class ResponseCache:
             raise self._failure("written", hidden or exc) from exc
 
     def _run_each(self, operations: Sequence[Operation]) -> list[Any]:
-        """Run operations in one durable transaction, each with its result or its own error."""
+        """Run operations in one durable transaction; where one fails, each in one of its own.
+
+        Its result is then an error of its own.
+        """
         try:
             return self.run_now(operations)
         except CacheFailed:
             raise
-        except (MergeRunnerError, *DAMAGED):
-            return self.run_now([partial(_alone, operation) for operation in operations])
+        except (MergeRunnerError, *DAMAGED) as exc:
+            alone = len(operations) == 1
+            return [exc] if alone else [self._run_each([each])[0] for each in operations]
 
     def read(self, name: str) -> str | None:
         """Return the text under a name, or None; raises RecordingError where it is damaged."""
         rows = self.rows(_GET, name)
-        return self._text(*rows[0]) if rows else None
+        return text_of(*rows[0]) if rows else None
 
     def replace(self, name: str, text: str, _: Execute) -> None:
         """Keep a text under a name that is no call key, behind a checksum; an operation."""
@@ -301,8 +266,11 @@ class ResponseCache:
             for row in self._reading.execute(_CALLS):
                 try:
                     ((key, raw, *value),) = self.rows(_CALL, *row)
-                    key, text = self._disk.get(key, raw), self._text(*value)
-                    entry = _verified(key, text)
+                    if not (raw and isinstance(key, str)):
+                        raise RecordingError(
+                            "the cache holds a key that is no text: it is not ours"
+                        )
+                    entry = _verified(key, text_of(*value))
                     check_body(entry.request.body)
                     yield entry
                 except (RecordingError, *DAMAGED) as exc:
@@ -310,7 +278,7 @@ class ResponseCache:
                         left_out.append(str(exc))
         except FAILURES as exc:
             raise self._failure("read", exc) from exc
-        yield from self._overlay.values()
+        yield from self.recording[0].values()
 
     def newest(self, most: int) -> Iterator[CachedCall]:
         """Yield the calls that the folder has answered last, the newest first, but damaged ones."""
@@ -321,54 +289,10 @@ class ResponseCache:
             if call is not None:
                 yield call
 
-    def kinds(self) -> tuple[Kinds, Kinds]:
-        """Return how many calls the recording and the folder have answered, by kind of request.
-
-        Those of the folder since it was last asked for are counted first.
-        """
-        if self._texts is None:
-            return self._recording[1], kinds_of(
-                (entry.request, entry.attempts[-1]) for entry in self.entries()
-            )
-        after = 0
-        while after := self.run_now([partial(self._count_newer, after)])[0]:
-            pass
-        return self._recording[1], kinds_in(self.rows("SELECT * FROM kinds"))
-
     @property
     def number(self) -> int:
         """The number of calls in the folder, with damaged ones."""
         return int(self.rows(_NUMBER)[0][0])
-
-    def _count_newer(self, after: int, execute: Execute) -> int:
-        """Count some calls that are not counted yet, and whose number is higher; an operation.
-
-        No call is ever removed, so that a newer one has a higher number than all before it. Returns
-        the number after which to go on, 0 where there are no more.
-        """
-        execute(TABLE)
-        ((last,),) = execute("SELECT coalesce(max(last), 0) FROM kinds").fetchall()
-        rows = execute(_NEWER, (max(last, after), BATCH)).fetchall()
-        calls = []
-        for _, mode, filename, value in rows:
-            with contextlib.suppress(RecordingError, *DAMAGED):  # it is told where it is used
-                entry = CachedCall.from_json(self._text(mode, filename, value.decode()))
-                calls.append((entry.request, entry.attempts[-1]))
-        newest = rows[-1][0] if rows else 0
-        for row in rows_of(kinds_of(calls), newest):
-            execute(ADD, row)
-        return newest if len(rows) == BATCH else 0
-
-    def recorded(self, name: str, **fields: str) -> set[str]:
-        """Return what ``name`` is in requests with a reply and these ``fields``.
-
-        They are those of the recording, else of the folder.
-        """
-        for kinds in self.kinds():
-            wanted = [k for k in kinds if all(getattr(k, f) == of for f, of in fields.items())]
-            if wanted:
-                return {getattr(kind, name) for kind in wanted}
-        return set()
 
     def close(self) -> None:
         """Close the folder and the recording before it, and free its locks."""
@@ -377,7 +301,7 @@ class ResponseCache:
         self.locks.close()
         self._reading.close()  # first, since the last one to write ends the journal
         if self._texts is not None:
-            self._texts.close()
+            close_texts(self._texts)
 
     def keep(self, entry: CachedCall, execute: Execute) -> CachedCall:
         """Keep an entry unless there is one, and return what is kept; an operation.
@@ -385,12 +309,12 @@ class ResponseCache:
         One that is damaged goes to quarantine.
         """
         key, text = entry.request.key, _behind_checksum(entry.to_json())
-        if not self._texts.add(key, text):
+        if not execute(_ADD, (key, text)).rowcount:
             try:
                 return self._kept(key) or entry
             except RecordingError:
-                self._move_aside([key], execute)
-                self._texts.add(key, text)
+                self._move_aside(key, execute)
+                execute(_ADD, (key, text))
         if len(entry.attempts) > 1:
             self._texts.delete(_UNANSWERED + key)
         return entry
@@ -399,21 +323,25 @@ class ResponseCache:
         """Keep the attempts at a call that has no answer yet; an operation."""
         self.replace(_UNANSWERED + key, ATTEMPTS.dump_json(attempts).decode(), execute)
 
-    def _damaged(self, key: str) -> list[str]:
+    def set_damage_aside(self, key: str, execute: Execute) -> list[str]:
+        """Move a damaged entry or list of attempts to quarantine as it is; an operation.
+
+        Returns their names.
+        """
         damaged = []
         for name, check in ((key, self._kept), (_UNANSWERED + key, self._tried)):
             try:
                 check(key)
             except RecordingError:
                 damaged.append(name)
+                self._move_aside(name, execute)
         return damaged
 
-    def _move_aside(self, names: list[str], execute: Execute) -> None:
-        """Rename rows, whatever they hold; an operation."""
-        for name in names:
-            aside = _DAMAGED + name
-            aside += f" {len(before) + 1}" if (before := self.names(aside)) else ""
-            execute("UPDATE Cache SET key = ? WHERE key = ? AND raw = 1", [aside, name])
+    def _move_aside(self, name: str, execute: Execute) -> None:
+        """Rename a row, whatever it holds; an operation."""
+        aside = _DAMAGED + name
+        aside += f" {len(before) + 1}" if (before := self.names(aside)) else ""
+        execute("UPDATE Cache SET key = ? WHERE key = ? AND raw = 1", [aside, name])
 
     def _kept(self, key: str, request: ChatRequest | None = None) -> CachedCall | None:
         text = self.read(key)
@@ -421,10 +349,6 @@ class ResponseCache:
 
     def _tried(self, key: str) -> Attempts:
         return _attempts(self.read(_UNANSWERED + key) or "[]")
-
-    def _text(self, mode: object, filename: object, value: object) -> str:
-        """Return the text of a row; raises RecordingError where it is damaged."""
-        return _checked(self._disk.fetch(mode, filename, value))
 
     def rows(self, sql: str, *values: object) -> Rows:
         """Return the rows of a query; raises CacheFailed, or RecordingError for what is no text."""
@@ -471,21 +395,10 @@ def import_folder(folder: Path, cache: ResponseCache) -> tuple[int, int]:
     return added, there
 
 
-def _alone(operation: Operation, execute: Execute) -> object:
-    """Run an operation in a savepoint of a transaction; an error of its own is returned.
-
-    It is undone then, and the others of the transaction go on. Raises what is wrong with the disk.
-    """
-    execute("SAVEPOINT operation")
-    result: object
-    try:
-        result = operation(execute)
-    except CacheFailed:
-        raise
-    except (MergeRunnerError, *DAMAGED) as exc:
-        execute("ROLLBACK TO operation")
-        result = exc
-    execute("RELEASE operation")
+def both(first: Operation, then: Operation, execute: Execute) -> Any:  # noqa: ANN401 # of any
+    """Run two operations as one, with the result of the first."""
+    result = first(execute)
+    then(execute)
     return result
 
 
@@ -510,9 +423,16 @@ def _behind_checksum(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:CHECKSUM_LENGTH] + text
 
 
-def _checked(text: str) -> str:
-    """Return what was put behind a checksum; raises RecordingError where that is wrong."""
-    content = text[CHECKSUM_LENGTH:]
-    if text != _behind_checksum(content):
+def text_of(mode: object, filename: object, value: object) -> str:
+    """Return the text of a row, which was put behind a checksum.
+
+    Raises RecordingError where it is damaged, or none of ours.
+    """
+    if filename is not None or mode != MODE_RAW:
+        raise RecordingError("the cache holds a pickle or names a file: it is not ours")
+    if not isinstance(value, str):
+        raise RecordingError("the recorded reply is damaged: it is no text")
+    content = value[CHECKSUM_LENGTH:]
+    if value != _behind_checksum(content):
         raise RecordingError("the recorded reply is damaged: its checksum is wrong")
     return content

@@ -7,6 +7,7 @@ gives texts alone, and a file with other settings than ours is refused before di
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sqlite3
 import tempfile
@@ -66,21 +67,38 @@ class TextDisk(diskcache.Disk):  # type: ignore[misc] # diskcache ships no types
             raise TypeError("the cache stores texts alone")
         return 0, MODE_RAW, None, value
 
-    def fetch(self, mode: object, filename: object, value: object, read: bool = False) -> str:
-        """Return the text of a row; raises RecordingError unless it holds one."""
-        if filename is not None or mode != MODE_RAW:
-            raise RecordingError("the cache holds a pickle or names a file: it is not ours")
-        if not isinstance(value, str):
-            raise RecordingError("the recorded reply is damaged: it is no text")
-        return value
+    def fetch(self, *_: object, **__: object) -> str:
+        """Give nothing to diskcache itself: rows are read as ``cache`` checks them."""
+        raise RecordingError("diskcache reads no values here")
 
     def remove(self, file_path: object) -> None:
         """Leave a file that a row names where it is: we wrote none."""
 
 
 def open_texts(folder: Path) -> diskcache.Cache:
-    """Return the diskcache of a folder, whose file is made if there is none."""
-    return diskcache.Cache(str(folder), timeout=BUSY_S, disk=TextDisk, **SETTINGS)
+    """Return the diskcache of a folder, whose file is made if there is none.
+
+    Its triggers, which count rows and bytes as an eviction would need, are four more statements for
+    each reply: it goes without. Rows are counted when it is closed, and none has a size.
+    """
+    texts = diskcache.Cache(str(folder), timeout=BUSY_S, disk=TextDisk, **SETTINGS)
+    triggers = "SELECT name FROM sqlite_master WHERE type = 'trigger' AND tbl_name = 'Cache'"
+    if names := texts._sql(triggers).fetchall():
+        with texts.transact(retry=True):
+            for name in ('"' + name.replace('"', '""') + '"' for (name,) in names):
+                texts._sql(f"DROP TRIGGER {name}")
+                # It would make one anew that is gone. No row of this table is ever deleted.
+                texts._sql(f"CREATE TRIGGER {name} DELETE ON Settings BEGIN SELECT 0; END")
+    return texts
+
+
+def close_texts(texts: diskcache.Cache) -> None:
+    """Close it when its rows are counted; where that cannot be written, it is as it was opened."""
+    with contextlib.suppress(*FAILURES):
+        ((rows,),) = texts._sql("SELECT count(*) FROM Cache").fetchall()
+        if len(texts) != rows:
+            texts.reset("count", rows)
+    texts.close()
 
 
 def refuse_others(folder: Path) -> bytes:
@@ -141,6 +159,24 @@ def upgrade(folder: Path) -> None:
                 database.execute(f"INSERT INTO main.{table} SELECT * FROM before.{table}")  # noqa: S608
             sql = "UPDATE Cache SET value = ? WHERE key = ? AND raw = 1"
             database.execute(sql, [FORMAT, FORMAT_KEY])
+
+
+def prepare(folder: Path, *, read_only: bool, before: bool) -> None:
+    """Make a folder that is not there, and upgrade one of the format before, or raise UsageError.
+
+    One that is ``read_only`` must be there, and only where ``before`` is True of that format.
+    """
+    if read_only:
+        require(folder)
+    else:
+        make(folder)
+    if refuse_others(folder) == BEFORE.encode() and not before:
+        if read_only:
+            raise UsageError(
+                f"the cache {folder} has format {BEFORE}: a sweep or a replay with it brings it to "
+                f"format {FORMAT}"
+            )
+        upgrade(folder)
 
 
 def require(folder: Path) -> None:

@@ -39,7 +39,7 @@ from merge_runner.llm.http_outcome import (
 )
 from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger
 from merge_runner.llm.limiter import Limiter
-from merge_runner.llm.prices import cost_usd, is_underpriced
+from merge_runner.llm.prices import cost_usd, underpriced_tiers
 from merge_runner.llm.recorded import RecordedReplies
 from merge_runner.records import (
     SCRIPTED_HEADER,
@@ -106,6 +106,8 @@ class LlmClient:
     meter: Meter = field(init=False)
     _wire: WireFormat = field(init=False)
     money: Budget = field(init=False)
+    _tier: str | None = field(init=False)
+    _underpriced: set[str] = field(init=False)
     _refused: int = 0
     _alone: asyncio.Lock = field(default_factory=asyncio.Lock)
     _stopping: bool = False
@@ -118,6 +120,8 @@ class LlmClient:
             self.name, self.entry, self.endpoint, self._wire, self.cache
         )
         self.meter = self.recorded.meter
+        self._tier = as_text(self.entry.parameters.get("service_tier"))
+        self._underpriced = underpriced_tiers(self.entry)
         # Without a name a ledger keeps nothing.
         self.money = self.budget or Budget(Ledger(self.cache, ""))
 
@@ -203,11 +207,8 @@ class LlmClient:
         worst = Usage(
             input_tokens=len(request.body.encode()), output_tokens=self.entry.max_output_tokens
         )
-        tier = as_text(self.entry.parameters.get("service_tier"))
-        dearest_usd = cost_usd(self.entry, worst) or 0.0
-        if tier is not None:
-            dearest_usd = max(dearest_usd, cost_usd(self.entry, worst, tier) or 0.0)
-        asked = Asked(self.driver, str(request.slot), dearest_usd)
+        usd = cost_usd(self.entry, worst) or 0.0, cost_usd(self.entry, worst, self._tier) or 0.0
+        asked = Asked(self.driver, str(request.slot), max(usd))
         call = Call(request, order, asked, worst, self.entry.deadline_s)
         call.attempts, call.earlier = [*(earlier or ())], len(earlier or ())
         call.damaged = earlier is None
@@ -241,10 +242,7 @@ class LlmClient:
             call.earlier = len(call.attempts)
         elif not self.passed:  # nobody waits for an answer that may take hours
             return await self._first(call)
-        try:
-            return await self._attempt(call)
-        except TryAgain as exc:
-            return await self._try_again(call, exc)
+        return await self._answer(call)
 
     async def _first(self, call: Call) -> ChatReply:
         """Make a call alone, or with others where one has been answered meanwhile."""
@@ -258,10 +256,7 @@ class LlmClient:
         else:
             self._alone.release()
         try:
-            try:
-                return await self._attempt(call)
-            except TryAgain as exc:
-                return await self._try_again(call, exc)
+            return await self._answer(call)
         except SweepStopped:
             alone = False  # the next call would only be refused in the same way
             raise
@@ -283,7 +278,7 @@ class LlmClient:
     async def _quarantine(self, call: Call) -> None:
         """Move what is damaged of a call to quarantine, and take what is left of its attempts."""
         key = call.request.key
-        for name in await self.cache.quarantine(key):
+        for name in await self.cache.write(partial(self.cache.set_damage_aside, key)):
             self.meter.damaged.append(name)
             self.meter.notes.append(
                 f"{self.driver}: {call.asked.slot}: what is recorded is damaged; it is set aside "
@@ -292,12 +287,14 @@ class LlmClient:
         _, earlier = self.cache.look_up(key)
         call.attempts, call.earlier = [*earlier], len(earlier)
 
-    async def _try_again(self, call: Call, first: TryAgain) -> ChatReply:
-        """Make attempts after a failed first one, until one brings an answer."""
+    async def _answer(self, call: Call) -> ChatReply:
+        """Make attempts until one brings an answer."""
+        try:
+            return await self._attempt(call)
+        except TryAgain as exc:
+            failed = [exc]
         # Only here, since it costs time and memory that most calls need not spend.
         from tenacity import AsyncRetrying, retry_if_exception_type
-
-        failed = [first]
 
         async def next_attempt() -> ChatReply:
             if failed:
@@ -420,7 +417,7 @@ class LlmClient:
         call.attempts.append(record)
         self.meter.count_attempt(record)
         tier = outcome.reading.service_tier
-        if tier and is_underpriced(self.entry, tier):
+        if tier in self._underpriced:
             self.meter.underpriced[tier] += 1
         aside_usd = paid.aside_usd or math.inf  # none: a user has released it meanwhile
         if (record.cost_usd or 0.0) > aside_usd + TOLERANCE_USD:

@@ -6,11 +6,22 @@ added when it is next asked for.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Iterable
+from contextlib import suppress
+from functools import partial
+from typing import NamedTuple
 
-from merge_runner.records import Attempt, ChatRequest, is_scripted, without_prompt
+from merge_runner.errors import RecordingError
+from merge_runner.llm.cache import CachedCall, ResponseCache, text_of
+from merge_runner.llm.durable import Execute
+from merge_runner.records import DAMAGED, Attempt, ChatRequest, is_scripted, without_prompt
 
+BATCH = 1_000
+# As bytes, since a damaged text may be none.
+NEWER = """
+SELECT rowid, mode, filename, CAST(value AS BLOB) FROM Cache WHERE rowid > ? AND raw = 1
+AND length(key) = 64 AND NOT instr(key, ' ') AND typeof(value) = 'text' ORDER BY rowid LIMIT ?
+"""
 COLUMNS = "provider, endpoint, model, path, body, own"
 TABLE = f"""
 CREATE TABLE IF NOT EXISTS kinds (
@@ -69,14 +80,45 @@ def kinds_of(calls: Iterable[tuple[ChatRequest, Attempt]]) -> Kinds:
     return found
 
 
-def kinds_in(rows: Iterable[tuple[Any, ...]]) -> Kinds:
-    """Return the counts in rows of the table."""
-    found = {}
-    for provider, endpoint, model, path, body, own, *counts, _ in rows:
-        found[Kind(provider, endpoint, model, path, body, bool(own))] = Answers(*counts)
-    return found
+def counted(cache: ResponseCache) -> tuple[Kinds, Kinds]:
+    """Return how many calls the recording and the folder have answered, by kind of request.
+
+    Those of the folder since it was last asked for are counted first.
+    """
+    after = 0
+    while after := cache.run_now([partial(_count_newer, after)])[0]:
+        pass
+    rows = cache.rows("SELECT * FROM kinds")
+    return cache.recording[1], {Kind(*row[:6]): Answers(*row[6:10]) for row in rows}
 
 
-def rows_of(kinds: Kinds, last: int) -> Iterator[tuple[Any, ...]]:
-    """Yield the rows of counts, the newest of whose calls has this number."""
-    return ((*kind, *answers, last) for kind, answers in kinds.items())
+def _count_newer(after: int, execute: Execute) -> int:
+    """Count some calls that are not counted yet, and whose number is higher; an operation.
+
+    No call is ever removed, so that a newer one has a higher number than all before it. Returns the
+    number after which to go on, 0 where there are no more.
+    """
+    execute(TABLE)
+    ((last,),) = execute("SELECT coalesce(max(last), 0) FROM kinds").fetchall()
+    rows = execute(NEWER, (max(last, after), BATCH)).fetchall()
+    calls = []
+    for _, mode, filename, value in rows:
+        with suppress(RecordingError, *DAMAGED):  # it is told where it is used
+            entry = CachedCall.from_json(text_of(mode, filename, value.decode()))
+            calls.append((entry.request, entry.attempts[-1]))
+    newest = rows[-1][0] if rows else 0
+    for kind, answers in kinds_of(calls).items():
+        execute(ADD, (*kind, *answers, newest))
+    return newest if len(rows) == BATCH else 0
+
+
+def recorded_values(cache: ResponseCache, name: str, **fields: str) -> set[str]:
+    """Return what ``name`` is in requests with a reply and these ``fields``.
+
+    They are those of the recording, else of the folder.
+    """
+    for kinds in counted(cache):
+        wanted = [k for k in kinds if all(getattr(k, f) == of for f, of in fields.items())]
+        if wanted:
+            return {getattr(kind, name) for kind in wanted}
+    return set()

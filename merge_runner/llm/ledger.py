@@ -14,15 +14,15 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any
 
 from merge_runner.errors import CacheFailed, RecordingError, UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.cache_file import FILE
-from merge_runner.llm.durable import Execute, ResultT, Rows
+from merge_runner.llm.durable import Execute, Rows
 from merge_runner.records import Attempt
 
 TOLERANCE_USD = 1e-9  # sums of floats
@@ -107,11 +107,11 @@ def scopes(store: ResponseCache) -> list[str]:
 
 
 class Ledger:
-    """The spending of one sweep; ``scope`` names it in the cache. ``spending`` is its last state.
+    """The spending of one sweep; ``scope`` names it in the cache. ``spending`` is as last summed.
 
-    Several processes may run the sweep: every change sums anew. The ledger of a model that costs
-    nothing has no name, and keeps no record. What ``others`` hold counts under the same cap:
-    ``committed_usd`` is the most that may have been spent under it.
+    Several processes may run the sweep: every transaction sums anew. The ledger of a model that
+    costs nothing has no name, and keeps no record. What ``others`` hold counts under the same cap:
+    ``committed_usd`` is the most that may have been spent under it by now.
     """
 
     is_shared_out = False  # by a coordinator, which is asked before each attempt
@@ -153,6 +153,12 @@ class Ledger:
         self.spending = Spending(spent_usd, reserved_usd, attempts, overrun_usd, overruns)
         self.committed_usd = spent_usd + reserved_usd + elsewhere_usd
 
+    def _sum_once(self, execute: Execute) -> None:
+        """Sum before the first change that this ledger makes in a transaction."""
+        if self.store.summed is not self:
+            self._sum(execute(_SUMS, (self.scope, self._others)))
+            self.store.summed = self
+
     def reserve(
         self,
         key: str,
@@ -163,15 +169,13 @@ class Ledger:
         execute: Execute,
     ) -> bool:
         """Reserve the worst case of an attempt; False if that exceeds the cap; an operation."""
-        self._sum(execute(_SUMS, (self.scope, self._others)))
+        self._sum_once(execute)
         if cap_usd is not None and self.committed_usd + usd > cap_usd + TOLERANCE_USD:
             return False
         since = datetime.now(UTC).isoformat(timespec="milliseconds")
         place = (asked.driver, asked.slot, asked.honest_usd, since, "in flight")
         execute(_OPEN, (self.scope, key, number, usd, *place))
         self.committed_usd += usd
-        reserved_usd, attempts = self.spending.reserved_usd + usd, self.spending.open_attempts + 1
-        self.spending = replace(self.spending, reserved_usd=reserved_usd, open_attempts=attempts)
         return True
 
     async def ask(self, key: str, usd: float, asked: Asked) -> bool:
@@ -181,27 +185,17 @@ class Ledger:
     def ended(self, key: str, usd: float | None) -> None:
         """Say there what an attempt at a call has cost; None: unknown."""
 
-    def settle(
-        self,
-        key: str,
-        attempt: Attempt,
-        driver: str,
-        keep: Callable[[Execute], ResultT],
-        execute: Execute,
-    ) -> ResultT:
-        """Keep what an attempt at a call brought, and settle what it cost; an operation.
+    def settle(self, key: str, attempt: Attempt, driver: str, execute: Execute) -> None:
+        """Settle what an attempt at a call cost; an operation.
 
-        Its reservation stays where the cost is unknown. Returns what is kept.
+        Its reservation stays where the cost is unknown.
         """
-        kept = keep(execute)
         if not self.scope:
-            return kept
+            return
         if attempt.cost_usd is None:  # it may have been charged
             execute(_KEEP, (attempt.outcome, key, attempt.number))
         else:
             self.pay(key, attempt.number, attempt.cost_usd, driver, execute)
-        self._sum(execute(_SUMS, (self.scope, self._others)))
-        return kept
 
     def pay(
         self, key: str, number: int, usd: float, driver: str, execute: Execute
@@ -210,13 +204,17 @@ class Ledger:
 
         Returns the driver, the cost, and by how much that exceeds the worst case.
         """
-        over = (0.0, 0.0)
+        self._sum_once(execute)
         closed = execute(_CLOSE, (key, number)).fetchall()
         # None: a user has released it. That of a line is of the sweep that has submitted its batch.
         scope, aside_usd, honest_usd = closed[0] if closed else (self.scope, usd, usd)
-        if usd > aside_usd + TOLERANCE_USD:
-            over = (usd - aside_usd, usd / max(honest_usd, TOLERANCE_USD))
+        exceeds = usd > aside_usd + TOLERANCE_USD
+        over = (usd - aside_usd, usd / max(honest_usd, TOLERANCE_USD)) if exceeds else (0.0, 0.0)
         execute(_PAY, (scope, driver, usd, *over))
+        if exceeds or not closed or scope != self.scope:
+            self._sum(execute(_SUMS, (self.scope, self._others)))
+        else:
+            self.committed_usd += usd - aside_usd
         return driver, usd, over[0]
 
     def reserved_usd(self, key: str) -> float:

@@ -52,10 +52,8 @@ def cost_usd(entry: ModelEntry, usage: Usage, tier: str | None = None) -> float 
         return None
 
 
-def is_underpriced(entry: ModelEntry, tier: str | None) -> bool:
-    """Return whether a reply of this tier costs more than the registry knows."""
-    if tier not in DEARER_TIERS:
-        return False
+def underpriced_tiers(entry: ModelEntry) -> set[str]:
+    """Return the service tiers whose replies cost more than the registry knows."""
     million = Usage(1_000_000, 0, 1_000_000)
     plain_usd = cost_usd(entry, million)
-    return bool(plain_usd) and cost_usd(entry, million, tier) == plain_usd
+    return {t for t in DEARER_TIERS if plain_usd and cost_usd(entry, million, t) == plain_usd}

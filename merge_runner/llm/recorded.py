@@ -64,11 +64,12 @@ class RecordedReplies:
         prompt = self.prompt(question)
         request = self.request(prompt, question.slot)
         try:
-            reply = self.reply(request)
+            recorded = self.calls.get(request.key, request)
         except RecordingError as exc:
             raise CallFailed(f"{self.name}: call {request.key}: {exc}", request) from exc
-        if reply is None:
+        if recorded is None:
             raise ReplayMiss("no recorded reply", request)
+        reply = self.read(recorded, len(recorded.attempts))
         self.count(reply)
         return question.decide(prompt, reply)
 
@@ -99,11 +100,6 @@ class RecordedReplies:
             body=sent.body,
             slot=slot,
         )
-
-    def reply(self, request: ChatRequest) -> ChatReply | None:
-        """Return the recorded reply to a request; raises RecordingError for a damaged one."""
-        recorded = self.calls.get(request.key, request)
-        return self.read(recorded, len(recorded.attempts)) if recorded else None
 
     def read(self, recorded: CachedCall, earlier: int) -> ChatReply:
         """Read an answer anew, as an audit does: an earlier version may have read it otherwise."""

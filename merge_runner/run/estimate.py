@@ -12,7 +12,7 @@ from statistics import median
 from merge_runner.config import ModelEntry
 from merge_runner.llm.batch.providers import batch_terms
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.kinds import Answers, kinds_of
+from merge_runner.llm.kinds import Answers, counted, kinds_of
 from merge_runner.llm.prices import cost_usd
 from merge_runner.prompts.blocks import render_prompt
 from merge_runner.records import SIDES, Usage, canonical_json
@@ -38,7 +38,7 @@ def earlier_answers(plan: Plan, cache: ResponseCache) -> dict[str, Usage | None]
     """
     like = _asked_as(plan)
     sums: dict[str, Answers] = {}
-    for kind, answers in chain.from_iterable(kinds.items() for kinds in cache.kinds()):
+    for kind, answers in chain.from_iterable(kinds.items() for kinds in counted(cache)):
         asked = kind.model, kind.endpoint, kind.path, kind.body
         for name in (name for name, wanted in like.items() if wanted[:2] == asked[:2]):
             counts = kind.own and like[name] == asked

@@ -25,13 +25,14 @@ ADVICE = (
 class FirstDecisions:
     """The decisions of each model until one is valid, of which so many may be invalid.
 
-    They are ``one_by_one`` where trials can wait for each other.
+    They are ``one_by_one`` where trials can wait for each other. ``valid`` are the models that have
+    decided validly.
     """
 
     def __init__(self, most_invalid: float = math.inf, *, one_by_one: bool = False) -> None:
         self._most_invalid = most_invalid
         self._one_by_one = one_by_one
-        self._valid: set[str] = set()
+        self.valid: set[str] = set()
         self._invalid: Counter[str] = Counter()
         self._described: dict[str, str] = {}
         self._asked: set[str] = set()  # models that a trial asks alone
@@ -42,10 +43,10 @@ class FirstDecisions:
         """Play a trial when its models have decided validly, or no other trial asks them."""
         self._check()
         alone = {*models} if self._one_by_one else set()
-        while alone & self._asked - self._valid:
+        while alone & self._asked - self.valid:
             self._changed.clear()
             await self._changed.wait()
-        alone -= self._valid
+        alone -= self.valid
         self._asked |= alone
         try:
             yield
@@ -55,17 +56,16 @@ class FirstDecisions:
 
     def count(self, model: str, decision: Decision) -> None:
         """Count a decision; raises NoValidDecision where too many are invalid."""
-        if model not in self._valid:
-            text = decision.reply.text if decision.reply else ""
-            self.add(model, decision.valid, not decision.valid, decision.failure, text)
-            self._check()
+        text = decision.reply.text if decision.reply else ""
+        self.add(model, decision.valid, not decision.valid, decision.failure, text)
+        self._check()
 
     def add(
         self, model: str, valid: int, invalid: int, failure: str | None, text: str | None
     ) -> None:
         """Count so many decisions; ``failure`` and ``text`` are of an invalid one."""
         if valid:
-            self._valid.add(model)
+            self.valid.add(model)
             self._changed.set()
         if invalid:
             self._invalid[model] += invalid
@@ -78,7 +78,7 @@ class FirstDecisions:
         return [
             f"none of the first {number} decisions of {model} is valid. {self._described[model]}"
             for model, number in sorted(self._invalid.items())
-            if model not in self._valid and number >= least
+            if model not in self.valid and number >= least
         ]
 
     def _check(self) -> None:

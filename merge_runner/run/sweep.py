@@ -40,6 +40,7 @@ from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LONG_WAIT_S
 from merge_runner.llm.http_outcome import TransportFailure, if_nobody, set_base_url
+from merge_runner.llm.kinds import counted, recorded_values
 from merge_runner.llm.ledger import Ledger, scopes
 from merge_runner.paths import DEFAULT_DB, SHIPPED_RECORDINGS, command_at
 from merge_runner.records import ReplayMiss, TrialRecord, TrialSpec, canonical_json
@@ -52,12 +53,7 @@ from merge_runner.run.clients import check_batches, live_clients, open_rounds
 from merge_runner.run.cluster import DaskTasks, connected
 from merge_runner.run.estimate import Estimate, earlier_answers, estimate, usual_latencies_s
 from merge_runner.run.guard import MOST_INVALID, FirstDecisions
-from merge_runner.run.local_runner import (
-    AGAIN,
-    BATCH,
-    Flusher,
-    LocalRunner,
-)
+from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import Options, Plan, usual_prompts
 from merge_runner.run.progress import REASONS_SHOWN, Progress, show_progress
 from merge_runner.run.progress_file import write_snapshot
@@ -65,6 +61,7 @@ from merge_runner.run.replay import Replay
 from merge_runner.run.stored_replay import refuse_changed_programs
 from merge_runner.run.summary import as_dict
 from merge_runner.run.trials import Player
+from merge_runner.run.writer import AGAIN, BATCH, Flusher
 from merge_runner.text_safety import first_of
 
 INTERRUPTED = 130
@@ -140,7 +137,7 @@ async def play(
 
 def _has_replies(cache: ResponseCache, plan: Plan) -> bool:
     """Whether a model of a plan is recorded, or it has none; what is damaged may be of it."""
-    models, (_, kinds) = {entry.id or UNNAMED for entry in plan.entries.values()}, cache.kinds()
+    models, (_, kinds) = {entry.id or UNNAMED for entry in plan.entries.values()}, counted(cache)
     whole = sum(answers.answers for answers in kinds.values())
     return any(kind.model in models for kind in kinds) or cache.number > whole or not models
 
@@ -460,6 +457,8 @@ class Sweep:
         ended_with, checked = self.exit_code, None
         audited = partial(audit_sweep, store.path, sweep_id, keys, finished=self.exit_code == 0)
         try:
+            if not self._options.replay:
+                self._ledger.read()
             facts = await in_thread(partial(sweep_facts, store.path, sweep_id))
             audit = await in_thread(audited)
             checked = facts, audit
@@ -472,8 +471,6 @@ class Sweep:
                 audit_it = command_at("merge-runner audit", "--db", store.path, DEFAULT_DB)
                 self._fail(1, f"the audit found {len(findings)} faults: `{audit_it}`")
             self.messages += map(str, findings[:SHOWN])
-            if not self._options.replay:
-                self._ledger.read()
         except MergeRunnerError as exc:
             self._fail_by(exc)
         if self.exit_code != ended_with:
@@ -527,14 +524,14 @@ async def _with_names(
         named = model_id(entry)
         if not named and options.sends_nothing:
             # A server of one's own serves one model, or the recorded replies do not tell which.
-            models = cache.recorded("model", provider=entry.provider)
+            models = recorded_values(cache, "model", provider=entry.provider)
             named = models.pop() if len(models) == 1 else UNNAMED
         entries[name] = entry.model_copy(
             update={"id": named or await _served_name(name, entry, say=say)}
         )
         recorded: set[str] = set()
         if options.replay:
-            recorded = cache.recorded("endpoint", model=entries[name].id)
+            recorded = recorded_values(cache, "endpoint", model=entries[name].id)
         if recorded and endpoints[name] not in recorded:
             endpoints[name], *others = sorted(recorded)
             if others:

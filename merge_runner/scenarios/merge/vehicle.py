@@ -2,9 +2,48 @@
 
 from __future__ import annotations
 
-from math import sqrt
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from math import inf, sqrt
 
-from merge_runner.config import Resistance
+from merge_runner.config import Resistance, ScenarioConfig
+
+
+@dataclass(slots=True)
+class Vehicle:
+    """The samples of one vehicle from step 0 on, in SI units.
+
+    The acceleration of a step stands with the sample at its end. ``merged`` is the step in which it
+    was at the merge point (inf: in none), and how many s after the beginning of that.
+    """
+
+    positions: list[float]
+    velocities: list[float]
+    accelerations: list[float] = field(default_factory=lambda: [0.0])
+    merged: tuple[float, float] = inf, 0.0
+
+    def drive(
+        self, actions: Sequence[float | None], config: ScenarioConfig, merge_point_m: float
+    ) -> list[float]:
+        """Drive a step with each action in [-1, 1], None: cruise; returns the new positions."""
+        step_s, first = config.step_s, len(self.positions)
+        position, velocity = self.positions[-1], self.velocities[-1]
+        for step, action in enumerate(actions, first - 1):
+            acceleration = 0.0
+            if action is not None:
+                commanded = action * config.max_acceleration_mps2
+                acceleration = net_acceleration(commanded, velocity, config.resistance)
+            before_m, before_mps = position, velocity
+            position, velocity = advance(before_m, before_mps, acceleration, step_s)
+            if before_m < merge_point_m <= position:
+                left_m = merge_point_m - before_m
+                self.merged = step, time_to_reach(left_m, before_mps, acceleration)
+            self.positions.append(position)
+            self.velocities.append(velocity)
+            # Where the vehicle stopped within the step, what it executed is less than the command.
+            stopped = before_mps + acceleration * step_s < 0
+            self.accelerations.append(-before_mps / step_s if stopped else acceleration)
+        return self.positions[first:]
 
 
 def advance(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
@@ -11,20 +10,7 @@ from merge_runner.records import SIDES, Observation, Side, StateRow, Status
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.conditions import Condition
 from merge_runner.scenarios.merge.geometry import Track
-from merge_runner.scenarios.merge.vehicle import advance, net_acceleration, time_to_reach
-
-
-@dataclass(slots=True)
-class _Vehicle:
-    """The samples of one vehicle from step 0 on, in SI units, and when it was at the merge point.
-
-    The acceleration of a step stands with the sample at its end.
-    """
-
-    positions: list[float]
-    velocities: list[float]
-    accelerations: list[float] = field(default_factory=lambda: [0.0])
-    merged_s: float | None = None
+from merge_runner.scenarios.merge.vehicle import Vehicle
 
 
 class World:
@@ -49,12 +35,13 @@ class World:
         self._config, self._track = config, track
         self.step = 0
         self._vehicles = {
-            side: _Vehicle([position], [speed])
+            side: Vehicle([position], [speed])
             for side, (position, speed) in (starts or dict(places)).items()
         }
         if max(positions) >= track.merge_point_m:
             raise UsageError(f"{condition}: a vehicle is at the merge point before both are driven")
-        together = collided(config, track, *self._positions())
+        at = [self._vehicles[side].positions[0] for side in SIDES]
+        together = collided(config, track, *at)
         self.status: Status | None = "collided" if together else None
 
     @property
@@ -66,43 +53,33 @@ class World:
         """Whether the vehicle has left its tunnel; until then it cruises by itself."""
         return self._vehicles[side].positions[-1] > self._track.tunnel_exit_m - 1e-9
 
-    def drive(self, left: Sequence[float | None], right: Sequence[float | None]) -> None:
-        """Drive some steps with the actions of both sides, or until the trial ends."""
-        for of_left, of_right in zip(left, right, strict=True):
-            self.advance({"left": of_left, "right": of_right})
-            if self.status is not None:
-                return
-
     def advance(self, actions: Mapping[Side, float | None]) -> None:
         """Drive one step with normalised actions in [-1, 1]; None lets a vehicle cruise."""
-        config, dt = self._config, self._config.step_s
-        for side, vehicle in self._vehicles.items():
-            position, velocity = vehicle.positions[-1], vehicle.velocities[-1]
-            action, acceleration = actions[side], 0.0
-            if action is not None:
-                commanded = action * config.max_acceleration_mps2
-                acceleration = net_acceleration(commanded, velocity, config.resistance)
-            new_position, new_velocity = advance(position, velocity, acceleration, dt)
-            if position < self._track.merge_point_m <= new_position:
-                left_m = self._track.merge_point_m - position
-                vehicle.merged_s = self.time_s + time_to_reach(left_m, velocity, acceleration)
-            vehicle.positions.append(new_position)
-            vehicle.velocities.append(new_velocity)
-            # Where the vehicle stopped within the step, what it executed is less than the command.
-            stopped = velocity + acceleration * dt < 0
-            vehicle.accelerations.append(-velocity / dt if stopped else acceleration)
-        self.step += 1
-        left_m, right_m = self._positions()
-        if collided(config, self._track, left_m, right_m):
-            self.status = "collided"
-        elif max(left_m, right_m) >= self._track.end_m:
-            self.status = "finished"
-        elif self.step >= config.timeout_steps:
-            self.status = "timeout"
+        self.drive([actions["left"]], [actions["right"]])
+
+    def drive(self, left: Sequence[float | None], right: Sequence[float | None]) -> None:
+        """Drive some steps with the actions of both sides, or until the trial ends."""
+        config, track, vehicles = self._config, self._track, self._vehicles
+        places = (
+            vehicles["left"].drive(left, config, track.merge_point_m),
+            vehicles["right"].drive(right, config, track.merge_point_m),
+        )
+        for left_m, right_m in zip(*places, strict=True):
+            self.step += 1
+            if collided(config, track, left_m, right_m):
+                self.status = "collided"
+            elif left_m >= track.end_m or right_m >= track.end_m:
+                self.status = "finished"
+            elif self.step >= config.timeout_steps:
+                self.status = "timeout"
+            if self.status is not None:
+                return  # what the vehicles drove beyond this step is of no trial
 
     def merged_first(self) -> Side | None:
         """Who reached the merge point first; None after a collision or if nobody did."""
-        times = {s: v.merged_s for s, v in self._vehicles.items() if v.merged_s is not None}
+        merged = {side: vehicle.merged for side, vehicle in self._vehicles.items()}
+        step_s = self._config.step_s
+        times = {s: _time(at, step_s) + on for s, (at, on) in merged.items() if at < self.step}
         if self.status == "collided" or not times:
             return None
         return min(times, key=times.__getitem__)
@@ -146,16 +123,12 @@ class World:
                 rows.append(row)
         return tuple(rows)
 
-    def _positions(self) -> tuple[float, float]:
-        """Where the left and the right vehicle are now."""
-        return self._vehicles["left"].positions[-1], self._vehicles["right"].positions[-1]
-
     def _history(self, samples: list[float], before: float) -> tuple[float, ...]:
         wanted = self._config.memory_samples
         lacking = wanted - len(samples) if self._config.history_start == "cruise" else 0
         return (before,) * lacking + tuple(samples[-wanted:])
 
 
-def _time(step: int, step_s: float) -> float:
+def _time(step: float, step_s: float) -> float:
     """The time of a step, without the binary dust of a product like 3 * 0.2."""
     return round(step * step_s, 9)

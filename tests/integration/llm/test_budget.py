@@ -88,7 +88,7 @@ async def test_what_is_spent_and_set_aside_never_exceeds_the_cap(cache, plan, tr
 
     def watched(*arguments):
         begun = reserve(*arguments)
-        assert ledger.spending.committed_usd <= CAP + 1e-6
+        assert ledger.committed_usd <= CAP + 1e-6
         return begun
 
     ledger.reserve = watched
@@ -106,7 +106,7 @@ async def test_what_is_spent_and_set_aside_never_exceeds_the_cap(cache, plan, tr
     assert {type(result) for result in results} <= {type(None), TrialSuspended}
     unknown = [share is None for _, _, share, _, _ in plan]
     paid = [result is None for result in results]
-    assert ledger.spending.open_attempts == sum(map(min, unknown, paid))
+    assert ledger.read().open_attempts == sum(map(min, unknown, paid))
 
 
 class Trials:
@@ -232,10 +232,10 @@ async def test_what_is_set_aside_is_told_with_the_reason_of_each_attempt(ledger)
         now(ledger, ledger.reserve, key, number, 0.25, None, O3)
         actual = 0.0 if outcome == "connection_lost" else None
         ended = Attempt(number, outcome, cost_usd=actual)
-        now(ledger, ledger.settle, key, ended, O3.driver, nothing)
+        now(ledger, ledger.settle, key, ended, O3.driver)
     now(ledger, ledger.reserve, "d", 1, 0.125, None, O3)
     now(ledger, ledger.reserve, "paid", 1, 0.25, None, O3)
-    now(ledger, ledger.settle, "paid", tried(0.1), O3.driver, nothing)
+    now(ledger, ledger.settle, "paid", tried(0.1), O3.driver)
     reasons = ledger.reasons()
     assert [(r["outcome"], r["attempts"], r["usd"]) for r in reasons] == [
         ("timeout", 2, 0.5),
@@ -257,12 +257,25 @@ async def test_what_is_released_counts_no_longer(ledger, cache):
     await set_aside(Budget(again, 1.0), 1, 0.5)
 
 
+def test_what_is_settled_counts_at_once_whoever_has_reserved_or_released_it(ledger, cache):
+    other = Ledger(cache, "another sweep")
+    for key in ("line", "released", "own"):
+        now(other, other.reserve, key, 1, 0.25, None, O3)
+    now(ledger, ledger.settle, "line", tried(0.125), O3.driver)
+    assert (ledger.committed_usd, other.read().committed_usd) == (0, 0.625)
+    now(other, other.settle, "own", tried(0.125), O3.driver)
+    assert other.committed_usd == other.read().committed_usd == 0.5
+    other.release()
+    now(other, other.settle, "released", tried(0.0625), O3.driver)
+    assert other.committed_usd == other.read().committed_usd == 0.3125
+
+
 async def test_a_task_s_share_gives_way_to_what_the_task_has_spent_and_open(ledger, tmp_path):
     cache = ResponseCache(tmp_path)
     task = Ledger(cache, "task")
     for key in ("a", "b"):
         now(task, task.reserve, key, 1, 0.25, None, O3)
-    now(task, task.settle, "a", tried(0.5), O3.driver, nothing)
+    now(task, task.settle, "a", tried(0.5), O3.driver)
     now(ledger, ledger.reserve, "task 1", 1, 2.0, None, O3)
     now(ledger, ledger.share, "task 1", *task.rows())
     assert ledger.read() == task.read()
@@ -279,7 +292,7 @@ async def test_a_reply_and_its_cost_are_kept_together_or_not_at_all(ledger, cach
     answer = Attempt(1, "ok", 200, cost_usd=0.125, reply="{}")
     operations = {
         "keep": partial(cache.keep, CachedCall(request, (answer,))),
-        "settle": partial(ledger.settle, request.key, answer, O3.driver, nothing),
+        "settle": partial(ledger.settle, request.key, answer, O3.driver),
     }
 
     def raising(execute):

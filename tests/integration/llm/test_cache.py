@@ -18,9 +18,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from merge_runner.errors import MergeRunnerError, RecordingError, UsageError
+from merge_runner.llm import kinds
 from merge_runner.llm.cache import CachedCall, ResponseCache, import_folder
 from merge_runner.llm.cache_file import TABLES, TextDisk
-from merge_runner.llm.kinds import kinds_of
 from merge_runner.llm.ledger import Ledger
 from merge_runner.records import Attempt, ChatRequest, Slot, Usage, make_request
 from tests.support.cases import cases
@@ -45,7 +45,7 @@ def by_key(*entries):
 
 def counted(entries):
     """How many of these calls there are of each kind."""
-    return kinds_of((each.request, each.attempts[-1]) for each in entries)
+    return kinds.kinds_of((each.request, each.attempts[-1]) for each in entries)
 
 
 def overlaid(entries):
@@ -81,7 +81,7 @@ def other(cache, folder):
 
 
 def endpoints(cache, model):
-    return sorted(cache.recorded("endpoint", model=model))
+    return sorted(kinds.recorded_values(cache, "endpoint", model=model))
 
 
 def left_out(cache):
@@ -96,6 +96,11 @@ def stock(cache, folder):
     """What any other program makes of the folder."""
     with diskcache.Cache(str(folder)) as opened:
         yield opened
+
+
+def aside(cache, key):
+    """The names of what is damaged of a call, and set aside."""
+    return cache.run_now([partial(cache.set_damage_aside, key)])[0]
 
 
 texts = st.text(st.characters(exclude_categories=["Cs"]))
@@ -289,6 +294,26 @@ def test_nothing_is_ever_evicted_and_each_write_is_synchronous(cache, stock):
     assert stock.sqlite_synchronous == 2
 
 
+def test_a_file_with_the_counts_of_diskcache_goes_on_without_them(folder):
+    """They are triggers, and other programs that open the file with diskcache make none anew."""
+    counting = "SELECT name FROM sqlite_master WHERE type = 'trigger' AND tbl_name = 'Cache'"
+    with contextlib.closing(ResponseCache(folder)) as cache:
+        cache.put_now([entry(1)])
+    with contextlib.closing(sqlite3.connect(folder / "cache.db")) as database, database:
+        for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'"):
+            database.execute(f"DROP TRIGGER {name}")
+    with diskcache.Cache(str(folder)) as stock:
+        assert len(stock._sql(counting).fetchall()) == 5
+    for _ in range(2):
+        with contextlib.closing(ResponseCache(folder)) as cache:
+            cache.put_now([entry(2)])
+            assert list(cache.entries()) == [entry(1), entry(2)]
+            assert cache.rows(counting) == []
+        with diskcache.Cache(str(folder)) as stock:
+            assert not stock._sql(counting).fetchall()
+            assert stock.check() == []
+
+
 PLANTED = {
     "durability ends": ("sqlite_journal_mode", "off"),
     "durability ends, in other letters": ("sqlite_SYNCHRONOUS", 0),
@@ -342,11 +367,11 @@ def test_a_damaged_entry_is_an_error_and_no_reply(cache, stock):
 async def test_damaged_attempts_are_set_aside_and_good_ones_are_not(cache, stock):
     key = entry(1).request.key
     await cache.write(partial(cache.keep_attempts, key, entry(1).attempts))
-    assert cache.set_damage_aside(key) == []
+    assert aside(cache, key) == []
     name = next(name for name in stock if name.startswith("attempts "))
     stock[name] = "no JSON"
-    assert cache.set_damage_aside(key) == [name]
-    assert cache.set_damage_aside(key) == []
+    assert aside(cache, key) == [name]
+    assert aside(cache, key) == []
     assert cache.look_up(key) == (None, ())
     assert stock[f"damaged {name}"] == "no JSON"
 
@@ -422,7 +447,7 @@ def test_an_odd_row_is_told_set_aside_as_it_is_and_the_rest_goes_on(cache, folde
     reasons = []
     assert list(cache.entries(reasons)) == [good]
     assert len(reasons) == 1
-    assert cache.set_damage_aside(key) == [key]
+    assert aside(cache, key) == [key]
     assert row_of(folder, f"damaged {key}") == before
     assert cache.get(key) is None
     assert cache.put_now([odd]) == [odd]
@@ -434,7 +459,7 @@ def test_what_is_damaged_again_lies_beside_what_was_before(cache, folder):
     for text in ("one", "two", "three"):
         cache.put_now([entry(1)])
         changed(folder, "UPDATE Cache SET value = :text WHERE key = :key", key=key, text=text)
-        assert cache.set_damage_aside(key) == [key]
+        assert aside(cache, key) == [key]
     names = (f"damaged {key}", f"damaged {key} 2", f"damaged {key} 3")
     assert [row_of(folder, name)[3] for name in names] == [b"one", b"two", b"three"]
 
@@ -471,7 +496,7 @@ def test_any_one_changed_byte_of_the_file_is_harmless_or_an_error_of_ours(model_
             for each in FULL:
                 with contextlib.suppress(RecordingError):
                     found |= by_key(*filter(None, [cache.get(each.request.key)]))
-                cache.set_damage_aside(each.request.key)
+                aside(cache, each.request.key)
                 assert cache.put_now([each]) == [each]
         assert all(each in FULL for each in found.values())
 
@@ -514,27 +539,27 @@ def test_calls_are_counted_by_kind_once_whichever_process_kept_them(cache, other
     tokens = Usage(input_tokens=100, output_tokens=7)
     first = [entry(n, endpoint=server, usage=tokens) for n in (1, 2) for server in "ab"]
     cache.put_now(first, tried=[(entry(9).request.key, (Attempt(1, "timeout"),))])
-    assert other.kinds() == cache.kinds() == ({}, counted(first))
+    assert kinds.counted(other) == kinds.counted(cache) == ({}, counted(first))
     # A reply takes the place of what was tried last, which no longer has a row.
     later = [entry(9), entry(3, usage=tokens), entry(4, scripted=True)]
     for each in later:
         cache.put_now([each])
-    assert cache.kinds() == other.kinds() == ({}, counted([*first, *later]))
+    assert kinds.counted(cache) == kinds.counted(other) == ({}, counted([*first, *later]))
     assert [kind.own for kind in counted(later)] == [True, True, False]
     monkeypatch.setattr(CachedCall, "from_json", lambda text: pytest.fail("it is read again"))
-    assert cache.kinds() == ({}, counted([*first, *later]))
+    assert kinds.counted(cache) == ({}, counted([*first, *later]))
 
 
 @pytest.mark.parametrize("batch", [1, 2, 1000])
 def test_all_calls_are_counted_but_damaged_ones(cache, folder, monkeypatch, batch):
-    monkeypatch.setattr("merge_runner.llm.cache.BATCH", batch)
+    monkeypatch.setattr("merge_runner.llm.kinds.BATCH", batch)
     kept = [entry(number) for number in range(1, 6)]
     cache.put_now(kept)
     with contextlib.closing(sqlite3.connect(folder / "cache.db")) as database, database:
         for row, value in ((1, "'damaged'"), (3, "CAST(X'80' AS TEXT)")):
             damaged = f"UPDATE Cache SET value = {value} WHERE key = ?"
             database.execute(damaged, [kept[row].request.key])
-    assert cache.kinds()[1] == counted(kept[::2])
+    assert kinds.counted(cache)[1] == counted(kept[::2])
     assert [*cache.newest(9)] == [kept[4], kept[2], kept[0]]
     assert [*cache.newest(1)] == [kept[4]]
 

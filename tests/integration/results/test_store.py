@@ -25,7 +25,7 @@ from merge_runner.results.store import (
     results_digest,
     sweep_facts,
 )
-from merge_runner.run.local_runner import Flusher
+from merge_runner.run.writer import Flusher
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.trial import Trial, play_trial
 from tests.support.driven_trials import ask_nobody

@@ -17,11 +17,11 @@ from tests.support.harness import PROJECT, a_model, run_sweep
 
 # Of a call under a cap, and of one whose reply is recorded, by what is counted.
 BOUNDS = {
-    "changes of file": {"live": 102, "replayed": 60},
-    "functions": {"live": 225, "replayed": 160},
-    "statements": {"live": 15, "replayed": 1},
+    "changes of file": {"live": 75, "replayed": 39.5},
+    "functions": {"live": 210, "replayed": 147},
+    "statements": {"live": 8, "replayed": 1},
     "on the event loop": {"live": 1, "replayed": 1},
-    "commits": {"live": 2, "replayed": 0},
+    "commits": {"live": 1, "replayed": 0},
 }
 GOALS = {
     "changes of file": {"live": 75, "replayed": 45},
@@ -34,7 +34,7 @@ PRICE = {"input": 1.0, "output": 1.0, "source": "contract"}
 FEW_S, MANY_S = 3, 8  # in each of which both drivers ask
 
 ROOT = f"{Path(merge_runner.__file__).parent}/"
-# What shows, checks or answers is no part of the way of a call, nor is what it calls.
+# What shows, checks, answers or stores is no part of the way of a call, nor is what it calls.
 ELSEWHERE = (
     "audit/",
     "cli/",
@@ -42,6 +42,7 @@ ELSEWHERE = (
     "planted_effect.py",
     "run/progress.py",
     "run/progress_file.py",
+    "run/writer.py",
 )
 
 
@@ -149,7 +150,7 @@ async def test_a_further_call_takes_no_more_than_it_did(counted):
             told += [f"{way}, {name}: {found[name]:.1f}, to become {GOALS[name][way]}"]
             told += [f"{n / calls:8.1f} {each}" for each, n in more.most_common() if n]
         if way == "live":
-            entered = {each.split()[0] for each in many["functions"]}
+            entered = {each.split()[0] for each in many["functions"] - few["functions"]}
             assert {file for file in entered if file.startswith("llm/")} == drawn_path()
         too_many = [name for name, n in found.items() if n > BOUNDS[name][way]]
         assert not too_many, "\n".join(told)

@@ -16,7 +16,7 @@ from merge_runner.errors import StoreError, StoreLocked
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.results.store import Store
-from merge_runner.run import local_runner, sweep
+from merge_runner.run import sweep, writer
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import Options, make_plan
 from merge_runner.run.progress import Progress
@@ -74,7 +74,7 @@ async def test_a_writer_that_breaks_ends_the_run_before_more_is_asked(options, m
     assert again["exit_code"] == 0, again["messages"]
     assert again["calls"]["cached"] == summary["calls"]["live"]
     monkeypatch.setattr(Store, "write", broken)
-    monkeypatch.setattr(local_runner, "EVERY_S", 1e9)
+    monkeypatch.setattr(writer, "EVERY_S", 1e9)
     at_its_very_end = await run(options, "constant")
     assert at_its_very_end["messages"][0].startswith("3 trials are not stored: the writer of")
     assert ends(options) == [(True, 1), (True, 0), (True, 1)]

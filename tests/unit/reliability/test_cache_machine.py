@@ -88,7 +88,7 @@ class CacheMachine(RuleBasedStateMachine):
         process = self.running[number]
         if question in process.in_flight_calls:
             return
-        process.cache.set_damage_aside(key)
+        process.cache.run_now([partial(process.cache.set_damage_aside, key)])
         known = process.cache.get(key)
         if question in self.answered:
             assert known == self.answered[question], "what is answered is not asked again"
@@ -130,6 +130,12 @@ class CacheMachine(RuleBasedStateMachine):
         question = data.draw(st.sampled_from(sorted(calls)))
         return question, *calls.pop(question)
 
+    def settled(self, paid, attempt, keep):
+        async def settle():
+            return await paid.settle(attempt, keep)
+
+        return self.wait(settle())
+
     @precondition(in_flight)
     @rule(data=st.data(), cost=costs)
     def answer(self, data, cost):
@@ -139,7 +145,7 @@ class CacheMachine(RuleBasedStateMachine):
         reply = f'{{"text": "ä {self.made}"}}'
         attempts.append(Attempt(len(attempts) + 1, "ok", 200, reply=reply, cost_usd=float(cost)))
         entry = CachedCall(REQUESTS[question], tuple(attempts))
-        kept = self.wait(paid.settle(attempts[-1], partial(cache.keep, entry)))
+        kept = self.settled(paid, attempts[-1], partial(cache.keep, entry))
         paid.close()
         assert kept == entry
         self.answered[question] = entry
@@ -154,7 +160,7 @@ class CacheMachine(RuleBasedStateMachine):
         told = float(cost) if known else None
         attempts.append(Attempt(len(attempts) + 1, "server_error", 500, cost_usd=told))
         key = REQUESTS[question].key
-        self.wait(paid.settle(attempts[-1], partial(cache.keep_attempts, key, tuple(attempts))))
+        self.settled(paid, attempts[-1], partial(cache.keep_attempts, key, tuple(attempts)))
         paid.close()
         self.tried[question] = tuple(attempts)
 

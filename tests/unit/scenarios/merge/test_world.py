@@ -94,6 +94,21 @@ def test_each_side_executes_its_own_action_less_the_resistance_unless_it_cruises
     assert [trace(resisted, side)[1][3:] for side in SIDES] == [(9.8, -1.0), (10.0, 0.0)]
 
 
+@settings(max_examples=60)
+@given(names, scenarios, st.lists(st.tuples(actions, actions), min_size=1, max_size=400))
+def test_steps_that_are_driven_at_once_are_as_if_one_by_one_up_to_the_end(name, scenario, pairs):
+    at_once, one_by_one = (World(scenario, CONDITIONS[name], TRACK) for _ in range(2))
+    at_once.drive(*zip(*pairs, strict=True))
+    for left, right in pairs:
+        if one_by_one.status is None:
+            one_by_one.advance({"left": left, "right": right})
+    assert at_once.states() == one_by_one.states()
+    for side in SIDES:
+        assert at_once.observe(side) == one_by_one.observe(side)
+    ends = [(world.status, world.step, world.merged_first()) for world in (at_once, one_by_one)]
+    assert ends[0] == ends[1]
+
+
 @pytest.mark.parametrize(
     ("actions", "scenario", "steps", "end"),
     [
@@ -130,6 +145,15 @@ def test_who_merged_first_is_told_apart_within_one_step():
     steps = [min(row[0] for row in trace(world, side) if row[2] >= 100) for side in SIDES]
     assert steps[0] == steps[1]
     assert (world.status, world.merged_first()) == ("finished", "left")
+
+
+def test_who_is_at_the_merge_point_only_after_the_end_has_not_merged():
+    """The left vehicle, from 50 m at 10 m/s, is there in the step after 4.8 s."""
+    for timeout_s, end in ((4.8, ("timeout", 24, None)), (5.0, ("timeout", 25, "left"))):
+        scenario = ScenarioConfig(vehicle_length_m=0.5, timeout_s=timeout_s)
+        world = World(scenario, Condition(1.0, 0.0), TRACK)
+        world.drive([0.0] * 30, [0.0] * 30)
+        assert (world.status, world.step, world.merged_first()) == end
 
 
 @pytest.mark.parametrize("history_start", ["cruise", "empty"])
