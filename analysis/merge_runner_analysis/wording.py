@@ -373,7 +373,8 @@ def _percent(collisions: Values, count: int) -> float:
 def apart(one: str, other: str, rows: Mapping[str, Values]) -> tuple[str, str]:
     """The headline of one driver less another, and what else is shown, of rows by their metric.
 
-    ``A crashed in 12 of 110 trials, B in 33 of 110: 19.09 points fewer [8.41, 29.78]; p = 0.004``.
+    ``A crashed in 12 of 110 trials, B in 33 of 110: 19.09 points fewer [8.41, 29.78]; corrected
+    p = 0.004``.
     """
     crashed = rows.get(COLLISIONS.name, {})
     counts = [crashed.get(f"{name}{of}") for of in ("", "_reference") for name in ("k", "n")]
@@ -388,12 +389,12 @@ def apart(one: str, other: str, rows: Mapping[str, Values]) -> tuple[str, str]:
         return f"{claim}.", _others(rows)
     if p >= ALPHA:
         said = f"no difference is shown, {number(difference)} points {brackets(ci)}"
-        return f"{claim}: {said}; p {equal_p(p)}.", _others(rows)
+        return f"{claim}: {said}; corrected p {equal_p(p)}.", _others(rows)
     # Of fewer, the ends change their signs and their places.
     ends = ci and sorted(end if difference > 0 else -end for end in ci)
     more = "more" if difference > 0 else "fewer"
     said = f"{number(abs(difference))} points {more} {brackets(ends)}".rstrip()
-    return f"{claim}: {said}; p {equal_p(p)}.", _others(rows)
+    return f"{claim}: {said}; corrected p {equal_p(p)}.", _others(rows)
 
 
 def _others(rows: Mapping[str, Values]) -> str:

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from merge_runner_analysis.metrics import COLLISIONS, LEFT_FIRST
-from merge_runner_analysis.tables.model import Row, Table
+from merge_runner_analysis.tables.model import Row, Table, from_text
+from merge_runner_analysis.web.computed import computed
+from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.effect_rows import (
     difference_mark,
     metric_of,
@@ -18,6 +20,7 @@ from merge_runner_analysis.web.effect_rows import (
 from merge_runner_analysis.web.judged import Driver
 from merge_runner_analysis.web.marks import Mark
 from merge_runner_analysis.web.scope import Scope
+from merge_runner_analysis.web.site import Site
 from merge_runner_analysis.wording import apart, brackets, capital, number, p_value
 
 # The trials behind a count, as a filter of their list; None where no filter keeps just these.
@@ -62,6 +65,18 @@ class Comparison:
     rows: list[Difference]
     tested: int
     could: str
+
+
+def set_apart(
+    site: Site, own: Driver, other: Driver, scope: Scope
+) -> tuple[Job, Comparison | None]:
+    """One driver less another, each with its prompt, once that is computed."""
+    groups = (f"{one.name}/{one.prompt}" for one in (own, other))
+    job = computed(site, ("comparison", *groups, scope.sweep, scope.condition))
+    if job.content is None:
+        return job, None
+    trials = trials_of(own, scope), trials_of(other, scope)
+    return job, comparison_of(from_text(job.content["table"]), (own.name, other.name), trials)
 
 
 def comparison_of(

@@ -63,7 +63,7 @@ def test_the_headline_says_crashes_in_counts_then_points_interval_and_p(client):
     claim = text_of(re.search(r'<p class="answer">(.*?)</p>', page, re.S)[1])
     assert re.fullmatch(
         rf"{A} crashed in 11 of 54 trials, {B} in 33 of 55: "
-        r"\d\d\.\d\d points fewer \[\d\d\.\d\d, \d\d\.\d\d\]; p < 0\.001\.",
+        r"\d\d\.\d\d points fewer \[\d\d\.\d\d, \d\d\.\d\d\]; corrected p < 0\.001\.",
         claim,
     )
     turned = text_of(client.get(f"/drivers/{B}?with={A}").text)

@@ -9,9 +9,8 @@ from merge_runner.records import SIDES
 from merge_runner_analysis.published import HUMAN
 from merge_runner_analysis.tables.formats import printed
 from merge_runner_analysis.tables.model import Row as TableRow
-from merge_runner_analysis.tables.model import from_text
-from merge_runner_analysis.web.comparison import Comparison, comparison_of, trials_of
-from merge_runner_analysis.web.computed import computed, computed_table
+from merge_runner_analysis.web.comparison import set_apart
+from merge_runner_analysis.web.computed import computed_table
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.display_text import with_minus
 from merge_runner_analysis.web.effect_rows import MIDDLE
@@ -61,7 +60,7 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     beside = by_name.get(asked.get("with", ""))
     was_asked = own and own.facts and own.facts["asked"] and not beside
     awaited, first = _first(site, name, scope) if was_asked else (None, "")
-    compared, apart = _apart(site, own, beside, scope) if own and beside else (None, None)
+    compared, apart = set_apart(site, own, beside, scope) if own and beside else (None, None)
     both = [one for one in (own, beside) if one]
     conditions = by_condition(site, scope, both)
     # Of each condition, the humans' and the drivers' share of trials in which left goes first.
@@ -114,16 +113,6 @@ def _counted(cells: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str]]:
         ),
         ("Crashes", "collided", "ended"),
     ]
-
-
-def _apart(site: Site, own: Driver, other: Driver, scope: Scope) -> tuple[Job, Comparison | None]:
-    """One driver less another, each with the prompt of the page, once that is computed."""
-    groups = (f"{one.name}/{one.prompt}" for one in (own, other))
-    job = computed(site, ("comparison", *groups, scope.sweep, scope.condition))
-    if job.content is None:
-        return job, None
-    trials = trials_of(own, scope), trials_of(other, scope)
-    return job, comparison_of(from_text(job.content["table"]), (own.name, other.name), trials)
 
 
 def _summary(own: Driver) -> str:

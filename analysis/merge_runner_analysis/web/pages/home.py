@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from merge_runner_analysis.web.comparison import set_apart
 from merge_runner_analysis.web.computed import computed_table
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.effect_rows import MIDDLE
@@ -38,9 +39,6 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
     scope = bar.scope
     drivers, values = judged(site, bar, asked)
     jobs, asking, question = _question(site, bar)
-    older = [job.older for job in (values["computed"], *jobs)]
-    now = standing, site.catalogue.state, site.catalogue.held, older
-    seen = news_of(now, asked.get("seen", ""))
     shown = [
         one
         for one in drivers
@@ -52,6 +50,13 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         if one.kind == LANGUAGE_MODEL and one.cells
     }
     kinds = by_kind(shown)
+    apart = None
+    if not jobs and len(models) == len(shown) == 2:  # two language models are the question
+        job, apart = set_apart(site, shown[0], shown[1], scope)
+        jobs, asking = [job], [job] * (apart is None and not job.failure)
+    older = [job.older for job in (values["computed"], *jobs)]
+    now = standing, site.catalogue.state, site.catalogue.held, older
+    seen = news_of(now, asked.get("seen", ""))
     conditions = by_condition(site, scope, shown)
     return site.render(
         "home.html",
@@ -67,6 +72,7 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         kinds=kinds,
         headline=headline(models, [one.kind for one in shown]),
         question=question,
+        apart=apart,
         asking=asking,
         middle=MIDDLE,
         linked=True,
