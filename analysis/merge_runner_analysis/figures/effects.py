@@ -12,10 +12,8 @@ from merge_runner_analysis.figures.style import (
     GREY,
     LINE_IN,
     PAGE_IN,
-    X_LABELS_IN,
     Points,
     Style,
-    place_panels,
     style,
     wrapped,
 )
@@ -29,7 +27,6 @@ from merge_runner_analysis.study import Study
 ACROSS = 3  # panels
 LABEL, LEGEND = 24, 48  # characters of a line
 LINES_IN = 2.2 * LINE_IN  # from one level to the next
-AROUND_IN, BETWEEN_IN = (0.15, 0.05), (0.36, X_LABELS_IN + 0.03)
 MARK = 0.03  # of an axis: the width of a mark
 EVEN = 50.0  # percent: neither driver is favoured
 
@@ -48,9 +45,8 @@ def effects_figure(study: Study) -> Figure:
     looks = {driver: style(number) for number, driver in enumerate(drivers)}
     across, down = min(ACROSS, len(metrics)) or 1, -(-len(metrics) // ACROSS) or 1
     height_in = down * (LINES_IN * len(lines) + 0.6) + LINE_IN * 2 * len(drivers)
-    figure = Figure(figsize=(PAGE_IN, max(height_in, 1.5)))
-    panels = figure.subplots(down, across, sharey=True, squeeze=False)
-    axes = panels.flatten()
+    figure = Figure(figsize=(PAGE_IN, max(height_in, 1.5)), layout="constrained")
+    axes = figure.subplots(down, across, sharey=True, squeeze=False).flatten()
     for axis, metric in zip(axes, metrics, strict=False):
         axis.set_xlabel(metric.heading)
         for number, (driver, look) in enumerate(looks.items()):
@@ -76,8 +72,7 @@ def effects_figure(study: Study) -> Figure:
         for driver, look in looks.items()
     ]
     if handles:
-        figure.legend(handles=handles, loc="lower center", ncols=2, frameon=False)
-    place_panels(figure, panels, axes[0].get_yticklabels(), AROUND_IN, BETWEEN_IN)
+        figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False)
     return figure
 
 
@@ -122,7 +117,6 @@ def _limit(axis: Axes, least: float | None, most: float | None) -> None:
 
 
 def _draw(axis: Axes, points: Points, look: Style) -> None:
-    """Dots with their intervals."""
     rows = [
         (place, own.value, *(own.bounds() or (own.value, own.value)))
         for place, own in points

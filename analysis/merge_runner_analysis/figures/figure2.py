@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -24,7 +23,6 @@ from merge_runner_analysis.figures.style import (
     Points,
     Style,
     draw_points,
-    place_panels,
     style,
     wrapped,
 )
@@ -41,8 +39,6 @@ Styles = dict[float, Style]  # of relative velocities in m/s
 LABEL = 21  # characters of a line of a row's name
 # A row is so high, of few rows each higher; and what is above and below all rows.
 ROW_IN, FEW_ROWS_IN, HIGHEST_ROW_IN, AROUND_IN = 0.62, 4.4, 1.1, 0.86
-# The labels of the speeds on the left of panels A, the headings above, and between two panels.
-SPEEDS_IN, HEADINGS_IN, BETWEEN_IN = 0.32, 0.36, (0.34, 0.15)
 # One row a finished trial: the ego's speeds.
 EGO_SPEEDS = """
 SELECT trial_id, spec_hash, list(time_s ORDER BY step) AS time_s,
@@ -76,7 +72,7 @@ def figure2(study: Study, chosen: list[Group]) -> Figure:
     rows = max(len(names), 1)
     lines = max((name.count("\n") + 1 for name in names), default=1)
     row_in = max(ROW_IN, min(HIGHEST_ROW_IN, FEW_ROWS_IN / rows), LINE_IN * lines + 0.2)
-    figure = Figure(figsize=(PAGE_IN, AROUND_IN + rows * row_in))
+    figure = Figure(figsize=(PAGE_IN, AROUND_IN + rows * row_in), layout="constrained")
     axes = figure.subplots(rows, len(HEADINGS), sharex="col", sharey="col", squeeze=False)
     for row, group, name in zip(axes, groups, names, strict=False):
         row[0].set_ylabel(name, rotation=0, ha="right", va="center", multialignment="right")
@@ -105,20 +101,10 @@ def figure2(study: Study, chosen: list[Group]) -> Figure:
         for dashes, label in humans.items()
         if dashes == ":" or not study.human.measured
     ]
-    figure.legend(handles=handles, loc="lower center", ncols=min(len(handles), 6), frameon=False)
-    names_of_rows = [row[0].yaxis.label for row in axes]
-    place_panels(figure, axes, names_of_rows, (SPEEDS_IN, HEADINGS_IN), BETWEEN_IN)
-    for panel in axes[0]:
-        _fix_ticks(panel.xaxis, panel.yaxis)
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=min(len(handles), 6), frameon=False
+    )
     return figure
-
-
-def _fix_ticks(*axes: Axis) -> None:
-    """Choose the ticks of a column, which all rows share, once and not again in each row."""
-    for axis in axes:
-        low, high = axis.get_view_interval()
-        seen = [tick for tick in axis.get_majorticklocs() if low <= tick <= high]
-        axis.set_ticks(seen, axis.get_major_formatter().format_ticks(seen))
 
 
 def left_first(merged_first: pd.Series) -> Estimate:
@@ -149,7 +135,6 @@ def points(group: Group, velocity_mps: float, summary: Summary) -> Points:
 
 @remembered
 def _points(group: Group, summary: Summary) -> dict[float, Points]:
-    """By relative velocity in m/s."""
     if summary is not left_first and not group.measured:
         return {}
     trials = group.outcomes if summary is left_first else group.trials
@@ -198,7 +183,6 @@ def published_gap_line(velocity_mps: float) -> tuple[Array, Array]:
 
 
 def _draw_traces(axis: Axes, study: Study, group: Group, first: str, styles: Styles) -> None:
-    """The left speeds of those trials in which this side merged first."""
     traces = left_traces(study, group, first)
     count = sum(len(traces.get(velocity, ())) for velocity in styles)
     if not count:
@@ -220,7 +204,6 @@ def _draw_traces(axis: Axes, study: Study, group: Group, first: str, styles: Sty
 
 
 def _draw_estimates(axis: Axes, group: Group, summary: Summary, styles: Styles) -> None:
-    """Estimates of the relative velocities, side by side."""
     found = [points(group, velocity, summary) for velocity in styles]
     for index, (part, look) in enumerate(zip(found, styles.values(), strict=True)):
         draw_points(axis, part, 0.3 * (index - (len(styles) - 1) / 2), look)
@@ -231,7 +214,6 @@ def _draw_estimates(axis: Axes, group: Group, summary: Summary, styles: Styles) 
 
 
 def _say(axis: Axes, text: str) -> None:
-    """A remark in a panel."""
     place: Style = {"xycoords": "axes fraction", "ha": "center", "va": "top"}
     axis.annotate(text, (0.5, 0.9), fontsize=6, color=GREY, **place)
 
