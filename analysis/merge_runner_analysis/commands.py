@@ -319,7 +319,6 @@ def report(
 
 
 def _say_what_is_computed(study: Study, what: str) -> None:
-    """Say why nothing is seen for a while."""
     say(
         f"computing the {what} of {len(study.frames.trials)} trials; a thousand take about a minute"
     )

@@ -119,7 +119,6 @@ def sources_of(
 
 
 def _counted(group: Group, measure: str) -> Source:
-    """The trials that a verdict counts."""
     went = went_so(group, measure)
     trials, numerator = (
         tuple(group.trials.loc[index, "trial_id"]) for index in (went.index, went.index[went])

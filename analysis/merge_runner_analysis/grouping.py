@@ -302,7 +302,6 @@ def groups_of(
 
 
 def _model_group(rows: pd.DataFrame, first: pd.Series) -> Group:
-    """The group of these trials, which have the keys of the ``first`` of them."""
     scripted = bool(first["scripted"])
     models: dict[Side, str] = {side: first[f"model_{side}"] for side in SIDES}
     sides = [side for side in SIDES if rows[f"{side}_scripted"].any()]

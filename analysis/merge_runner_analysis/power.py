@@ -183,7 +183,6 @@ def played(group: Group) -> Truth | None:
 
 
 def _trials_of(truth: Truth, conditions: Sequence[str], repetitions: int = 1) -> pd.DataFrame:
-    """Return how trials of each condition are drawn, as columns of numbers."""
     signs = np.array([-1 if name.endswith(MIRRORED) else 1 for name in conditions])
     known = [CONDITIONS[name.removesuffix(MIRRORED)] for name in conditions]
     headway_m = signs * np.array([one.projected_headway_m for one in known])
@@ -205,7 +204,6 @@ def _trials_of(truth: Truth, conditions: Sequence[str], repetitions: int = 1) ->
 
 
 def _drawn(trials: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
-    """Return one outcome of each trial."""
     n = len(trials)
     collided = rng.random(n) < trials["collided"]
     first = rng.random(n) < expit(trials["logit"] + trials["noise"] * rng.standard_normal(n))
@@ -310,7 +308,6 @@ class Played:
 
 @lru_cache(maxsize=8)
 def _level(level: tuple[Played, ...], multiple: float, *, sides: bool) -> pd.DataFrame:
-    """Return the trials of a level."""
     return pd.concat([part.trials(multiple, sides=sides) for part in level], ignore_index=True)
 
 
@@ -430,7 +427,6 @@ def power_table(title: str, rows: Sequence[Row]) -> Table:
 
 
 def _cases(plan: Plan, groups: Sequence[Group]) -> Iterator[tuple[str, str, Case | Contrast]]:
-    """Yield what is compared, after the names of both."""
     truths = {arm.label: _truths(plan, arm, groups) for arm in plan.arms}
     contrasts = list(_contrasts(plan, truths))
     yield from contrasts
@@ -549,7 +545,6 @@ def _primary(plan: Plan) -> str:
 
 
 def _place(plan: Plan, factor: str, level: str) -> int:
-    """Return where the study lists a level."""
     listed = plan.levels.get(factor, [])
     return listed.index(level) if level in listed else len(listed)
 

@@ -77,7 +77,6 @@ class Study:
         self.groups = [self.human] * with_human + self.models
 
     def _driven(self, trials: pd.DataFrame) -> pd.DataFrame:
-        """Return the chosen ones of drivers' trials, of a run and of a condition."""
         sweep, condition = self.selection.sweep, self.selection.condition
         if sweep:
             links = self.frames.studies.trials
@@ -86,7 +85,6 @@ class Study:
         return trials[trials["condition"] == condition] if condition else trials
 
     def _runs(self, wanted: str) -> list[str]:
-        """Return the ids of the runs of this id or name; raises UsageError where there is none."""
         called = self.frames.studies.called
         named = [sweep_id for sweep_id, name in called.items() if name == wanted]
         if not named:

@@ -114,7 +114,6 @@ def judged(
 
 
 def _near(tasks: Mapping[str, ScenarioConfig]) -> str:
-    """The query of the samples at or next to which boxes can overlap."""
     every = [ScenarioConfig(), *tasks.values()]
     step_s = max(one.step_s for one in every)
     # What accelerations against each other, and a resistance, add to the way within a step.

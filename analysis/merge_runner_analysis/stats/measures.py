@@ -102,7 +102,6 @@ def mean_of(trials: pd.DataFrame, column: str, shares: pd.Series | None = None) 
 
 
 def _weighted_mean(trials: pd.DataFrame, column: str, shares: pd.Series) -> float:
-    """The mean over conditions, which weigh by these shares as far as they have trials."""
     means = trials.groupby("condition")[column].mean()
     weights = shares.reindex(means.index, fill_value=0)
     return float(means @ weights / weights.sum())

@@ -92,7 +92,6 @@ def read_twice(frame: pd.DataFrame, images: pd.Series) -> pd.DataFrame:
 
 @remembered
 def _mirrored(study: Study, condition: str) -> str:
-    """Return a condition as the driver on the right sees it."""
     headway_m, velocity_mps = study.conditions[condition]
     numbers = (0 - headway_m, 0 - velocity_mps)
     if numbers == (headway_m, velocity_mps):

@@ -263,7 +263,6 @@ def decided(both: Both, tests: Mapping[str, Estimate]) -> dict[str, str]:
 
 
 def _strength(statistic: Statistic, both: Both) -> str:
-    """Whether a trait that differs is weaker or stronger than in humans."""
     own, human = statistic.own(both).value, statistic.human(both).value
     assert own is not None
     assert human is not None
@@ -326,7 +325,6 @@ def _rates(both: Both) -> Estimate | None:
 
 
 def _velocity(both: Both) -> Estimate | None:
-    """I4, against its margin."""
     moved = fits(both.group).hc3.moved(both.group.trials)
     if moved is None:
         return None
@@ -334,7 +332,6 @@ def _velocity(both: Both) -> Estimate | None:
 
 
 def _held(both: Both) -> Estimate | None:
-    """I5, against its margin."""
     likeness = both.likeness
     value, se, margin = likeness.value, likeness.se, MEASURES["held"].margin
     if value is None or se is None or margin is None:
@@ -346,7 +343,6 @@ def _held(both: Both) -> Estimate | None:
 
 
 def _likeness(study: Study, group: Group) -> Estimate:
-    """How far accelerations are held, less the humans, in human standard deviations."""
     likeness = less_humans(study, group) if len(group.finished) else None
     if likeness is not None and likeness.value is not None:
         return likeness
@@ -362,12 +358,10 @@ def _of_fit(human: Group, found: Estimate) -> Estimate:
 
 
 def _imported(human: Group) -> bool:
-    """Whether so many pairs are imported that their gaps are known."""
     return human.measured and human.finished["pair"].nunique() >= MIN_PAIRS
 
 
 def _gap(group: Group) -> Estimate:
-    """The mean gap of a driver."""
     found = mean_of(group.finished, GAP.column)
     why = Why.ONE_GAP if found.n else Why.NO_GAP
     return replace(found, problem=Fact(why)) if found.se is None else found
@@ -430,7 +424,6 @@ def human_fit(human: Group) -> Regression:
 
 @remembered
 def _slope(group: Group, term: str) -> Estimate:
-    """A slope of who goes first by Firth's fit."""
     fit = fits(group).firth
     if fit.problem:
         return Estimate(n=fit.n, problem=fit.problem)
@@ -441,7 +434,6 @@ def _slope(group: Group, term: str) -> Estimate:
 
 
 def _headway(fit: Regression) -> Estimate:
-    """The slope of the gap on headway."""
     if fit.problem:
         return Estimate(n=fit.n, problem=fit.problem)
     term = fit.terms[TESTED["I3"][0]]
@@ -480,7 +472,6 @@ def _standardised(both: Both) -> Estimate:
 
 
 def _goes_first(indicator: str) -> Statistic:
-    """The slope of who goes first that an indicator tests."""
     term = TESTED[indicator][0]
     return Statistic(
         lambda both: _slope(both.group, term),

@@ -59,7 +59,6 @@ def attempts(study: Study) -> Table:
 
 
 def _columns(name: str) -> list[Column]:
-    """A column of counts, and one of their shares."""
     meaning = MEANINGS.get(name, f"answers without a valid plan: {name}")
     counts = "" if name == "trials" else FAILURES.get(name, name)
     count = Column(name, name.replace("_", " "), "count", meaning, counts)

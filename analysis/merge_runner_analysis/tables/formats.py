@@ -64,7 +64,6 @@ def render(tables: Sequence[Table], form: TableFormat, width: int | None = None)
 
 
 def _grid(table: Table) -> tuple[list[Column], list[list[str]]]:
-    """The columns that are shown; their headings, and each row, as a reader sees them."""
     shown = shown_columns(table)
     rows = [[shown_value(c, row.values.get(c.name)) for c in shown] for row in table.rows]
     return shown, [[column.heading for column in shown], *rows]

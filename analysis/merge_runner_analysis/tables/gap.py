@@ -71,7 +71,6 @@ def _fits(group: Group) -> list[Fit]:
 
 
 def _published(group: Group, term: str) -> Row:
-    """The humans' row of Table IV as the paper prints it."""
     printed = published("paper_gap").query("driver == 'human' and term == @term").iloc[0]
     values = {name: printed_value(printed[name]) for name in ("b", "se", "t", "p")}
     note = f"published values, no human traces are imported ({citation('paper_gap')})"

@@ -89,7 +89,6 @@ def _drivers(study: Study) -> Iterator[str]:
 
 
 def _names(study: Study, factors: tuple[str, ...]) -> list[list[str]]:
-    """The names of the levels of each of these factors."""
     names: dict[str, dict[str, None]] = {factor: {} for factor in factors}
     for of_factor in levels_by_factor(study):
         if of_factor[0].factor in names:

@@ -124,7 +124,6 @@ def _driver(group: Group, kind: str) -> dict[str, Value]:
 
 
 def _played_rule(study: Study, group: Group) -> str:
-    """The collision rule of a group's scenario, as sentences name it."""
     scenario = study.frames.specs.get(group.spec_hash, {}).get("scenario", {})
     return PLAYED_RULES[ScenarioConfig.model_validate(scenario).collision_rule]
 
