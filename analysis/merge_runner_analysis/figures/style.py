@@ -48,9 +48,14 @@ def wrapped(text: str, width: int) -> str:
     return "\n".join(line.strip() for line in lines)
 
 
-def draw_points(axis: Axes, points: Points, shift: float, style: Style) -> None:
+def draw_points(
+    axis: Axes, points: Points, shift: float, style: Style, *, horizontal: bool = False
+) -> None:
     """Draw estimates with their intervals, ``shift`` beside their places on the axis."""
-    rows = [(x + shift, one.value, one.low, one.high) for x, one in points]
-    x, y, low, high = np.array(rows, dtype=float).reshape(-1, 4).T
-    errors = np.nan_to_num(np.vstack([y - low, high - y]))
-    axis.errorbar(x, y, yerr=errors, elinewidth=0.7, capsize=1.5, mew=0.8, **style)
+    rows = [(place + shift, one.value, one.low, one.high) for place, one in points]
+    places, values, low, high = np.array(rows, dtype=float).reshape(-1, 4).T
+    errors = np.nan_to_num(np.vstack([values - low, high - values]))
+    at: Style = {"x": places, "y": values, "yerr": errors}
+    if horizontal:
+        at = {"x": values, "y": places, "xerr": errors}
+    axis.errorbar(**at, elinewidth=0.7, capsize=1.5, mew=0.8, **style)
