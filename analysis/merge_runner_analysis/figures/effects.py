@@ -49,7 +49,7 @@ def effects_figure(study: Study) -> Figure:
         axis.set_xlabel(metric.heading)
         for number, (driver, look) in enumerate(looks.items()):
             points = [
-                (place, level_estimate(study, level, metric))
+                (float(place), level_estimate(study, level, metric))
                 for place, levels in enumerate(lines.values())
                 for name, level in levels
                 if name == driver

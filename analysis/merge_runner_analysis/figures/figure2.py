@@ -90,11 +90,10 @@ def figure2(study: Study, chosen: list[Group]) -> Figure:
         axis.set_title(panel, loc="left", fontweight="bold")
     for axis, label in zip(axes[-1], HEADINGS.values(), strict=True):
         axis.set_xlabel(label)
-    signed = (f"{v:+g}".replace("-", "−") if v else "0" for v in velocities)
-    handles = [
-        Line2D([], [], label=f"Δv = {text} m/s", **styles[v])
-        for v, text in zip(styles, signed, strict=True)
-    ]
+    handles = []
+    for velocity, look in styles.items():
+        signed = f"{velocity:+g}".replace("-", "−") if velocity else "0"
+        handles.append(Line2D([], [], label=f"Δv = {signed} m/s", **look))
     humans = {":": "humans", "--": "published regression"} if study.human in study.groups else {}
     handles += [
         Line2D([], [], color=GREY, ls=dashes, lw=0.8, label=label)
@@ -120,8 +119,8 @@ def gap(gaps_m: pd.Series) -> Estimate:
 
 def deviation(rmse_mps: pd.Series) -> Estimate:
     """Panel E: mean RMSE of the speed in m/s, of a trial that of both vehicles; never below 0."""
-    found = mean(rmse_mps.to_numpy(float))
-    return found if found.low is None else replace(found, low=max(0.0, found.low))
+    rmse = mean(rmse_mps.to_numpy(float))
+    return rmse if rmse.low is None else replace(rmse, low=max(0.0, rmse.low))
 
 
 Summary = Callable[[pd.Series], Estimate]
@@ -139,13 +138,13 @@ def _points(group: Group, summary: Summary) -> dict[float, Points]:
         return {}
     trials = group.outcomes if summary is left_first else group.trials
     columns = ["relative_velocity_mps", "projected_headway_m", "condition"]
-    chosen = trials.loc[trials["status"] == "finished", [*columns, COLUMNS[summary]]]
-    found: dict[float, Points] = {}
-    for (velocity, headway_m, _), values in chosen.groupby(columns)[COLUMNS[summary]]:
+    finished = trials.loc[trials["status"] == "finished", [*columns, COLUMNS[summary]]]
+    by_velocity: dict[float, Points] = {}
+    for (velocity, headway_m, _), values in finished.groupby(columns)[COLUMNS[summary]]:
         estimate = summary(values)
         if estimate.value is not None:
-            found.setdefault(velocity, []).append((headway_m, estimate))
-    return found
+            by_velocity.setdefault(velocity, []).append((headway_m, estimate))
+    return by_velocity
 
 
 @remembered
@@ -164,11 +163,11 @@ def left_traces(study: Study, group: Group, first: str) -> dict[float, list[Arra
         return {}
     trials = group.finished[group.finished["merged_first"] == first]
     velocities = trials.set_index(KEYS)["relative_velocity_mps"].to_dict()
-    found: dict[float, list[Array]] = {}
+    traces: dict[float, list[Array]] = {}
     for row in of_trials(study.read(EGO_SPEEDS), trials).itertuples():
         velocity = float(velocities[row.trial_id, row.spec_hash])
-        found.setdefault(velocity, []).append(np.column_stack([row.time_s, row.velocity_mps]))
-    return found
+        traces.setdefault(velocity, []).append(np.column_stack([row.time_s, row.velocity_mps]))
+    return traces
 
 
 def published_gap_line(velocity_mps: float) -> tuple[Array, Array]:

@@ -20,14 +20,7 @@ from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.frames import KEYS
 from merge_runner_analysis.grouping import Group, levels_of
 from merge_runner_analysis.metrics import BOXES, COLLISIONS, LEFT_FIRST, METRICS, Metric
-from merge_runner_analysis.stats.contrasts import (
-    contrast_means,
-    contrast_rates,
-    corrected,
-    difference_of_contrasts,
-    means_within,
-    shared_cells,
-)
+from merge_runner_analysis.stats import contrasts
 from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.intervals import difference
 from merge_runner_analysis.stats.levels import DRIVER, Level, copied_cells, levels_by_factor
@@ -241,21 +234,28 @@ def _compared(
     if metric.estimator == "median":
         medians = float(level["value"].median()), float(reference["value"].median())
         return medians, Estimate(medians[0] - medians[1])
-    if metric.rate and (cells := shared_cells(level, reference, "value")):
+    if metric.rate and (cells := contrasts.shared_cells(level, reference, "value")):
         first, second = cells.rates
-        return (100 * first, 100 * second), contrast_rates(cells).times(100)
-    means = means_within(level, reference, "value")
-    return means, contrast_means(level, reference, "value")
+        return (100 * first, 100 * second), contrasts.contrast_rates(cells).times(100)
+    means = contrasts.means_within(level, reference, "value")
+    return means, contrasts.contrast_means(level, reference, "value")
 
 
 def _interaction(frames: Sequence[pd.DataFrame], metric: Metric) -> Estimate | None:
     """Return the difference of the first two less that of the others; None if one is not known."""
     level, reference, twin, base = frames
     if metric.rate:
-        cells, others = shared_cells(level, reference, "value"), shared_cells(twin, base, "value")
-        return difference_of_contrasts(cells, others).times(100) if cells and others else None
-    mean = contrast_means(level, reference, "value")
-    other = contrast_means(twin, base, "value")
+        cells, others = (
+            contrasts.shared_cells(level, reference, "value"),
+            contrasts.shared_cells(twin, base, "value"),
+        )
+        return (
+            contrasts.difference_of_contrasts(cells, others).times(100)
+            if cells and others
+            else None
+        )
+    mean = contrasts.contrast_means(level, reference, "value")
+    other = contrasts.contrast_means(twin, base, "value")
     return difference(mean, other) if mean and other else None
 
 
@@ -277,7 +277,7 @@ def _with_corrected(study: Study, effects: list[Effect]) -> list[Effect]:
             and one.difference.p is not None
             and (one.difference.se or one.difference.value)
         }
-        p |= dict(zip(family, corrected([*family.values()]), strict=True))
+        p |= dict(zip(family, contrasts.corrected([*family.values()]), strict=True))
     return [
         replace(one, primary=is_primary[place], p_corrected=p[place])
         for place, one in enumerate(effects)

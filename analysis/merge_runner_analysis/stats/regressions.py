@@ -355,8 +355,8 @@ class Moved:
     @property
     def within_p(self) -> float:
         """The p-value that all are below the margin: the largest of two one-sided tests each."""
-        each = zip(self.sizes, self.errors, strict=True)
-        return max(equivalence_p(float(b), float(se), self.freedom) for b, se in each)
+        pairs = zip(self.sizes.tolist(), self.errors.tolist(), strict=True)
+        return max(equivalence_p(size, se, self.freedom) for size, se in pairs)
 
     @property
     def beyond_p(self) -> float:

@@ -35,12 +35,12 @@ SHARES = {"retried", "lost", *FAILURES, "invalid", NO_DECISION, "fallback"}
 
 def attempts(study: Study) -> Table:
     """A row per driver and variant: trials, calls, attempts, and what went wrong with them."""
-    found = {group: tally(study, group.stored) for group in study.played}
+    tallies = {group: tally(study, group.stored) for group in study.played}
     known = {"answers", "decisions", *MEANINGS, *FAILURES.values()}
-    reasons = dict.fromkeys(name for one in found.values() for name in sorted({*one} - known))
-    names = [
-        name for name in MEANINGS if name != NO_DECISION or any(one[name] for one in found.values())
-    ]
+    reasons = dict.fromkeys(name for of in tallies.values() for name in sorted({*of} - known))
+    names = [*MEANINGS]
+    if not any(of[NO_DECISION] for of in tallies.values()):
+        names.remove(NO_DECISION)
     names[names.index("invalid") : names.index("invalid")] = reasons
     columns = [column for name in names for column in _columns(name)]
     return Table(
@@ -48,7 +48,7 @@ def attempts(study: Study) -> Table:
         (*GROUP_COLUMNS, *columns),
         [
             row_of(group, _values(columns, counts), _note(counts), rests_on=STORED)
-            for group, counts in found.items()
+            for group, counts in tallies.items()
         ],
         (
             "a call is asked at one decision, in one or more attempts; retried is of all attempts, "
