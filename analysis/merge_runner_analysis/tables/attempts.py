@@ -9,7 +9,6 @@ from merge_runner_analysis.provenance import tally
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.model import GROUP_COLUMNS, STORED, Column, Table, row_of
 
-NO_CALLS = "no call: this driver asks no model, or its calls are not in the database"
 # Failures with a share of the answers beside their number; the others are malformed answers, and
 # have a column where they occur.
 FAILURES = {"refused": "refusal", "truncated": "truncated", "empty": "empty"}
@@ -79,5 +78,7 @@ def _values(columns: list[Column], counts: Counter[str]) -> dict[str, int | floa
 def _note(counts: Counter[str]) -> str:
     if counts["answers"]:
         return ""
-    decided = "" if counts["decisions"] else "; no decision is stored"
-    return ("no call was answered" if counts["calls"] else NO_CALLS) + decided
+    note = "no call: this driver asks no model, or its calls are not in the database"
+    if counts["calls"]:
+        note = "no call was answered"
+    return note if counts["decisions"] else f"{note}; no decision is stored"

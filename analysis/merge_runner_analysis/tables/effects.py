@@ -26,21 +26,6 @@ from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Val
 from merge_runner_analysis.wording import SAME_TRIALS, note_of
 
 TEST = "of the test of Mantel and Haenszel, or of Welch's"
-HOW = (
-    "compared within the cells that both have, a condition with one level of each other factor: "
-    "shares by the test of Mantel and Haenszel with the score interval that agrees with it, means "
-    "by Welch's test in a model with a level for each cell"
-)
-CROSSED = (
-    "an interaction (×) is the difference of a level minus that at the reference of the other "
-    "factor, in the cells that all four have"
-)
-FAMILIES = (
-    "p, corrected: by Holm in two families. The effects of factors on {primary}, the primary "
-    "measure, are one, without those of the model; all others are the other one"
-)
-DETECTABLE = "detectable: found at p < .05, before correction, with power .8"
-SAME_VALUE = "the same in every trial, so that there is nothing to test"
 UNTESTED = (
     "no test without cells that all have, spread within cells, or with undecided trials, trials of "
     "several studies or the same ones at two levels"
@@ -165,7 +150,7 @@ def problem(study: Study, one: Effect) -> str:
     elif one.difference.value is None:
         remarks.append(f"{one.metric.heading}: {UNTESTED}")
     elif one.difference.p is None and not one.difference.se and one.metric.estimator != "median":
-        remarks.append(SAME_VALUE)
+        remarks.append("the same in every trial, so that there is nothing to test")
     elif copies:
         remarks.append(
             f"the difference leaves out {copies} of {shared} shared cells, those with the same "
@@ -195,9 +180,20 @@ def _notes(study: Study, by: str) -> Iterator[str]:
     if not tested and not every:
         yield "the trials of judged drivers differ in no factor"
         return
-    yield f"levels are {HOW}. {CROSSED}"
+    yield (
+        "levels are compared within the cells that both have, a condition with one level of each "
+        "other factor: shares by the test of Mantel and Haenszel with the score interval that "
+        "agrees with it, means by Welch's test in a model with a level for each cell. an "
+        "interaction (×) is the difference of a level minus that at the reference of the other "
+        "factor, in the cells that all four have"
+    )
     if tested:
-        yield f"{FAMILIES.format(primary=primary(study).heading)}. {DETECTABLE}"
+        yield (
+            "p, corrected: by Holm in two families. The effects of factors on "
+            f"{primary(study).heading}, the primary measure, are one, without those of the model; "
+            "all others are the other one. detectable: found at p < .05, before correction, with "
+            "power .8"
+        )
     counts = [
         f"{level.id}: {level.pooled.repeated} of {len(level.pooled.stored.trials)}"
         for level in chain.from_iterable(every)

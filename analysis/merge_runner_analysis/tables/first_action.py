@@ -29,15 +29,6 @@ NO_ACTION = (
     "no trial that ended has a first action of both: none did, or with control_start = "
     '"own_exit" one driver acts while the other is in its tunnel yet'
 )
-REPEATS = (
-    "{name} declares no chance, and does the same first in all repetitions of a situation: each "
-    "situation counts once"
-)
-UNBOUNDED = "exchange rate: no finite interval, as the slope on headway may be 0 (Fieller 1954)"
-ONLY_ASKED = (
-    "asked without the loop (`merge-runner sweep --first`), in {trials} trials that end before a "
-    "second decision"
-)
 # By the sign of the own relative velocity.
 VELOCITIES = {-1: "slower", 0: "equal", 1: "faster"}
 FIRST_ACTIONS = (
@@ -97,12 +88,21 @@ def _first_rows(study: Study, group: Group) -> Iterator[Row]:
                 **_estimate("slope", fitted),
                 **_estimate("exchange_rate", rate),
             }
-        remarks = (
-            "" if len(rows) else NO_ACTION,
-            REPEATS.format(name=seat.name) if first.repeats_itself(study, seat) else "",
-            UNBOUNDED if len(rows) and rate and rate.low is None else "",
-            ONLY_ASKED.format(trials=len(group.ended)) if group in study.asked else "",
-        )
+        remarks = [] if len(rows) else [NO_ACTION]
+        if first.repeats_itself(study, seat):
+            remarks.append(
+                f"{seat.name} declares no chance, and does the same first in all repetitions of a "
+                "situation: each situation counts once"
+            )
+        if len(rows) and rate and rate.low is None:
+            remarks.append(
+                "exchange rate: no finite interval, as the slope on headway may be 0 (Fieller 1954)"
+            )
+        if group in study.asked:
+            remarks.append(
+                f"asked without the loop (`merge-runner sweep --first`), in {len(group.ended)} "
+                "trials that end before a second decision"
+            )
         yield row_of(group, values, *remarks, item=seat.side, rests_on=ENDED)
 
 

@@ -41,7 +41,6 @@ NOTES = (
     "move. Robust: the 95 % interval of the mean gain lies above 0. Vehicles that took no action "
     "do not count",
 )
-NO_CEILING = "not all conditions of the humans were played: no ceiling"
 
 
 def indicators(study: Study) -> Table:
@@ -148,4 +147,4 @@ def reasons(judged: Score, *names: str) -> str:
 
 def no_ceiling(group: Group) -> str:
     """Return why a group has no ceiling; empty where it has one."""
-    return "" if min(group.sizes) else NO_CEILING
+    return "" if min(group.sizes) else "not all conditions of the humans were played: no ceiling"

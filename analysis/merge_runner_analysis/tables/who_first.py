@@ -19,11 +19,6 @@ from merge_runner_analysis.tables.coefficients import (
 )
 from merge_runner_analysis.tables.model import Column, Optional, Table
 
-ESTIMATORS = (
-    "b, SE, z and p: the paper's maximum likelihood with Wald's tests; Firth b, SE and LR p: the "
-    "penalised estimate that the verdicts rest on, with its likelihood-ratio test"
-)
-
 
 def who_first(study: Study) -> Table:
     """Table III: logistic regression of left-first on h (m) and dv (m/s)."""
@@ -44,7 +39,12 @@ def who_first(study: Study) -> Table:
             for group in study.groups
             for fit in fitted[group]
         ],
-        (ESTIMATORS, TESTED_ELSEWHERE, *mixed_note(study, "S4", "random intercept per pair")),
+        (
+            "b, SE, z and p: the paper's maximum likelihood with Wald's tests; Firth b, SE and LR "
+            "p: the penalised estimate that the verdicts rest on, with its likelihood-ratio test",
+            TESTED_ELSEWHERE,
+            *mixed_note(study, "S4", "random intercept per pair"),
+        ),
     )
 
 
