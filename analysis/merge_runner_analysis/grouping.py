@@ -280,9 +280,8 @@ def groups_of(
     groups = []
     for _, rows in keyed.groupby(keys):
         counts = of_trials(decisions, rows).groupby("model")[["invalid", "asked"]].sum()
-        reasons = (not_judged(row.Index, row.invalid, row.asked) for row in counts.itertuples())
-        group = _model_group(trials.loc[rows.index], rows.iloc[0])
-        group = replace(group, unjudged=Reason("; ".join(filter(None, reasons))))
+        reasons = filter(None, (not_judged(*count) for count in counts.itertuples()))
+        group = _model_group(trials.loc[rows.index], rows.iloc[0], Reason("; ".join(reasons)))
         own = [specs.get(name, {}) for name in rows["spec_hash"].unique()]
         # Of a first decision that was only asked, what follows is not known: draws that differ
         # later may be equal until then.
@@ -293,7 +292,7 @@ def groups_of(
     return sorted(groups, key=lambda g: (g.scripted, g.driver, g.setting != BASELINE, g.setting))
 
 
-def _model_group(rows: pd.DataFrame, first: pd.Series) -> Group:
+def _model_group(rows: pd.DataFrame, first: pd.Series, unjudged: Reason) -> Group:
     scripted = bool(first["scripted"])
     models: dict[Side, str] = {side: first[f"model_{side}"] for side in SIDES}
     sides = [side for side in SIDES if rows[f"{side}_scripted"].any()]
@@ -310,6 +309,7 @@ def _model_group(rows: pd.DataFrame, first: pd.Series) -> Group:
         trials=rows,
         posing=Sentence(posing),
         caution=Sentence(unresponsive(first["spec"])),
+        unjudged=unjudged,
     )
     return replace(group, label=f"{driver} ({group.said})") if group.said else group
 

@@ -245,15 +245,11 @@ def _interaction(frames: Sequence[pd.DataFrame], metric: Metric) -> Estimate | N
     """Return the difference of the first two less that of the others; None if one is not known."""
     level, reference, twin, base = frames
     if metric.rate:
-        cells, others = (
-            contrasts.shared_cells(level, reference, "value"),
-            contrasts.shared_cells(twin, base, "value"),
-        )
-        return (
-            contrasts.difference_of_contrasts(cells, others).times(100)
-            if cells and others
-            else None
-        )
+        cells = contrasts.shared_cells(level, reference, "value")
+        others = contrasts.shared_cells(twin, base, "value")
+        if cells is None or others is None:
+            return None
+        return contrasts.difference_of_contrasts(cells, others).times(100)
     mean = contrasts.contrast_means(level, reference, "value")
     other = contrasts.contrast_means(twin, base, "value")
     return difference(mean, other) if mean and other else None
