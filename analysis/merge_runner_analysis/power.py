@@ -27,11 +27,12 @@ from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.published import HUMAN_GAP_SD_M, human_outcomes, published
 from merge_runner_analysis.stats import regressions
 from merge_runner_analysis.stats.contrasts import contrast_means, contrast_rates, shared_cells
-from merge_runner_analysis.stats.indicators import ALPHA, TESTED, fits, judge
+from merge_runner_analysis.stats.indicators import TESTED, fits, judge
 from merge_runner_analysis.stats.intervals import POWER
 from merge_runner_analysis.stats.regressions import Array
 from merge_runner_analysis.stats.sides import read_twice
 from merge_runner_analysis.tables.model import Column, Row, Table, Value
+from merge_runner_analysis.wording import ALPHA
 
 COEFFICIENTS = 7  # of a truth: of who merges first, and of the gap
 MULTIPLES = (0.5, 1.0, 2.0, 4.0)
@@ -53,24 +54,21 @@ QUESTIONS = {
 }
 
 
-class Measure(NamedTuple):
-    """A measure of an effect: its column of simulated trials, and its unit.
-
-    Keys of an [effect] in ``changed_by`` change it in any condition.
-    """
+class Endpoint(NamedTuple):
+    """A measure of simulated trials: column, unit, and the keys of an [effect] that change it."""
 
     column: str
     unit: str
     changed_by: tuple[str, ...]
 
 
-MEASURES = {
-    "goes first": Measure("left_first", "points", ("goes_first", *regressions.WHO_FIRST_TERMS)),
-    "collisions": Measure("collided", "points", ("collided",)),
-    "gap": Measure("gap_m", "m", ("gap_m",)),
+ENDPOINTS = {
+    "goes first": Endpoint("left_first", "points", ("goes_first", *regressions.WHO_FIRST_TERMS)),
+    "collisions": Endpoint("collided", "points", ("collided",)),
+    "gap": Endpoint("gap_m", "m", ("gap_m",)),
 }
 # By the name of a primary measure in a study's file.
-PRIMARY = {
+PRIMARY_ENDPOINTS = {
     "goes_first": "goes first",
     "collided": "collisions",
     "gap_m": "gap",
@@ -78,7 +76,7 @@ PRIMARY = {
     "collided_percent": "collisions",
     "collided_boxes_percent": "collisions",
 }
-NOTHING = 1e-6  # an effect that is no more than this is none
+NEGLIGIBLE = 1e-6  # an effect that is no more than this is none
 MIRRORED = " mirrored"  # after the name of a condition: as the driver on the right sees it
 COLUMNS = (
     Column("table", "table", noted=True),
@@ -157,7 +155,7 @@ def _chance(logits: pd.Series, noise: pd.Series) -> Array:
 
 
 @cache
-def human_trials() -> pd.DataFrame:
+def human_sample() -> pd.DataFrame:
     """Return the published outcomes; the gap of no single trial is published."""
     return human_outcomes().rename(columns={"collided_boxes": "collided"}).assign(gap_m=np.nan)
 
@@ -167,7 +165,7 @@ def human() -> Truth:
     """Return the humans as they are published."""
     tables = [published(name) for name in ("paper_who_first", "paper_gap")]
     b = pd.concat(table[table["driver"] == "human"]["b"] for table in tables).astype(float)
-    collided = float(human_trials()["collided"].mean())
+    collided = float(human_sample()["collided"].mean())
     return Truth("human", HUMAN_GAP_SD_M, collided, 0.0, *b)
 
 
@@ -223,7 +221,7 @@ def simulate(
     )
 
 
-def findings(own: pd.DataFrame, other: pd.DataFrame | None) -> dict[str, bool]:
+def significant(own: pd.DataFrame, other: pd.DataFrame | None) -> dict[str, bool]:
     """Return by question what a driver's trials show at p < .05, alone or beside the humans."""
     if other is None:
         gap = regressions.gap_ols(own, robust=True)
@@ -276,7 +274,7 @@ class Case:
     def found(self, multiple: float, rng: np.random.Generator) -> dict[str, bool]:
         """Return by question what one simulated study of so many times this size shows."""
         own = simulate(self.own, self.conditions, round(multiple * self.repetitions), rng)
-        return findings(own, human_trials() if self.against else None)
+        return significant(own, human_sample() if self.against else None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,7 +311,7 @@ def _level(level: tuple[Played, ...], multiple: float, *, sides: bool) -> pd.Dat
 
 @dataclass(frozen=True, slots=True)
 class Contrast:
-    """A level of a factor against its reference, in the cells of both, in one of MEASURES.
+    """A level of a factor against its reference, in the cells of both, in one of ENDPOINTS.
 
     It is ``assumed`` to differ by what the study names, by default, or as it is planted or played.
     """
@@ -342,7 +340,7 @@ class Contrast:
     @property
     def size(self) -> float:
         """The difference that there is to find, in the unit of the measure, as its test weighs."""
-        column, means = MEASURES[self.measure].column, []
+        column, means = ENDPOINTS[self.measure].column, []
         for trials in self._levels(1):
             expected = trials.assign(left_first=_chance(trials["logit"], trials["noise"]))
             means.append(_by_cell(expected, column).groupby("condition")["value"])
@@ -353,12 +351,12 @@ class Contrast:
 
     def effects(self) -> dict[str, Assumed]:
         """Return the effect that there is to find."""
-        unit = MEASURES[self.measure].unit
+        unit = ENDPOINTS[self.measure].unit
         return {self.measure: Assumed(EFFECTS, self.size, unit, self.assumed)}
 
     def found(self, multiple: float, rng: np.random.Generator) -> dict[str, bool]:
         """Return whether one simulated study of so many times this size shows a difference."""
-        column = MEASURES[self.measure].column
+        column = ENDPOINTS[self.measure].column
         own, other = (_by_cell(_drawn(trials, rng), column) for trials in self._levels(multiple))
         if self.measure == "gap":
             estimate = contrast_means(own, other, "value")
@@ -497,9 +495,9 @@ def _with_assumption(plan: Plan, factor: str, contrast: Contrast) -> Contrast:
     effect = plan.study.file.effect.get(factor, Effect())
     if contrast.truth == PLANTED:
         return replace(contrast, assumed=PLANTED)
-    if any(getattr(effect, name) for name in MEASURES[contrast.measure].changed_by):
+    if any(getattr(effect, name) for name in ENDPOINTS[contrast.measure].changed_by):
         return replace(contrast, assumed=NAMED)
-    if contrast.truth != human().name and abs(contrast.size) > NOTHING:
+    if contrast.truth != human().name and abs(contrast.size) > NEGLIGIBLE:
         return contrast
     own = tuple(
         replace(part, truth=part.truth.plus(_by_default(contrast.measure, part), part.conditions))
@@ -539,9 +537,9 @@ def _levels(arm: Arm) -> dict[str, str]:
 
 
 def _primary(plan: Plan) -> str:
-    """Return the study's primary measure, as MEASURES name it; raises UsageError."""
+    """Return the study's primary measure, as ENDPOINTS name it; raises UsageError."""
     name = plan.study.file.primary
-    return require(PRIMARY, "measure to simulate:", name, "by primary in the study")
+    return require(PRIMARY_ENDPOINTS, "measure to simulate:", name, "by primary in the study")
 
 
 def _place(plan: Plan, factor: str, level: str) -> int:

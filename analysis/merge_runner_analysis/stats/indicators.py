@@ -39,9 +39,8 @@ from merge_runner_analysis.stats.held import measure_profiles
 from merge_runner_analysis.stats.intervals import difference, mean
 from merge_runner_analysis.stats.regressions import Regression
 from merge_runner_analysis.study import Study
-from merge_runner_analysis.wording import INDICATORS, Fact, Why
+from merge_runner_analysis.wording import ALPHA, INDICATORS, Fact, Why
 
-ALPHA = 0.05
 PUBLISHED, BY_EYE = Fact(Why.NO_TRACES), Fact(Why.BY_EYE)
 # By indicator: the term that decides it, and the sign that it needs; I4's is to have no effect.
 TESTED = {

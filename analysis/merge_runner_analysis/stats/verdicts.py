@@ -32,11 +32,12 @@ from merge_runner_analysis.metrics import BOXES, COLLISIONS, GAP
 from merge_runner_analysis.published import HUMAN_GAP_SD_M, PAIRS, human_outcomes, published
 from merge_runner_analysis.stats import contrasts, intervals, measures, regressions
 from merge_runner_analysis.stats.estimate import Estimate
-from merge_runner_analysis.stats.indicators import ALPHA, TESTED, fits, judge, less_humans
+from merge_runner_analysis.stats.indicators import TESTED, fits, judge, less_humans
 from merge_runner_analysis.stats.regressions import CONDITION, GAP_TERMS, MIN_PAIRS, Regression
 from merge_runner_analysis.stats.score_interval import wilson
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.wording import (
+    ALPHA,
     MEASURES,
     OPEN,
     SHOWN,
@@ -114,7 +115,7 @@ class Comparison:
 @remembered
 def compared(study: Study, group: Group) -> tuple[Comparison, ...]:
     """Compare a driver with the humans by every measure."""
-    alike = in_human_conditions(group)
+    alike = comparable(group)
     both = Both(alike, study.human, _likeness(study, alike))
     tests = tests_of(both)
     states = decided(both, tests)
@@ -166,7 +167,7 @@ def went_so(group: Group, measure: str) -> pd.Series:
 
     Only those in conditions of humans count.
     """
-    alike = in_human_conditions(group)
+    alike = comparable(group)
     if measure == "collisions":
         return measures.values(alike, COLLISIONS).astype(bool)
     return _went_first(alike.trials, measure)
@@ -180,7 +181,7 @@ def _went_first(outcomes: pd.DataFrame, measure: str) -> pd.Series:
     return (first == expected)[first.notna() & (expected != 0)]
 
 
-def in_human_conditions(group: Group) -> Group:
+def comparable(group: Group) -> Group:
     """Return the trials in conditions that humans drove: others would pass for a difference."""
     if group.trials["condition"].isin(HUMAN_CONDITIONS).all():
         return group
