@@ -195,8 +195,8 @@ def _effect(
     frames = trials_by_cell(study, [level.pooled for level in levels], metric)
     left_out = {copy for level in levels for copy in level.copies}
     for level, frame in zip(levels, frames, strict=False):
-        unused = level.pooled.trials.drop(index=frame.index.unique())
-        left_out.update(unused[KEYS].itertuples(index=False, name=None))
+        unused = level.pooled.trials[KEYS].drop(index=frame.index.unique())
+        left_out.update(unused.itertuples(index=False, name=None))
     values: tuple[float | None, float | None] = (None, None)
     difference = None
     if frames and len(frames[0]):
