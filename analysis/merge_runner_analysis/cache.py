@@ -30,7 +30,7 @@ CREATE TABLE IF NOT EXISTS finished (
 PACKAGES = (Path(merge_runner_analysis.__file__).parent, Path(merge_runner.__file__).parent)
 COMPUTING = {".py", ".sql", ".csv"}
 PATIENCE_S = 0.5
-LOG = logging.getLogger(__name__)
+warn_once = cache(logging.getLogger(__name__).warning)
 Owner = TypeVar("Owner")
 Others = ParamSpec("Others")
 Result = TypeVar("Result")
@@ -91,11 +91,11 @@ def keep_finished(db: Path, made_of: str, options: str, contents: Mapping[str, s
 
 def kept(db: Path, made_of: str, options: str, name: str, make: Callable[[], str]) -> str:
     """Return what is kept of this state under a name; else it is made, and kept."""
-    found = finished(db, made_of, options, [name])
-    if not found:
-        found = {name: make()}
-        keep_finished(db, made_of, options, found)
-    return found[name]
+    contents = finished(db, made_of, options, [name])
+    if not contents:
+        contents = {name: make()}
+        keep_finished(db, made_of, options, contents)
+    return contents[name]
 
 
 def digest_of(db: Path, made_of: str) -> str:
@@ -111,16 +111,10 @@ def _run(db: Path, sql: str, rows: Sequence[tuple[str, ...]]) -> list[tuple[str,
     try:
         with closing(sqlite3.connect(f"{db}.derived", timeout=PATIENCE_S)) as kept, kept:
             kept.execute(KEPT)
-            return [found for row in rows for found in kept.execute(sql, row)]
+            return [result for row in rows for result in kept.execute(sql, row)]
     except sqlite3.Error as exc:
-        say_once(str(exc))
+        warn_once("what was computed is not kept for the next time: %s", str(exc))
         return []
-
-
-@cache
-def say_once(reason: str) -> None:
-    """Log, once for each reason, that nothing is kept."""
-    LOG.warning("what was computed is not kept for the next time: %s", reason)
 
 
 def remembered(

@@ -129,11 +129,12 @@ def tables(
     from merge_runner_analysis.tables import finished_tables
     from merge_runner_analysis.tables.formats import render
 
-    study = None
     selection = _selection(
         models, where, study_file, by, run=run, without_fallbacks=without_fallbacks
     )
-    if against is not None:
+    if against is None:
+        made = finished_tables(db, names or (), selection=selection)
+    else:
         from merge_runner_analysis.study import Study
         from merge_runner_analysis.tables.against import PAPER
         from merge_runner_analysis.tables.against import against as beside
@@ -141,9 +142,7 @@ def tables(
         if against != PAPER:
             raise UsageError(f"--against {against}: valid is {PAPER}")
         study = Study(db, selection)
-    made = finished_tables(db, names or (), study, selection)
-    if study is not None:
-        made = [beside(table, study) for table in made]
+        made = [beside(table, study) for table in finished_tables(db, names or (), study)]
     width = None if wide else terminal_width()
     print_out(render(made, TableFormat.JSON if as_json else output, width))
 
@@ -179,19 +178,17 @@ def explain(
     (made,) = finished_tables(db, [table], study)
     if not cell:
         names = {"rows": [row.id for row in made.rows], "columns": [c.name for c in made.columns]}
-        listed = [
-            *names["rows"],
-            f"columns, each after ROW and a colon: {', '.join(names['columns'])}",
-        ]
-        print_out(json.dumps(names, indent=2) if as_json else "\n".join(listed))
+        columns = f"columns, each after ROW and a colon: {', '.join(names['columns'])}"
+        lines = [*names["rows"], columns]
+        print_out(json.dumps(names, indent=2) if as_json else "\n".join(lines))
         return
-    found = explain_cell(study, made, cell)
+    explanation = explain_cell(study, made, cell)
     if as_json:
-        sources = [source._asdict() for source in found.sources]
-        shown = {**found._asdict(), "sources": sources}
-        print_out(json.dumps(shown, indent=2, ensure_ascii=False))
+        sources = [source._asdict() for source in explanation.sources]
+        facts = {**explanation._asdict(), "sources": sources}
+        print_out(json.dumps(facts, indent=2, ensure_ascii=False))
     else:
-        print_out("\n".join(found.lines(whole=whole)))
+        print_out("\n".join(explanation.lines(whole=whole)))
 
 
 @app.command(rich_help_panel=PLAY)

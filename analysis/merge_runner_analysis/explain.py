@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
 import pandas as pd
 
 from merge_runner.paths import DEFAULT_DB, command_at
@@ -21,7 +20,6 @@ from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.formats import shown_value
 from merge_runner_analysis.tables.model import COUNTED, ENDED, FINISHED, STORED, Column, Row, Table
 
-SEE_NOTES = "see the notes of the table"
 QUERY = (
     "SELECT trials.trial_id, condition, status, merged_first, "
     "trial_metrics.* EXCLUDE (trial_id, spec_hash) FROM trials "
@@ -107,23 +105,22 @@ def sources_of(
     if column is not None and column.counts == COUNTED and row.values.get(column.name):
         return tuple(_counted(group, str(row.values["measure"])) for group in groups)
     rests_on = (column.rests_on if column else "") or row.rests_on
-    return tuple(
-        _source(
-            study, group.stored if rests_on == STORED else group, rests_on, row.conditions,
-            row.copies, column.counts if column else "",
-        )
-        if rests_on and group.measured
-        else Source(group.id, f"published, not from traces: {row.note or SEE_NOTES}")
-        for group in groups
-    )  # fmt: skip
+    counts = column.counts if column else ""
+    sources = []
+    for group in groups:
+        if rests_on and group.measured:
+            rows = group.stored if rests_on == STORED else group
+            sources.append(_source(study, rows, rests_on, row.conditions, row.copies, counts))
+        else:
+            note = row.note or "see the notes of the table"
+            sources.append(Source(group.id, f"published, not from traces: {note}"))
+    return tuple(sources)
 
 
 def _counted(group: Group, measure: str) -> Source:
-    """The trials that a verdict counts."""
     went = went_so(group, measure)
-    trials, numerator = (
-        tuple(group.trials.loc[index, "trial_id"]) for index in (went.index, went.index[went])
-    )
+    names = group.trials.loc[went.index, "trial_id"]
+    trials, numerator = tuple(names), tuple(names[went])
     text = f"{len(trials)} of {len(group.trials)} trials; the value counts {len(numerator)} of them"
     return Source(group.id, text, _query(group, trials), trials, numerator)
 
@@ -139,23 +136,21 @@ def _source(
 ) -> Source:
     known = {STORED: group.trials, ENDED: group.ended, FINISHED: group.finished}
     whole = known.get(rests_on, group.trials)
-    kept = np.ones(len(whole), dtype=bool)  # to take a part of all columns takes far longer
+    kept = pd.Series(True, whole.index)  # to take a part of all columns takes far longer
     if rests_on not in known:
-        kept &= whole[rests_on].notna().to_numpy()
+        kept &= whole[rests_on].notna()
     if conditions:
-        kept &= whole["condition"].isin(conditions).to_numpy()
+        kept &= whole["condition"].isin(conditions)
     if copies:
-        copied, keys = {*copies}, zip(*(whole[name] for name in KEYS), strict=True)
-        kept &= np.array([key not in copied for key in keys], dtype=bool)
-    names = whole["trial_id"].array[kept]
+        kept &= ~pd.MultiIndex.from_frame(whole[KEYS]).isin(copies)
+    names = whole.loc[kept, "trial_id"]
     trials: tuple[str, ...] = tuple(names)
     numerator: tuple[str, ...] = ()
     if counts:
         values = whole.get(counts)
         if values is None:  # a failure that never occurred has no column
             values = call_counts(study, group).get(counts, pd.Series(False, whole.index))
-        counted = values.reindex(whole.index[kept]).fillna(False).astype(bool)
-        numerator = tuple(names[counted.to_numpy()])
+        numerator = tuple(names[values.reindex(names.index).fillna(False).astype(bool)])
     outcomes = group.published_outcomes
     parts = (
         f"{len(trials)} of {len(group.trials)} trials; not finished: {group.left_out}",

@@ -212,7 +212,6 @@ def read_frames(db: Path) -> Frames:
 
 
 def _studies(sweeps: pd.DataFrame, links: pd.DataFrame) -> Studies:
-    """Tell the studies of a database by its runs."""
     names: dict[str, str] = {}
     orders: dict[str, dict[str, list[str]]] = {}
     for row in sweeps.itertuples():

@@ -195,8 +195,8 @@ def humans_of(trials: pd.DataFrame) -> Group:
 
 def levels_of_group(levels: pd.DataFrame, group: Group) -> dict[str, str]:
     """The levels of a group, model and prompt first."""
-    found = of_trials(levels, group.trials).drop_duplicates("factor")
-    named = found.set_index("factor")["value"].to_dict()
+    rows = of_trials(levels, group.trials).drop_duplicates("factor")
+    named = rows.set_index("factor")["value"].to_dict()
     return {name: named[name] for name in sorted(named, key=lambda n: (n not in FIRST, n))}
 
 
@@ -205,13 +205,13 @@ def levels_of(groups: Iterable[Group], order: Order) -> dict[str, list[str]]:
 
     Then come usual ones, then numbers by size, then the rest by name.
     """
-    found: dict[str, set[str]] = {}
+    every: dict[str, set[str]] = {}
     for group in groups:
         for factor, level in group.levels.items():
-            found.setdefault(factor, set()).add(level)
+            every.setdefault(factor, set()).add(level)
     return {
         factor: sorted(levels, key=lambda level: _place(level, order.get(factor, ())))
-        for factor, levels in found.items()
+        for factor, levels in every.items()
     }
 
 
@@ -237,27 +237,19 @@ def _as_seen(stored: Mapping[str, Any] | None, name: str, ego: str) -> dict[str,
     at_usual = {name: value for name, value in spec.items() if name != MEAN_SPEED}
     usual = spec_hash(canonical_json(at_usual)) if MEAN_SPEED in spec else image
     task = {name: value for name, value in at_usual.items() if name != "prompt_blocks"}
-    task |= {side: _unplanted(task[side]) for side in SIDES if side in task}
+    for side in SIDES:
+        if body := task.get(side, {}).get("body"):
+            unplanted = {key: value for key, value in body.items() if key not in PLANTED}
+            task[side] = {**task[side], "body": unplanted}
     hashed = hashlib.sha256(json.dumps(task, sort_keys=True).encode()).hexdigest()
-    return {
-        "spec": spec,
-        "image": image,
-        "usual": usual,
-        "task": name if stored is None else hashed,
-    }
+    task_hash = name if stored is None else hashed
+    return {"spec": spec, "image": image, "usual": usual, "task": task_hash}
 
 
 def _turned(block: str) -> str:
     """The name of a prompt's block, of which one that a single driver is told names its side."""
     name, _, side = block.partition("@")
     return f"{name}@{'left' if side == 'right' else 'right'}" if side else block
-
-
-def _unplanted(driver: Mapping[str, Any]) -> Mapping[str, Any]:
-    """What a spec says of a driver, without what a study plants in the emulator."""
-    if "body" not in driver:
-        return driver
-    return {**driver, "body": {n: x for n, x in driver["body"].items() if n not in PLANTED}}
 
 
 def groups_of(
@@ -288,9 +280,8 @@ def groups_of(
     groups = []
     for _, rows in keyed.groupby(keys):
         counts = of_trials(decisions, rows).groupby("model")[["invalid", "asked"]].sum()
-        reasons = (not_judged(row.Index, row.invalid, row.asked) for row in counts.itertuples())
-        group = _model_group(trials.loc[rows.index], rows.iloc[0])
-        group = replace(group, unjudged=Reason("; ".join(filter(None, reasons))))
+        reasons = filter(None, (not_judged(*count) for count in counts.itertuples()))
+        group = _model_group(trials.loc[rows.index], rows.iloc[0], Reason("; ".join(reasons)))
         own = [specs.get(name, {}) for name in rows["spec_hash"].unique()]
         # Of a first decision that was only asked, what follows is not known: draws that differ
         # later may be equal until then.
@@ -301,8 +292,7 @@ def groups_of(
     return sorted(groups, key=lambda g: (g.scripted, g.driver, g.setting != BASELINE, g.setting))
 
 
-def _model_group(rows: pd.DataFrame, first: pd.Series) -> Group:
-    """The group of these trials, which have the keys of the ``first`` of them."""
+def _model_group(rows: pd.DataFrame, first: pd.Series, unjudged: Reason) -> Group:
     scripted = bool(first["scripted"])
     models: dict[Side, str] = {side: first[f"model_{side}"] for side in SIDES}
     sides = [side for side in SIDES if rows[f"{side}_scripted"].any()]
@@ -319,6 +309,7 @@ def _model_group(rows: pd.DataFrame, first: pd.Series) -> Group:
         trials=rows,
         posing=Sentence(posing),
         caution=Sentence(unresponsive(first["spec"])),
+        unjudged=unjudged,
     )
     return replace(group, label=f"{driver} ({group.said})") if group.said else group
 
@@ -344,9 +335,9 @@ def _distinct(group: Group, *, programs: bool, scripted: bool) -> Group:
     whole = replace(group, trials=rows.assign(way=way))
     if not programs:
         return replace(whole, equal=len(again))
-    return (
-        replace(whole, trials=whole.trials.drop(index=again), whole=whole) if len(again) else whole
-    )
+    if again.empty:
+        return whole
+    return replace(whole, trials=whole.trials.drop(index=again), whole=whole)
 
 
 def _marks(keyed: pd.DataFrame, within: list[str], what: str) -> pd.Series:

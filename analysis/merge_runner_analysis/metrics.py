@@ -108,110 +108,89 @@ def shown_in(place: str) -> list[Metric]:
     return [one for one in METRICS.values() if one.shown and one.estimator in SHOWN[place]]
 
 
-COLLISIONS = register(
-    Metric(
-        name="collided_percent",
-        label="coll.",
-        unit="%",
-        meaning="share of ended trials with a collision by the rule of their scenario, looked for "
-        "at its steps (the paper's: centres closer than a vehicle length, every 0.2 s)",
-        value="collided",
-        estimator="proportion",
-        trials="ended",
-        paper_of_drivers="collided_percent",
-    )
+COLLISIONS = Metric(
+    name="collided_percent",
+    label="coll.",
+    unit="%",
+    meaning="share of ended trials with a collision by the rule of their scenario, looked for "
+    "at its steps (the paper's: centres closer than a vehicle length, every 0.2 s)",
+    value="collided",
+    estimator="proportion",
+    trials="ended",
+    paper_of_drivers="collided_percent",
 )
-BOXES = register(
-    Metric(
-        name="collided_boxes_percent",
-        label="coll. boxes",
-        unit="%",
-        meaning="share of ended trials with a collision by the rule of the human experiment: boxes "
-        "that overlap, looked for at 20 Hz",
-        value="collided_boxes",
-        estimator="proportion",
-        trials="ended",
-        paper_of_humans="collided_percent",
-    )
+BOXES = Metric(
+    name="collided_boxes_percent",
+    label="coll. boxes",
+    unit="%",
+    meaning="share of ended trials with a collision by the rule of the human experiment: boxes "
+    "that overlap, looked for at 20 Hz",
+    value="collided_boxes",
+    estimator="proportion",
+    trials="ended",
+    paper_of_humans="collided_percent",
 )
-LEFT_FIRST = register(
-    Metric(
-        name="left_first_percent",
-        label="goes first",
-        unit="%",
-        meaning="share of finished trials with a first merger in which it is the driver that is "
-        "named first, of two equal ones the left one",
-        value="merged_first = 'left'",
-        estimator="proportion",
-        shown=False,
-    )
+LEFT_FIRST = Metric(
+    name="left_first_percent",
+    label="goes first",
+    unit="%",
+    meaning="share of finished trials with a first merger in which it is the driver that is "
+    "named first, of two equal ones the left one",
+    value="merged_first = 'left'",
+    estimator="proportion",
+    shown=False,
 )
-GAP = register(
-    Metric(
-        name="gap_m",
-        label="gap",
-        unit="m",
-        meaning="net gap when the first vehicle reaches the merge point",
-        value="gap_m",
-        paper_of_drivers="gap_m",
-        paper_of_humans="gap_m",
-    )
+GAP = Metric(
+    name="gap_m",
+    label="gap",
+    unit="m",
+    meaning="net gap when the first vehicle reaches the merge point",
+    value="gap_m",
+    paper_of_drivers="gap_m",
+    paper_of_humans="gap_m",
 )
-RMSE = register(
-    Metric(
-        name="rmse_mps",
-        label="RMSE",
-        unit="m/s",
-        meaning="RMSE of the speed from the initial speed, mean of both vehicles, to the first "
-        "merge",
-        value="rmse_mps",
-        least=0.0,
-        paper_of_drivers="rmse_mps",
-        paper_of_humans="rmse_mps",
-    )
+RMSE = Metric(
+    name="rmse_mps",
+    label="RMSE",
+    unit="m/s",
+    meaning="RMSE of the speed from the initial speed, mean of both vehicles, to the first merge",
+    value="rmse_mps",
+    least=0.0,
+    paper_of_drivers="rmse_mps",
+    paper_of_humans="rmse_mps",
 )
-JOINT = register(
-    Metric(
-        name="joint_percent",
-        label="joint",
-        unit="%",
-        meaning="share of finished trials with an RMSE of at least 0.5 m/s on both sides",
-        value="joint",
-        estimator="proportion",
-        paper_of_drivers="joint_percent",
-        paper_of_humans="joint_percent",
-    )
+JOINT = Metric(
+    name="joint_percent",
+    label="joint",
+    unit="%",
+    meaning="share of finished trials with an RMSE of at least 0.5 m/s on both sides",
+    value="joint",
+    estimator="proportion",
+    paper_of_drivers="joint_percent",
+    paper_of_humans="joint_percent",
 )
-
-
-VALID = register(
-    Metric(
-        name="valid_percent",
-        label="valid replies",
-        unit="%",
-        meaning="share of the replies, of two different drivers those to the one that is named "
-        "first, with a valid plan",
-        value="100 * valid_replies / nullif(replies, 0)",
-        weight="replies",
-        trials="ended",
-        shown=False,
-        least=0.0,
-    )
+VALID = Metric(
+    name="valid_percent",
+    label="valid replies",
+    unit="%",
+    meaning="share of the replies, of two different drivers those to the one that is named "
+    "first, with a valid plan",
+    value="100 * valid_replies / nullif(replies, 0)",
+    weight="replies",
+    trials="ended",
+    shown=False,
+    least=0.0,
 )
-COST = register(
-    Metric(
-        name="cost_usd",
-        label="cost",
-        unit="USD",
-        meaning="price of the calls of a trial; none where a price is not known",
-        value="cost_usd",
-        trials="ended",
-        shown=False,
-        least=0.0,
-    )
+COST = Metric(
+    name="cost_usd",
+    label="cost",
+    unit="USD",
+    meaning="price of the calls of a trial; none where a price is not known",
+    value="cost_usd",
+    trials="ended",
+    shown=False,
+    least=0.0,
 )
-
-
 # Surrogate measures of safety: columns of ``trial_metrics``, summed up by their medians.
 SURROGATES = {
     "conflict_resolution_s": (
@@ -230,12 +209,15 @@ SURROGATES = {
     ),
     "max_acceleration_mps2": ("max |a|", "largest absolute acceleration of either vehicle"),
 }
+for _metric in (COLLISIONS, BOXES, LEFT_FIRST, GAP, RMSE, JOINT, VALID, COST):
+    register(_metric)
 for _name, (_label, _meaning) in SURROGATES.items():
+    _unit = "m/s²" if _name.endswith("_mps2") else "s"
     register(
         Metric(
             name=_name,
             label=_label,
-            unit="m/s²" if _name.endswith("_mps2") else "s",
+            unit=_unit,
             meaning=_meaning,
             value=_name,
             estimator="median",

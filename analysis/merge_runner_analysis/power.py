@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -27,9 +27,12 @@ from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.published import HUMAN_GAP_SD_M, human_outcomes, published
 from merge_runner_analysis.stats import regressions
 from merge_runner_analysis.stats.contrasts import contrast_means, contrast_rates, shared_cells
-from merge_runner_analysis.stats.indicators import ALPHA, TESTED, fits, judge
+from merge_runner_analysis.stats.indicators import TESTED, fits, judge
 from merge_runner_analysis.stats.intervals import POWER
+from merge_runner_analysis.stats.regressions import Array
+from merge_runner_analysis.stats.sides import read_twice
 from merge_runner_analysis.tables.model import Column, Row, Table, Value
+from merge_runner_analysis.wording import ALPHA
 
 COEFFICIENTS = 7  # of a truth: of who merges first, and of the gap
 MULTIPLES = (0.5, 1.0, 2.0, 4.0)
@@ -49,14 +52,23 @@ QUESTIONS = {
     "relative velocity": (VERDICTS, "relative_velocity", "per m/s"),
     "collisions": (VERDICTS, "collided", "of 1"),
 }
-# By measure of an effect: its column of simulated trials, and its unit.
-MEASURES = {
-    "goes first": ("left_first", "points"),
-    "collisions": ("collided", "points"),
-    "gap": ("gap_m", "m"),
+
+
+class Endpoint(NamedTuple):
+    """A measure of simulated trials: column, unit, and the keys of an [effect] that change it."""
+
+    column: str
+    unit: str
+    changed_by: tuple[str, ...]
+
+
+ENDPOINTS = {
+    "goes first": Endpoint("left_first", "points", ("goes_first", *regressions.WHO_FIRST_TERMS)),
+    "collisions": Endpoint("collided", "points", ("collided",)),
+    "gap": Endpoint("gap_m", "m", ("gap_m",)),
 }
 # By the name of a primary measure in a study's file.
-PRIMARY = {
+PRIMARY_ENDPOINTS = {
     "goes_first": "goes first",
     "collided": "collisions",
     "gap_m": "gap",
@@ -64,13 +76,7 @@ PRIMARY = {
     "collided_percent": "collisions",
     "collided_boxes_percent": "collisions",
 }
-# By measure the keys of an [effect] that change it in any condition.
-CHANGED_BY = {
-    "goes first": ("goes_first", "intercept", "projected_headway", "relative_velocity"),
-    "collisions": ("collided",),
-    "gap": ("gap_m",),
-}
-NOTHING = 1e-6  # an effect that is no more than this is none
+NEGLIGIBLE = 1e-6  # an effect that is no more than this is none
 MIRRORED = " mirrored"  # after the name of a condition: as the driver on the right sees it
 COLUMNS = (
     Column("table", "table", noted=True),
@@ -90,15 +96,16 @@ COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """How a driver drives, as it is assumed: coefficients of Tables III and IV, and the rest."""
+    """How a driver is assumed to drive: coefficients of Tables III and IV, and the rest.
+
+    ``gap_sd_m`` and ``noise`` are the standard deviations of the gaps and of the trials' logits,
+    ``collided`` is the share of trials that end in a collision.
+    """
 
     name: str
     gap_sd_m: float
-    """By which gaps scatter normally."""
     collided: float
-    """The share of trials that end in a collision."""
     noise: float
-    """By which the logits of trials scatter."""
     intercept: float
     projected_headway: float
     relative_velocity: float
@@ -108,28 +115,20 @@ class Truth:
     headway_x_velocity: float
 
     @property
-    def logit(self) -> regressions.Array:
+    def logit(self) -> Array:
         """The coefficients of who merges first."""
         return np.array([self.intercept, self.projected_headway, self.relative_velocity])
 
     @property
-    def gap(self) -> regressions.Array:
+    def gap(self) -> Array:
         """The coefficients of the gap in m."""
         slopes = (self.abs_projected_headway, self.abs_relative_velocity, self.headway_x_velocity)
         return np.array([self.gap_m, *slopes])
 
-    def first(self, conditions: Sequence[str]) -> regressions.Array:
-        """The chance of the left driver to go first in each condition."""
-        h, dv = _numbers(conditions)
-        logit = np.column_stack([np.ones(len(h)), h, dv]) @ self.logit
-        return np.asarray(expit(logit[:, None] + self.noise * NORMAL).mean(axis=1))
-
-    def mean(self, measure: str, conditions: Sequence[str]) -> float:
-        """What trials of these conditions come to by one of MEASURES, in its unit."""
-        if measure == "gap":
-            return float((regressions.gap_design(*_numbers(conditions)) @ self.gap).mean())
-        share = self.collided if measure == "collisions" else self.first(conditions).mean()
-        return 100 * float(share)
+    def first(self, conditions: Sequence[str]) -> Array:
+        """Return the chance of the left driver to go first in each condition."""
+        trials = _trials_of(self, conditions)
+        return _chance(trials["logit"], trials["noise"])
 
     def plus(self, effect: Effect, conditions: Sequence[str]) -> Truth:
         """Return the truth with an effect; of who goes first it is one on the mean over these.
@@ -140,17 +139,23 @@ class Truth:
         more = replace(self, **{name: getattr(self, name) + value for name, value in added.items()})
         if not effect.goes_first:
             return more
-        wanted = float(np.clip(more.first(conditions).mean() + effect.goes_first, 0.001, 0.999))
+        target = float(np.clip(more.first(conditions).mean() + effect.goes_first, 0.001, 0.999))
 
         def missing(shift: float) -> float:
             shifted = replace(more, intercept=more.intercept + shift)
-            return float(shifted.first(conditions).mean()) - wanted
+            return float(shifted.first(conditions).mean()) - target
 
         return replace(more, intercept=more.intercept + optimize.brentq(missing, -50, 50))
 
 
+def _chance(logits: pd.Series, noise: pd.Series) -> Array:
+    """Return the mean chance of each trial over the noise of its logit."""
+    every = logits.to_numpy()[:, None] + noise.to_numpy()[:, None] * NORMAL
+    return np.asarray(expit(every).mean(axis=1))
+
+
 @cache
-def human_trials() -> pd.DataFrame:
+def human_sample() -> pd.DataFrame:
     """Return the published outcomes; the gap of no single trial is published."""
     return human_outcomes().rename(columns={"collided_boxes": "collided"}).assign(gap_m=np.nan)
 
@@ -160,7 +165,7 @@ def human() -> Truth:
     """Return the humans as they are published."""
     tables = [published(name) for name in ("paper_who_first", "paper_gap")]
     b = pd.concat(table[table["driver"] == "human"]["b"] for table in tables).astype(float)
-    collided = float(human_trials()["collided"].mean())
+    collided = float(human_sample()["collided"].mean())
     return Truth("human", HUMAN_GAP_SD_M, collided, 0.0, *b)
 
 
@@ -175,73 +180,48 @@ def played(group: Group) -> Truth | None:
     return Truth(f"{group.id} as played", float(scatter), float(collided), 0.0, *b)
 
 
-def _numbers(conditions: Iterable[str]) -> tuple[regressions.Array, regressions.Array]:
-    """Headways in m and relative velocities in m/s."""
+def _trials_of(truth: Truth, conditions: Sequence[str], repetitions: int = 1) -> pd.DataFrame:
     signs = np.array([-1 if name.endswith(MIRRORED) else 1 for name in conditions])
     known = [CONDITIONS[name.removesuffix(MIRRORED)] for name in conditions]
-    headways_m = np.array([each.projected_headway_m for each in known])
-    return signs * headways_m, signs * np.array([each.relative_velocity_mps for each in known])
+    headway_m = signs * np.array([one.projected_headway_m for one in known])
+    velocity_mps = signs * np.array([one.relative_velocity_mps for one in known])
+    logit = np.column_stack([np.ones(len(known)), headway_m, velocity_mps]) @ truth.logit
+    trials = pd.DataFrame(
+        {
+            "condition": list(conditions),
+            "projected_headway_m": headway_m,
+            "relative_velocity_mps": velocity_mps,
+            "collided": truth.collided,
+            "logit": logit,
+            "noise": truth.noise,
+            "gap_m": regressions.gap_design(headway_m, velocity_mps) @ truth.gap,
+            "gap_sd_m": truth.gap_sd_m,
+        }
+    )
+    return trials.loc[trials.index.repeat(max(1, repetitions))].reset_index(drop=True)
 
 
-class Trials(NamedTuple):
-    """How trials are drawn: the condition of each, and numbers of its ``Truth`` as arrays.
-
-    ``condition`` is a cell where levels are compared, and ``image`` that from the right side of one
-    that is read from both, else empty.
-    """
-
-    condition: Any
-    image: Any
-    collided: regressions.Array
-    logit: regressions.Array
-    noise: regressions.Array
-    gap_m: regressions.Array
-    gap_sd_m: regressions.Array
-
-    def drawn(self, rng: np.random.Generator) -> pd.DataFrame:
-        """One outcome of each trial."""
-        n = len(self.collided)
-        collided = rng.random(n) < self.collided
-        left = rng.random(n) < expit(self.logit + self.noise * rng.standard_normal(n))
-        gap_m = self.gap_m + self.gap_sd_m * rng.standard_normal(n)
-        return pd.DataFrame(
-            {
-                "condition": self.condition,
-                "collided": collided,
-                "left_first": np.where(collided, np.nan, left),
-                "gap_m": np.where(collided, np.nan, gap_m),
-            }
-        )
-
-
-def _trials_of(truth: Truth, conditions: Sequence[str], repetitions: int) -> Trials:
-    h, dv = _numbers(conditions)
-    n = len(conditions)
-    logit = np.column_stack([np.ones(n), h, dv]) @ truth.logit
-    gap_m = regressions.gap_design(h, dv) @ truth.gap
-    same = (np.full(n, each) for each in (truth.collided, truth.noise, truth.gap_sd_m))
-    collided, noise, gap_sd_m = same
-    names = np.array(list(conditions), dtype=object)
-    empty = np.full(n, "", dtype=object)
-    each = (names, empty, collided, logit, noise, gap_m, gap_sd_m)
-    return Trials(*(np.repeat(column, max(1, repetitions)) for column in each))
+def _drawn(trials: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
+    n = len(trials)
+    collided = rng.random(n) < trials["collided"]
+    first = rng.random(n) < expit(trials["logit"] + trials["noise"] * rng.standard_normal(n))
+    gap_m = trials["gap_m"] + trials["gap_sd_m"] * rng.standard_normal(n)
+    left_first = first.astype(float).mask(collided)
+    return trials.assign(collided=collided, left_first=left_first, gap_m=gap_m.mask(collided))
 
 
 def simulate(
     truth: Truth, conditions: Sequence[str], repetitions: int, rng: np.random.Generator
 ) -> pd.DataFrame:
     """Return so many trials of each condition, with the columns of ``load_trials``."""
-    trials = _trials_of(truth, conditions, repetitions).drawn(rng)
-    h, dv = (np.repeat(each, max(1, repetitions)) for each in _numbers(conditions))
+    trials = _drawn(_trials_of(truth, conditions, repetitions), rng)
     return trials.assign(
-        projected_headway_m=h,
-        relative_velocity_mps=dv,
         status=np.where(trials["collided"], "collided", "finished"),
         merged_first=np.where(trials["left_first"] == 1, "left", "right"),
     )
 
 
-def findings(own: pd.DataFrame, other: pd.DataFrame | None) -> dict[str, bool]:
+def significant(own: pd.DataFrame, other: pd.DataFrame | None) -> dict[str, bool]:
     """Return by question what a driver's trials show at p < .05, alone or beside the humans."""
     if other is None:
         gap = regressions.gap_ols(own, robust=True)
@@ -268,41 +248,38 @@ class Case:
     """A driver of this truth and size: by itself, or beside the humans."""
 
     own: Truth
+    conditions: tuple[str, ...]
     repetitions: int
     against: str = ""
 
     @property
     def truth(self) -> str:
-        """How the driver is supposed to drive."""
+        """How the driver is assumed to drive."""
         return self.own.name
 
-    def effects(self, conditions: Sequence[str]) -> dict[str, Assumed]:
-        """By question the effect that there is to find; that of I4 is small."""
-        other, alone = human(), not self.against
-        sizes = {
-            question: Assumed(
-                table, getattr(self.own, number) - (0.0 if alone else getattr(other, number)), unit
-            )
-            for question, (table, number, unit) in QUESTIONS.items()
-            if (question in TESTED) is alone
-        }
-        return {question: each for question, each in sizes.items() if each.effect}
+    @property
+    def trials(self) -> int:
+        """How many trials its driver plays."""
+        return self.repetitions * len(self.conditions)
 
-    def trials(self, conditions: Sequence[str]) -> int:
-        """How many its driver plays."""
-        return self.repetitions * len(conditions)
+    def effects(self) -> dict[str, Assumed]:
+        """Return by question the effect that there is to find; that of I4 is small."""
+        sizes = {}
+        for question, (table, number, unit) in QUESTIONS.items():
+            if (question in TESTED) is not bool(self.against):
+                reference = getattr(human(), number) if self.against else 0.0
+                sizes[question] = Assumed(table, getattr(self.own, number) - reference, unit)
+        return {question: size for question, size in sizes.items() if size.effect}
 
-    def found(
-        self, conditions: Sequence[str], multiple: float, rng: np.random.Generator
-    ) -> dict[str, bool]:
-        """By question what one simulated study of so many times this size shows."""
-        own = simulate(self.own, conditions, round(multiple * self.repetitions), rng)
-        return findings(own, human_trials() if self.against else None)
+    def found(self, multiple: float, rng: np.random.Generator) -> dict[str, bool]:
+        """Return by question what one simulated study of so many times this size shows."""
+        own = simulate(self.own, self.conditions, round(multiple * self.repetitions), rng)
+        return significant(own, human_sample() if self.against else None)
 
 
 @dataclass(frozen=True, slots=True)
 class Played:
-    """The trials of an arm as its ego sees them, and how they are supposed to go.
+    """The trials of an arm as its ego sees them, and how they are assumed to go.
 
     Of two ``equal`` drivers who are given the same either may be asked about.
     """
@@ -314,47 +291,27 @@ class Played:
     repetitions: int
     truth: Truth
 
-    def trials(self, multiple: float, *, sides: bool) -> Trials:
-        """So many times its trials, of which cells may have ``sides``."""
+    def trials(self, multiple: float, *, sides: bool) -> pd.DataFrame:
+        """Return so many times its trials by cell; those read from both sides have an ``image``.
+
+        Cells have ``sides`` where these are compared.
+        """
         trials = _trials_of(self.truth, self.conditions, round(multiple * self.repetitions))
-        of_side = f" {self.side}" if sides else ""
-        image = trials.image
+        names, images = trials["condition"], pd.Series(None, trials.index, dtype=object)
         if sides and self.equal:
-            image = [
-                f"{_image(name, self.conditions)} right{self.cell}" for name in trials.condition
-            ]
-        cells = [name + of_side + self.cell for name in trials.condition]
-        return trials._replace(
-            condition=np.array(cells, dtype=object), image=np.array(image, dtype=object)
-        )
+            images = names.map(partial(_image, conditions=self.conditions)) + f" right{self.cell}"
+        of_side = f" {self.side}" if sides else ""
+        return trials.assign(condition=names + of_side + self.cell, image=images)
 
 
 @lru_cache(maxsize=8)
-def _level(level: tuple[Played, ...], multiple: float, *, sides: bool) -> Trials:
-    """The trials of a level."""
-    parts = (each.trials(multiple, sides=sides) for each in level)
-    return Trials(*map(np.concatenate, zip(*parts, strict=True)))
-
-
-def _from_both_sides(trials: Trials, value: regressions.Array) -> pd.DataFrame:
-    """The ``value`` of each trial by cell, once more where it is read from the right, too.
-
-    So it is of two equal drivers where in other trials one alone has a level: see
-    ``stats.effects``.
-    """
-    twice = trials.image != ""
-    return pd.DataFrame(
-        {
-            "condition": np.concatenate([trials.condition, trials.image[twice]]),
-            "value": np.concatenate([value, 1 - value[twice]]),
-            "varies": np.concatenate([~twice, np.zeros(twice.sum(), bool)]),
-        }
-    )
+def _level(level: tuple[Played, ...], multiple: float, *, sides: bool) -> pd.DataFrame:
+    return pd.concat([part.trials(multiple, sides=sides) for part in level], ignore_index=True)
 
 
 @dataclass(frozen=True, slots=True)
 class Contrast:
-    """A level of a factor against its reference, in the cells of both, in one of MEASURES.
+    """A level of a factor against its reference, in the cells of both, in one of ENDPOINTS.
 
     It is ``assumed`` to differ by what the study names, by default, or as it is planted or played.
     """
@@ -367,70 +324,60 @@ class Contrast:
 
     @property
     def truth(self) -> str:
-        """How the level's driver is supposed to drive."""
+        """How the level's driver is assumed to drive."""
         return self.own[0].truth.name
 
     @property
-    def sides(self) -> bool:
-        """Whether cells have sides: who goes first, where one driver alone has a level."""
-        return self.one_sided and self.measure == "goes first"
+    def trials(self) -> int:
+        """How many trials the level has."""
+        return sum(part.repetitions * len(part.conditions) for part in self.own)
+
+    def _levels(self, multiple: float) -> list[pd.DataFrame]:
+        """Return both levels; cells of who goes first have sides if one driver has a level."""
+        sides = self.one_sided and self.measure == "goes first"
+        return [_level(level, multiple, sides=sides) for level in (self.own, self.other)]
 
     @property
     def size(self) -> float:
         """The difference that there is to find, in the unit of the measure, as its test weighs."""
-        means = []
-        for level in (self.own, self.other):
-            trials = _level(level, 1, sides=self.sides)
-            found = self._expected(trials)
-            means.append(_from_both_sides(trials, found).groupby("condition")["value"])
-        (one, n), (two, m) = ((each.mean(), each.size()) for each in means)
+        column, means = ENDPOINTS[self.measure].column, []
+        for trials in self._levels(1):
+            expected = trials.assign(left_first=_chance(trials["logit"], trials["noise"]))
+            means.append(_by_cell(expected, column).groupby("condition")["value"])
+        (one, n), (two, m) = ((values.mean(), values.size()) for values in means)
         weights = (n * m / (n + m)).dropna()
         unit = 1 if self.measure == "gap" else 100
         return unit * float((one - two).dropna() @ weights / weights.sum())
 
-    def _expected(self, trials: Trials) -> regressions.Array:
-        if self.measure == "gap":
-            return trials.gap_m
-        if self.measure == "collisions":
-            return trials.collided
-        logits = trials.logit[:, None] + trials.noise[:, None] * NORMAL
-        return np.asarray(expit(logits).mean(axis=1))
-
-    def effects(self, conditions: Sequence[str]) -> dict[str, Assumed]:
-        """The effect that there is to find."""
-        unit = MEASURES[self.measure][1]
+    def effects(self) -> dict[str, Assumed]:
+        """Return the effect that there is to find."""
+        unit = ENDPOINTS[self.measure].unit
         return {self.measure: Assumed(EFFECTS, self.size, unit, self.assumed)}
 
-    def trials(self, conditions: Sequence[str]) -> int:
-        """How many trials the level has."""
-        return sum(each.repetitions * len(each.conditions) for each in self.own)
-
-    def found(
-        self, conditions: Sequence[str], multiple: float, rng: np.random.Generator
-    ) -> dict[str, bool]:
-        """Whether one simulated study of so many times this size shows a difference."""
-        frames = []
-        for level in (self.own, self.other):
-            trials = _level(level, multiple, sides=self.sides)
-            value = trials.drawn(rng)[MEASURES[self.measure][0]].to_numpy(dtype=float)
-            frames.append(_from_both_sides(trials, value))
-        one, two = frames
+    def found(self, multiple: float, rng: np.random.Generator) -> dict[str, bool]:
+        """Return whether one simulated study of so many times this size shows a difference."""
+        column = ENDPOINTS[self.measure].column
+        own, other = (_by_cell(_drawn(trials, rng), column) for trials in self._levels(multiple))
         if self.measure == "gap":
-            found = contrast_means(one, two, "value")
+            estimate = contrast_means(own, other, "value")
         else:
-            cells = shared_cells(one, two, "value")
-            found = contrast_rates(cells) if cells else None
-        return {self.measure: found is not None and found.p is not None and found.p < ALPHA}
+            cells = shared_cells(own, other, "value")
+            estimate = contrast_rates(cells) if cells else None
+        p = estimate.p if estimate else None
+        return {self.measure: p is not None and p < ALPHA}
 
 
-def power(
-    case: Case | Contrast, conditions: Sequence[str], multiple: float, simulations: int
-) -> dict[str, float]:
+def _by_cell(trials: pd.DataFrame, column: str) -> pd.DataFrame:
+    frame = pd.DataFrame({"condition": trials["condition"], "value": trials[column].astype(float)})
+    return read_twice(frame, trials["image"])
+
+
+def power(case: Case | Contrast, multiple: float, simulations: int) -> dict[str, float]:
     """Return by question the share of simulated studies of so many times this size that find it."""
-    rng, found = np.random.default_rng(SEED), Counter[str]()
+    rng, counts = np.random.default_rng(SEED), Counter[str]()
     for _ in range(simulations):
-        found.update(n for n, shown in case.found(conditions, multiple, rng).items() if shown)
-    return {question: found[question] / simulations for question in case.effects(conditions)}
+        counts.update(name for name, shown in case.found(multiple, rng).items() if shown)
+    return {question: counts[question] / simulations for question in case.effects()}
 
 
 def chances(
@@ -442,21 +389,19 @@ def chances(
     measure. Where none does, or levels change how drivers heed their situation, the drivers by
     themselves have rows.
     """
-    conditions = plan.conditions
     labels: dict[Case | Contrast, list[tuple[str, str]]] = {}  # equal ones share rows
     for label, against, case in _cases(plan, groups):
         labels.setdefault(case, []).append((label, against))
     for case, names in labels.items():
-        at = {m: power(case, conditions, m, simulations) for m in MULTIPLES}
-        for question, (table, effect, unit, by) in case.effects(conditions).items():
+        at = {m: power(case, m, simulations) for m in MULTIPLES}
+        levels, against = (", ".join(dict.fromkeys(each)) for each in zip(*names, strict=True))
+        for question, (table, effect, unit, by) in case.effects().items():
             enough = next((m for m in MULTIPLES if at[m][question] >= POWER), None)
-            trials = case.trials(conditions)
-            levels, against = (", ".join(dict.fromkeys(each)) for each in zip(*names, strict=True))
             key = [table, question, levels, against, case.truth]
-            size = None if enough is None else round(enough * trials)
+            size = None if enough is None else round(enough * case.trials)
             cost = None if enough is None or cost_usd is None else enough * cost_usd
             shares: list[Value] = [100 * at[m][question] for m in MULTIPLES]
-            values = [*key, by, effect, unit, trials, *shares, size, cost]
+            values = [*key, by, effect, unit, case.trials, *shares, size, cost]
             yield Row("/".join(key), (), dict(zip([c.name for c in COLUMNS], values, strict=True)))
 
 
@@ -480,7 +425,6 @@ def power_table(title: str, rows: Sequence[Row]) -> Table:
 
 
 def _cases(plan: Plan, groups: Sequence[Group]) -> Iterator[tuple[str, str, Case | Contrast]]:
-    """What is compared, by the names of both."""
     truths = {arm.label: _truths(plan, arm, groups) for arm in plan.arms}
     contrasts = list(_contrasts(plan, truths))
     yield from contrasts
@@ -493,19 +437,18 @@ def _cases(plan: Plan, groups: Sequence[Group]) -> Iterator[tuple[str, str, Case
     if contrasts and len(slopes) < 2:
         return
     for label, own, repetitions in every:
-        yield label, "", Case(own, repetitions)
-        yield label, HUMANS, Case(own, repetitions, HUMANS)
+        for against in ("", HUMANS):
+            yield label, against, Case(own, tuple(plan.conditions), repetitions, against)
 
 
 def _contrasts(
     plan: Plan, truths: Mapping[str, list[Truth]]
 ) -> Iterator[tuple[str, str, Contrast]]:
-    """Each level of each factor against its reference, in the cells that both have.
+    """Yield each level of each factor against its reference, in the cells that both have.
 
     As in the table of effects mock models are compared with each other, and programs, which read no
     prompt, are not compared by it.
     """
-    one_sided = any(arm.focal and not arm.is_mixed for arm in plan.arms)
     for scripted in (False, True):
         arms = [arm for arm in plan.arms if arm.is_scripted is scripted]
         at: dict[frozenset[tuple[str, str]], list[Arm]] = {}
@@ -517,60 +460,56 @@ def _contrasts(
             for level in others:
                 pairs = []
                 for key, own in at.items():
-                    twins = at.get((key - {(factor, level)}) | {(factor, reference)}, [])
+                    cell = key - {(factor, level)}
+                    twins = at.get(cell | {(factor, reference)}, [])
                     reads = factor != PROMPT or own[0].entries
                     if (factor, level) in key and twins and reads:
-                        pairs.append((key - {(factor, level)}, own, twins))
-                for contrast in _assumed(plan, truths, factor, pairs, one_sided=one_sided):
+                        name = "".join(f" {n}={x}" for n, x in sorted(cell))
+                        pairs.append((name, own, twins))
+                for contrast in _assumed(plan, truths, factor, pairs):
                     yield f"{factor}={level}", f"{factor}={reference}", contrast
-
-
-Pair = tuple[frozenset[tuple[str, str]], list[Arm], list[Arm]]
 
 
 def _assumed(
     plan: Plan,
     truths: Mapping[str, list[Truth]],
     factor: str,
-    pairs: Sequence[Pair],
-    *,
-    one_sided: bool,
+    pairs: Sequence[tuple[str, list[Arm], list[Arm]]],
 ) -> Iterator[Contrast]:
-    """The contrast of these pairs of arms by each way in which trials are supposed to go."""
-    every = [arm for _, own, twins in pairs for arm in (*own, *twins)]
-    ways = min((len(truths[arm.label]) for arm in every), default=0)
+    """Yield the contrast of these cells and arms by each way in which trials may go."""
+    one_sided = any(arm.focal and not arm.is_mixed for arm in plan.arms)
+    levels = [[(cell, arm) for cell, *both in pairs for arm in both[place]] for place in range(2)]
+    ways = min((len(truths[arm.label]) for level in levels for _, arm in level), default=0)
     for way in range(ways):
-        levels: tuple[list[Played], list[Played]] = ([], [])
-        for cell, *both in pairs:
-            name = "".join(f" {n}={x}" for n, x in sorted(cell))
-            for level, arms in zip(levels, both, strict=True):
-                for arm in arms:
-                    level.append(_played(plan, arm, name, truths[arm.label][way]))
-        own, other = map(tuple, levels)
-        contrast = Contrast(own, other, _primary(plan), PLAYED, one_sided=one_sided)
-        yield replace(contrast, **_assumption(plan, factor, contrast))
+        own, other = (
+            tuple(_played(plan, arm, cell, truths[arm.label][way]) for cell, arm in level)
+            for level in levels
+        )
+        yield _with_assumption(
+            plan, factor, Contrast(own, other, _primary(plan), PLAYED, one_sided)
+        )
 
 
-def _assumption(plan: Plan, factor: str, contrast: Contrast) -> dict[str, Any]:
-    """Who says how a level differs; where nothing does, the level with what is supposed then."""
+def _with_assumption(plan: Plan, factor: str, contrast: Contrast) -> Contrast:
+    """Return a contrast with who says how its level differs, as far as nothing does by default."""
     effect = plan.study.file.effect.get(factor, Effect())
     if contrast.truth == PLANTED:
-        return {"assumed": PLANTED}
-    if any(getattr(effect, name) for name in CHANGED_BY[contrast.measure]):
-        return {"assumed": NAMED}
-    if contrast.truth != human().name and abs(contrast.size) > NOTHING:
-        return {"assumed": PLAYED}
-    supposed = tuple(
-        replace(each, truth=each.truth.plus(_by_default(contrast, each), each.conditions))
-        for each in contrast.own
+        return replace(contrast, assumed=PLANTED)
+    if any(getattr(effect, name) for name in ENDPOINTS[contrast.measure].changed_by):
+        return replace(contrast, assumed=NAMED)
+    if contrast.truth != human().name and abs(contrast.size) > NEGLIGIBLE:
+        return contrast
+    own = tuple(
+        replace(part, truth=part.truth.plus(_by_default(contrast.measure, part), part.conditions))
+        for part in contrast.own
     )
-    return {"assumed": DEFAULTS, "own": supposed}
+    return replace(contrast, assumed=DEFAULTS, own=own)
 
 
-def _by_default(contrast: Contrast, level: Played) -> Effect:
-    if contrast.measure == "collisions":
+def _by_default(measure: str, level: Played) -> Effect:
+    if measure == "collisions":
         return Effect(collided=min(level.truth.collided, 1 - level.truth.collided))
-    return Effect(goes_first=0.15) if contrast.measure == "goes first" else Effect(gap_m=1.0)
+    return Effect(goes_first=0.15) if measure == "goes first" else Effect(gap_m=1.0)
 
 
 def _played(plan: Plan, arm: Arm, cell: str, truth: Truth) -> Played:
@@ -581,7 +520,7 @@ def _played(plan: Plan, arm: Arm, cell: str, truth: Truth) -> Played:
 
 
 def _image(condition: str, conditions: Sequence[str]) -> str:
-    """A condition as the driver on the right sees it, named as one of these if it can be."""
+    """Return a condition as the driver on the right sees it, named as one of these if it can be."""
     if condition.endswith(MIRRORED):
         return condition.removesuffix(MIRRORED)
     own = CONDITIONS[condition]
@@ -598,19 +537,18 @@ def _levels(arm: Arm) -> dict[str, str]:
 
 
 def _primary(plan: Plan) -> str:
-    """The study's primary measure, as MEASURES name it; raises UsageError."""
-    require(PRIMARY, "measure to simulate:", plan.study.file.primary, "by primary in the study")
-    return PRIMARY[plan.study.file.primary]
+    """Return the study's primary measure, as ENDPOINTS name it; raises UsageError."""
+    name = plan.study.file.primary
+    return require(PRIMARY_ENDPOINTS, "measure to simulate:", name, "by primary in the study")
 
 
 def _place(plan: Plan, factor: str, level: str) -> int:
-    """Where the study lists a level."""
     listed = plan.levels.get(factor, [])
     return listed.index(level) if level in listed else len(listed)
 
 
 def _rehearses(plan: Plan) -> bool:
-    """Whether a study has nothing but parameters that plant an effect in the emulator.
+    """Return whether a study has nothing but parameters that plant an effect in the emulator.
 
     What its words plant, or what is planted beside an [effect], is no assumption.
     """
@@ -622,7 +560,7 @@ def _rehearses(plan: Plan) -> bool:
 
 
 def _truths(plan: Plan, arm: Arm, groups: Sequence[Group]) -> list[Truth]:
-    """As humans and as played, with named effects; of a rehearsal as planted.
+    """Return how an arm goes: as humans and as played, with named effects; or as planted.
 
     In a rehearsal an arm goes as its ego's request says, also one in which nothing is planted.
     """
@@ -636,21 +574,19 @@ def _truths(plan: Plan, arm: Arm, groups: Sequence[Group]) -> list[Truth]:
         # The script aims at gaps from 1.8 to 6.5 m; in 1 of 33 trials two vehicles collide.
         gap = (4.15 + planted.x_gap_m, 0.0, 0.0, 0.0)
         return [Truth(PLANTED, 1.36, 1 / 33, planted.x_noise, *planted.coefficients, *gap)]
-    named = plan.study.file.effect
+    effects = plan.study.file.effect
     prompt, words = decomposed(arm.variant)
-    unnamed = [word for word in words if word.partition("=")[0] not in named]
-    own = composed(BASELINE if PROMPT in named else prompt, unnamed)
+    unnamed = [word for word in words if word.partition("=")[0] not in effects]
+    setting = composed(BASELINE if PROMPT in effects else prompt, unnamed)
     by_setting = {(g.name, g.setting): g for g in reversed(groups) if not g.scripted}
-    known = [by_setting[arm.model, p] for p in (own, BASELINE) if (arm.model, p) in by_setting]
+    known = [by_setting[arm.model, p] for p in (setting, BASELINE) if (arm.model, p) in by_setting]
     people = human()
-    if (
-        len({each.ego for each in plan.arms}) > 1
-    ):  # both sides are one driver's, and none is favoured
-        people = replace(people, intercept=0.0)
+    if len({other.ego for other in plan.arms}) > 1:
+        people = replace(people, intercept=0.0)  # both sides are one driver's: none is favoured
     truths = [people, *filter(None, map(played, known[:1]))]
-    seen = _played(plan, arm, "", truths[0]).conditions
-    for factor, added in named.items():
+    conditions = _played(plan, arm, "", people).conditions
+    for factor, effect in effects.items():
         level = _levels(arm).get(factor)
         if level not in (None, plan.levels[factor][0]):
-            truths = [truth.plus(added, seen) for truth in truths]
+            truths = [truth.plus(effect, conditions) for truth in truths]
     return truths

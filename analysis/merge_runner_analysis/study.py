@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -11,7 +10,7 @@ from pathlib import Path
 import pandas as pd
 
 from merge_runner.config import without_endpoint
-from merge_runner.errors import UsageError, unknown_name
+from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_DB
 from merge_runner.prompts.blocks import BASELINE
 from merge_runner.registry import require
@@ -55,10 +54,12 @@ class Study:
         self.frames = read_frames(self.db)
         self.source = None if selection.file is None else read_study(selection.file)
         self.file, self.order = _chosen(self.db, self.frames.studies, self.source)
-        trials = self.frames.trials
-        self.human = self._part(humans_of(of_published_pairs(trials[trials["source"] == HUMAN])))
-        played = self._groups(self._driven(trials[trials["source"] != HUMAN]))
-        asked = self.frames.asked
+        trials, asked = self.frames.trials, self.frames.asked
+        is_human, condition = trials["source"] == HUMAN, selection.condition
+        self.human = humans_of(of_published_pairs(trials[is_human]))
+        if condition:
+            self.human = self.human.part(lambda rows: rows["condition"] == condition)
+        played = self._groups(self._driven(trials[~is_human]))
         only_asked = self._groups(asked.assign(driver=asked["driver"] + ONLY_ASKED))
         wanted = self._wanted([*played, *only_asked])
         self.empty = not played
@@ -77,26 +78,16 @@ class Study:
         self.groups = [self.human] * with_human + self.models
 
     def _driven(self, trials: pd.DataFrame) -> pd.DataFrame:
-        """Return the chosen ones of drivers' trials, of a run and of a condition."""
-        sweep, condition = self.selection.sweep, self.selection.condition
-        if sweep:
-            links = self.frames.studies.trials
-            runs = self._runs(sweep)
+        """Return the chosen drivers' trials; raises UsageError where there is no such run."""
+        run, condition = self.selection.sweep, self.selection.condition
+        if run:
+            links, called = self.frames.studies.trials, self.frames.studies.called
+            if run not in called.values():
+                names = filter(None, called.values())
+                require(dict.fromkeys([*names, *called]), "run", run, f"in {self.db}")
+            runs = [sweep_id for sweep_id, name in called.items() if name == run] or [run]
             trials = trials.merge(links.loc[links["sweep_id"].isin(runs), KEYS].drop_duplicates())
         return trials[trials["condition"] == condition] if condition else trials
-
-    def _runs(self, wanted: str) -> list[str]:
-        """Return the ids of the runs of this id or name; raises UsageError where there is none."""
-        called = self.frames.studies.called
-        named = [sweep_id for sweep_id, name in called.items() if name == wanted]
-        if not named:
-            names = filter(None, called.values())
-            require(dict.fromkeys([*names, *called]), "run", wanted, f"in {self.db}")
-        return named or [wanted]
-
-    def _part(self, humans: Group) -> Group:
-        condition = self.selection.condition
-        return humans.part(lambda rows: rows["condition"] == condition) if condition else humans
 
     def _groups(self, trials: pd.DataFrame) -> list[Group]:
         """Return the groups of these trials that were played for the study, if one was chosen."""
@@ -104,18 +95,18 @@ class Study:
         if self.file:
             trials = trials[frames.studies.holds(self.file, trials)]
         groups = groups_of(trials, frames.specs, frames.decisions, frames.levels)
-        return [*map(self._kept_trials, groups)]
-
-    def _kept_trials(self, group: Group) -> Group:
-        """Return the group, perhaps without its trials that had a fallback; all judge it."""
         if not self.selection.without_fallbacks:
-            return group
-        calls = self.frames.calls
-        fallen = _keys(calls[calls["fallback"] > 0])
-        kept = group.part(lambda trials: pd.Series(~_keys(trials).isin(fallen), trials.index))
-        if kept.trials.empty:
-            return replace(group, unjudged=group.unjudged or Reason("every trial had a fallback"))
-        return kept
+            return groups
+        fallen = _keys(frames.calls[frames.calls["fallback"] > 0])
+        every = Reason("every trial had a fallback")
+        parts = [
+            group.part(lambda rows: pd.Series(~_keys(rows).isin(fallen), rows.index))
+            for group in groups
+        ]
+        return [
+            replace(group, unjudged=group.unjudged or every) if part.trials.empty else part
+            for group, part in zip(groups, parts, strict=True)
+        ]
 
     def _wanted(self, groups: list[Group]) -> list[Group]:
         """Return the groups of the chosen drivers, at the chosen levels of factors.
@@ -131,14 +122,13 @@ class Study:
         valid = dict.fromkeys([HUMAN, *names.values()])
         wanted = [*valid] if self.selection.models is None else self.selection.models
         # Where one driver alone is so called without its endpoint, that is enough.
-        short = Counter(map(without_endpoint, valid))
+        short = [*map(without_endpoint, valid)]
         full = {
-            without_endpoint(name): name for name in valid if short[without_endpoint(name)] == 1
+            name: long for name, long in zip(short, valid, strict=True) if short.count(name) < 2
         }
         wanted = [name if name in valid else full.get(name, name) for name in wanted]
         for name in wanted or [""]:
-            if name not in valid:
-                raise unknown_name("driver", name, valid, f"in {self.db}")
+            require(valid, "driver", name, f"in {self.db}")
         kept = [group for group, name in names.items() if name in wanted]
         where = self.selection.where
         return _at(where, kept, self.db, self.order) if where else kept
@@ -153,8 +143,8 @@ class Study:
         """What to know of imported humans."""
         trials, specs = self.frames.trials, self.frames.specs
         recorded = trials[trials["source"] == HUMAN]
-        of_pages = [specs.get(name, {}).get("origin") == VELOCITY_PAGES
-                    for name in recorded["spec_hash"]]  # fmt: skip
+        origins = recorded["spec_hash"].map(lambda name: specs.get(name, {}).get("origin"))
+        of_pages = origins == VELOCITY_PAGES
         return [*findings(recorded.assign(of_pages=of_pages))] if len(recorded) else []
 
     @property
@@ -227,10 +217,9 @@ def in_one_study(study: Study, *groups: Group) -> bool:
 
 
 def _chosen(db: Path, studies: Studies, source: StudySource | None) -> tuple[str, Order]:
-    """The name of the study that was chosen, empty without one, and the order of its levels.
+    """Return the name of the study that was chosen, or an empty one, and the order of its levels.
 
-    Where several studies are pooled the one that lists the most levels of a factor says their
-    order, of equal ones the newest. Raises UsageError where the database has no trial of the study.
+    Raises UsageError where the database has no trial of the study.
     """
     if source is None:
         return "", _pooled_order(studies)
@@ -247,7 +236,10 @@ def _chosen(db: Path, studies: Studies, source: StudySource | None) -> tuple[str
 
 
 def _pooled_order(studies: Studies) -> Order:
-    """The levels of each factor in the order of the studies; one level alone says no order."""
+    """Return the levels of each factor in the order of the study that lists the most of them.
+
+    Of equal ones it is the newest; one level alone says no order.
+    """
     pooled: dict[str, list[str]] = {}
     for factor in dict.fromkeys(name for order in studies.orders.values() for name in order):
         lists = [order[factor] for order in studies.orders.values() if factor in order]
@@ -264,9 +256,9 @@ def _at(
 
     Raises UsageError where there is none, or no such level.
     """
-    there, kept = levels_of(groups, order), groups
+    every, kept = levels_of(groups, order), groups
     for factor, levels in where.items():
-        known = require(there, "factor", factor)
+        known = require(every, "factor", factor)
         for level in levels:
             require(dict.fromkeys(known), f"level of {factor}", level)
         kept = [group for group in kept if group.levels.get(factor) in levels]

@@ -101,11 +101,8 @@ def judged(
         name: ScenarioConfig.model_validate(specs.get(name, {}).get("scenario", {}))
         for name in trials.loc[ended & ~human, "spec_hash"].unique()
     }
-    overlapped = {
-        (trial_id, spec_hash)
-        for trial_id, spec_hash, near in connection.execute(_near(tasks)).fetchall()
-        if _overlap(tasks[spec_hash], near)
-    }
+    near = connection.execute(_near(tasks)).fetchall()
+    overlapped = {tuple(key) for *key, samples in near if _overlap(tasks[key[1]], samples)}
     keys = pd.MultiIndex.from_frame(trials[["trial_id", "spec_hash"]])
     boxes = pd.Series(keys.isin(overlapped), trials.index, dtype="boolean")
     # What a trace does not show of a trial that another rule ended is open.
@@ -114,17 +111,13 @@ def judged(
 
 
 def _near(tasks: Mapping[str, ScenarioConfig]) -> str:
-    """The query of the samples at or next to which boxes can overlap."""
-    every = [ScenarioConfig(), *tasks.values()]
-    step_s = max(one.step_s for one in every)
+    configs = [ScenarioConfig(), *tasks.values()]
+    step_s = max(task.step_s for task in configs)
     # What accelerations against each other, and a resistance, add to the way within a step.
-    added_m = 2 * (max(one.max_acceleration_mps2 for one in every) + 2) * step_s**2
-    reach_m = max(hypot(one.vehicle_length_m, one.vehicle_width_m) for one in every)
-    return NEAR.format(
-        specs=", ".join(map(quoted, tasks)) or "NULL",
-        step_s=step_s,
-        reach_m=reach_m + added_m + 0.01,
-    )
+    added_m = 2 * (max(task.max_acceleration_mps2 for task in configs) + 2) * step_s**2
+    reach_m = max(hypot(task.vehicle_length_m, task.vehicle_width_m) for task in configs)
+    names = ", ".join(map(quoted, tasks)) or "NULL"
+    return NEAR.format(specs=names, step_s=step_s, reach_m=reach_m + added_m + 0.01)
 
 
 def _overlap(config: ScenarioConfig, samples: Sequence[Sample]) -> bool:

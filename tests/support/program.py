@@ -43,7 +43,7 @@ def invoke(arguments, *, cwd: Path, env: dict[str, str]) -> Run:
         changed.enter_context(redirect_stdout(out))
         changed.enter_context(redirect_stderr(err))
         changed.enter_context(_as_a_process_tells_them(err))
-        for told_once in (database.warn_of_other_measures, cache.say_once):
+        for told_once in (database.warn_of_other_measures, cache.warn_once):
             told_once.cache_clear()
         os.chdir(cwd)
         code = contextvars.Context().run(_to_its_end)

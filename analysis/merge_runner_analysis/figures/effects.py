@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -12,10 +11,7 @@ from merge_runner_analysis.figures.style import (
     GREY,
     LINE_IN,
     PAGE_IN,
-    X_LABELS_IN,
-    Points,
-    Style,
-    place_panels,
+    draw_points,
     style,
     wrapped,
 )
@@ -29,7 +25,6 @@ from merge_runner_analysis.study import Study
 ACROSS = 3  # panels
 LABEL, LEGEND = 24, 48  # characters of a line
 LINES_IN = 2.2 * LINE_IN  # from one level to the next
-AROUND_IN, BETWEEN_IN = (0.15, 0.05), (0.36, X_LABELS_IN + 0.03)
 MARK = 0.03  # of an axis: the width of a mark
 EVEN = 50.0  # percent: neither driver is favoured
 
@@ -48,20 +43,19 @@ def effects_figure(study: Study) -> Figure:
     looks = {driver: style(number) for number, driver in enumerate(drivers)}
     across, down = min(ACROSS, len(metrics)) or 1, -(-len(metrics) // ACROSS) or 1
     height_in = down * (LINES_IN * len(lines) + 0.6) + LINE_IN * 2 * len(drivers)
-    figure = Figure(figsize=(PAGE_IN, max(height_in, 1.5)))
-    panels = figure.subplots(down, across, sharey=True, squeeze=False)
-    axes = panels.flatten()
+    figure = Figure(figsize=(PAGE_IN, max(height_in, 1.5)), layout="constrained")
+    axes = figure.subplots(down, across, sharey=True, squeeze=False).flatten()
     for axis, metric in zip(axes, metrics, strict=False):
         axis.set_xlabel(metric.heading)
         for number, (driver, look) in enumerate(looks.items()):
-            beside = 0.5 * (number + 0.5) / len(drivers) - 0.25
-            found = [
-                (place + beside, level_estimate(study, level, metric))
+            points = [
+                (float(place), level_estimate(study, level, metric))
                 for place, levels in enumerate(lines.values())
                 for name, level in levels
                 if name == driver
             ]
-            _draw(axis, found, look)
+            shift = 0.5 * (number + 0.5) / len(drivers) - 0.25
+            draw_points(axis, points, shift, look | {"ls": ""}, horizontal=True)
         if metric is LEFT_FIRST:
             axis.axvline(EVEN, color=GREY, ls=":", lw=0.8)
         _limit(axis, 0.0 if metric.rate else metric.least, 100.0 if metric.unit == "%" else None)
@@ -76,18 +70,17 @@ def effects_figure(study: Study) -> Figure:
         for driver, look in looks.items()
     ]
     if handles:
-        figure.legend(handles=handles, loc="lower center", ncols=2, frameon=False)
-    place_panels(figure, panels, axes[0].get_yticklabels(), AROUND_IN, BETWEEN_IN)
+        figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False)
     return figure
 
 
 def _lines(study: Study) -> dict[str, list[tuple[str, Level]]]:
-    """By line the levels that stand on it, each with its driver; without a factor one of drivers.
+    """Return by line its levels, each with its driver; without a factor one of all drivers.
 
     Levels stand as the study lists them, the reference first.
     """
     factors = levels_of(study.models, study.order)
-    found: dict[str, list[tuple[str, Level]]] = {
+    lines: dict[str, list[tuple[str, Level]]] = {
         f"{factor}: {name}": []
         for factor, names in factors.items()
         for name in names
@@ -98,12 +91,12 @@ def _lines(study: Study) -> dict[str, list[tuple[str, Level]]]:
         for levels in levels_by_factor(study, MODEL, model, 1):
             for level in levels:
                 line = f"{level.factor}: {level.name}"
-                if line in found:
-                    found[line].append((_named(model, level), level))
-    if not found:
+                if line in lines:
+                    lines[line].append((_named(model, level), level))
+    if not lines:
         drivers = [level for levels in levels_by_factor(study) for level in levels]
-        found = {"all trials": [(_named(level.name, level), level) for level in drivers]}
-    return {line: levels for line, levels in found.items() if levels}
+        lines = {"all trials": [(_named(level.name, level), level) for level in drivers]}
+    return {line: levels for line, levels in lines.items() if levels}
 
 
 def _named(driver: str, level: Level) -> str:
@@ -119,15 +112,3 @@ def _limit(axis: Axes, least: float | None, most: float | None) -> None:
         low if least is None else max(low, least - mark),
         high if most is None else min(high, most + mark),
     )
-
-
-def _draw(axis: Axes, points: Points, look: Style) -> None:
-    """Dots with their intervals."""
-    rows = [
-        (place, own.value, *(own.bounds() or (own.value, own.value)))
-        for place, own in points
-        if own.value is not None
-    ]
-    y, x, low, high = np.array(rows, dtype=float).reshape(-1, 4).T
-    errors = np.vstack([x - low, high - x])
-    axis.errorbar(x, y, xerr=errors, elinewidth=0.7, capsize=1.5, mew=0.8, **look | {"ls": ""})

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -24,7 +23,6 @@ from merge_runner_analysis.figures.style import (
     Points,
     Style,
     draw_points,
-    place_panels,
     style,
     wrapped,
 )
@@ -33,16 +31,13 @@ from merge_runner_analysis.grouping import Group, of_trials
 from merge_runner_analysis.published import HUMAN, published
 from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.intervals import mean, proportion
-from merge_runner_analysis.stats.regressions import gap_design
+from merge_runner_analysis.stats.regressions import Array, gap_design
 from merge_runner_analysis.study import Study
 
-Array = NDArray[np.float64]
 Styles = dict[float, Style]  # of relative velocities in m/s
 LABEL = 21  # characters of a line of a row's name
 # A row is so high, of few rows each higher; and what is above and below all rows.
 ROW_IN, FEW_ROWS_IN, HIGHEST_ROW_IN, AROUND_IN = 0.62, 4.4, 1.1, 0.86
-# The labels of the speeds on the left of panels A, the headings above, and between two panels.
-SPEEDS_IN, HEADINGS_IN, BETWEEN_IN = 0.32, 0.36, (0.34, 0.15)
 # One row a finished trial: the ego's speeds.
 EGO_SPEEDS = """
 SELECT trial_id, spec_hash, list(time_s ORDER BY step) AS time_s,
@@ -76,7 +71,7 @@ def figure2(study: Study, chosen: list[Group]) -> Figure:
     rows = max(len(names), 1)
     lines = max((name.count("\n") + 1 for name in names), default=1)
     row_in = max(ROW_IN, min(HIGHEST_ROW_IN, FEW_ROWS_IN / rows), LINE_IN * lines + 0.2)
-    figure = Figure(figsize=(PAGE_IN, AROUND_IN + rows * row_in))
+    figure = Figure(figsize=(PAGE_IN, AROUND_IN + rows * row_in), layout="constrained")
     axes = figure.subplots(rows, len(HEADINGS), sharex="col", sharey="col", squeeze=False)
     for row, group, name in zip(axes, groups, names, strict=False):
         row[0].set_ylabel(name, rotation=0, ha="right", va="center", multialignment="right")
@@ -94,31 +89,25 @@ def figure2(study: Study, chosen: list[Group]) -> Figure:
         axis.set_title(panel, loc="left", fontweight="bold")
     for axis, label in zip(axes[-1], HEADINGS.values(), strict=True):
         axis.set_xlabel(label)
-    signed = (f"{v:+g}".replace("-", "−") if v else "0" for v in velocities)
-    handles = [
-        Line2D([], [], label=f"Δv = {text} m/s", **styles[v])
-        for v, text in zip(styles, signed, strict=True)
-    ]
+    handles = []
+    for velocity, look in styles.items():
+        signed = f"{velocity:+g}".replace("-", "−") if velocity else "0"
+        handles.append(Line2D([], [], label=f"Δv = {signed} m/s", **look))
     humans = {":": "humans", "--": "published regression"} if study.human in study.groups else {}
     handles += [
         Line2D([], [], color=GREY, ls=dashes, lw=0.8, label=label)
         for dashes, label in humans.items()
         if dashes == ":" or not study.human.measured
     ]
-    figure.legend(handles=handles, loc="lower center", ncols=min(len(handles), 6), frameon=False)
-    names_of_rows = [row[0].yaxis.label for row in axes]
-    place_panels(figure, axes, names_of_rows, (SPEEDS_IN, HEADINGS_IN), BETWEEN_IN)
-    for panel in axes[0]:
-        _fix_ticks(panel.xaxis, panel.yaxis)
-    return figure
-
-
-def _fix_ticks(*axes: Axis) -> None:
-    """Choose the ticks of a column, which all rows share, once and not again in each row."""
-    for axis in axes:
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=min(len(handles), 6), frameon=False
+    )
+    # The ticks of a column, which all rows share, are chosen once: to draw takes a third less.
+    for axis in (part for panel in axes[0] for part in (panel.xaxis, panel.yaxis)):
         low, high = axis.get_view_interval()
-        seen = [tick for tick in axis.get_majorticklocs() if low <= tick <= high]
-        axis.set_ticks(seen, axis.get_major_formatter().format_ticks(seen))
+        ticks = [tick for tick in axis.get_majorticklocs() if low <= tick <= high]
+        axis.set_ticks(ticks, axis.get_major_formatter().format_ticks(ticks))
+    return figure
 
 
 def left_first(merged_first: pd.Series) -> Estimate:
@@ -134,8 +123,8 @@ def gap(gaps_m: pd.Series) -> Estimate:
 
 def deviation(rmse_mps: pd.Series) -> Estimate:
     """Panel E: mean RMSE of the speed in m/s, of a trial that of both vehicles; never below 0."""
-    found = mean(rmse_mps.to_numpy(float))
-    return found if found.low is None else replace(found, low=max(0.0, found.low))
+    rmse = mean(rmse_mps.to_numpy(float))
+    return rmse if rmse.low is None else replace(rmse, low=max(0.0, rmse.low))
 
 
 Summary = Callable[[pd.Series], Estimate]
@@ -149,18 +138,17 @@ def points(group: Group, velocity_mps: float, summary: Summary) -> Points:
 
 @remembered
 def _points(group: Group, summary: Summary) -> dict[float, Points]:
-    """By relative velocity in m/s."""
     if summary is not left_first and not group.measured:
         return {}
     trials = group.outcomes if summary is left_first else group.trials
     columns = ["relative_velocity_mps", "projected_headway_m", "condition"]
-    chosen = trials.loc[trials["status"] == "finished", [*columns, COLUMNS[summary]]]
-    found: dict[float, Points] = {}
-    for (velocity, headway_m, _), values in chosen.groupby(columns)[COLUMNS[summary]]:
+    finished = trials.loc[trials["status"] == "finished", [*columns, COLUMNS[summary]]]
+    by_velocity: dict[float, Points] = {}
+    for (velocity, headway_m, _), values in finished.groupby(columns)[COLUMNS[summary]]:
         estimate = summary(values)
         if estimate.value is not None:
-            found.setdefault(velocity, []).append((headway_m, estimate))
-    return found
+            by_velocity.setdefault(velocity, []).append((headway_m, estimate))
+    return by_velocity
 
 
 @remembered
@@ -179,11 +167,11 @@ def left_traces(study: Study, group: Group, first: str) -> dict[float, list[Arra
         return {}
     trials = group.finished[group.finished["merged_first"] == first]
     velocities = trials.set_index(KEYS)["relative_velocity_mps"].to_dict()
-    found: dict[float, list[Array]] = {}
+    traces: dict[float, list[Array]] = {}
     for row in of_trials(study.read(EGO_SPEEDS), trials).itertuples():
         velocity = float(velocities[row.trial_id, row.spec_hash])
-        found.setdefault(velocity, []).append(np.column_stack([row.time_s, row.velocity_mps]))
-    return found
+        traces.setdefault(velocity, []).append(np.column_stack([row.time_s, row.velocity_mps]))
+    return traces
 
 
 def published_gap_line(velocity_mps: float) -> tuple[Array, Array]:
@@ -198,7 +186,6 @@ def published_gap_line(velocity_mps: float) -> tuple[Array, Array]:
 
 
 def _draw_traces(axis: Axes, study: Study, group: Group, first: str, styles: Styles) -> None:
-    """The left speeds of those trials in which this side merged first."""
     traces = left_traces(study, group, first)
     count = sum(len(traces.get(velocity, ())) for velocity in styles)
     if not count:
@@ -220,7 +207,6 @@ def _draw_traces(axis: Axes, study: Study, group: Group, first: str, styles: Sty
 
 
 def _draw_estimates(axis: Axes, group: Group, summary: Summary, styles: Styles) -> None:
-    """Estimates of the relative velocities, side by side."""
     found = [points(group, velocity, summary) for velocity in styles]
     for index, (part, look) in enumerate(zip(found, styles.values(), strict=True)):
         draw_points(axis, part, 0.3 * (index - (len(styles) - 1) / 2), look)
@@ -231,7 +217,6 @@ def _draw_estimates(axis: Axes, group: Group, summary: Summary, styles: Styles) 
 
 
 def _say(axis: Axes, text: str) -> None:
-    """A remark in a panel."""
     place: Style = {"xycoords": "axes fraction", "ha": "center", "va": "top"}
     axis.annotate(text, (0.5, 0.9), fontsize=6, color=GREY, **place)
 

@@ -50,9 +50,9 @@ def write_figures(study: Study, folder: Path) -> Iterator[Path]:
             path = folder / f"{name}.{form}"
             path.write_bytes(rendered(study, name, form))
             yield path
-        if FIGURES[name].table:
-            path = folder / f"{FIGURES[name].table}.csv"
-            text = render(make_tables(study, [FIGURES[name].table]), TableFormat.CSV)
+        if table := FIGURES[name].table:
+            path = folder / f"{table}.csv"
+            text = render(make_tables(study, [table]), TableFormat.CSV)
             path.write_text(text + "\n", encoding="utf-8")
             yield path
 

@@ -75,7 +75,6 @@ def import_trials(sources: Iterable[Source], store: Store) -> Report:
 def _records(
     condition: str, experiment: int, iteration: int, file: File, report: Report
 ) -> Iterator[TrialRecord]:
-    """The trials of a file; what cannot be read is reported."""
     try:
         if not condition:
             yield trial_record(parse_csv(file.read()), experiment, iteration)

@@ -146,7 +146,7 @@ def trial_record(trace: Trace, experiment: int, iteration: int, page: str = "") 
     states = tuple(_states(trace))
     pair = PAIRS.get(experiment, f"experiment_{experiment}")
     arrivals = {side: _arrival(trace.positions_m[side]) for side in SIDES}
-    first = min(arrivals, key=arrivals.__getitem__)
+    first = min(SIDES, key=lambda side: arrivals[side])
     decided = status not in ("collided", "failed") and arrivals[first] < inf
     return TrialRecord(
         spec=TrialSpec(

@@ -13,13 +13,7 @@ from numpy.typing import NDArray
 from scipy import optimize, special, stats
 
 from merge_runner_analysis.stats.estimate import Estimate
-from merge_runner_analysis.stats.intervals import (
-    LEVEL,
-    POWER,
-    ROUNDING,
-    tested,
-    two_sided_p,
-)
+from merge_runner_analysis.stats.intervals import LEVEL, POWER, ROUNDING, tested, two_sided_p
 from merge_runner_analysis.stats.score_interval import Z
 
 # Where less of a trial's deviation is left over than this, it alone decides the difference.
@@ -139,21 +133,19 @@ def shared_cells(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Cel
 
     A column ``varies`` says which trials vary by themselves (see ``Cells``); else all do.
     """
-    counts, varying = [], []
+    counts = []
     for frame in (first, second):
         known = frame.loc[frame[measure].notna()]
-        hits = known.loc[known[measure].astype(bool), "condition"]
-        counts += [Counter(hits), Counter(known["condition"])]
-        if "varies" in known:
-            varying.append(Counter(known.loc[known["varies"], "condition"]))
-        else:
-            varying.append(counts[-1])
-    shared = sorted(counts[1].keys() & counts[3].keys())
+        cells, hits = known["condition"], known[measure].astype(bool)
+        varying = cells[known["varies"]] if "varies" in known else cells
+        counts += [Counter(cells[hits]), Counter(cells), Counter(varying)]
+    shared = sorted(counts[1].keys() & counts[4].keys())
     if not shared:
         return None
-    a, n, b, m = (np.array([count[cell] for cell in shared], dtype=int) for count in counts)
-    one, other = (np.array([count[cell] for cell in shared], dtype=int) for count in varying)
-    return Cells(a, n, b, m, (one / n, other / m))
+    a, n, first_varying, b, m, second_varying = (
+        np.array([count[cell] for cell in shared], dtype=int) for count in counts
+    )
+    return Cells(a, n, b, m, (first_varying / n, second_varying / m))
 
 
 def contrast_rates(cells: Cells) -> Estimate:
@@ -166,18 +158,16 @@ def contrast_rates(cells: Cells) -> Estimate:
     value, se = cells.difference, sqrt(cells.variance(0))
     ends = cells.end(-1), cells.end(1)
     p = two_sided_p(value / se) if se else 1.0
-    none = np.zeros_like(cells.n)
-    surest = Cells(cells.n, cells.n, none, cells.m)
+    surest = Cells(cells.n, cells.n, np.zeros_like(cells.n), cells.m)
     least = None
     if two_sided_p(1 / sqrt(surest.variance(0))) < 1 - LEVEL:
-        least = min(
-            (found for sign in (-1, 1) if (found := _detectable(cells, sign))), default=None
-        )
+        sizes = [_detectable(cells, sign) for sign in (-1, 1)]
+        least = min(filter(None, sizes), default=None)
     return Estimate(value, *ends, se=se, p=p, detectable=least)
 
 
 def _detectable(cells: Cells, sign: int) -> float | None:
-    """The smallest difference in this direction that is found with the power."""
+    """Return the smallest difference in this direction that is found with the power."""
 
     def missing(size: float) -> float:
         return Z_WITH_POWER * sqrt(cells.variance(sign * size)) - size
@@ -216,10 +206,10 @@ def detectable_rate(n: int, m: int, rate: float) -> float | None:
     In the direction in which less is enough; None where not even rates of 0 and 1 are told apart
     from it with the power.
     """
-    found = rejected(n, m) @ stats.binom.pmf(np.arange(m + 1), m, rate)
+    chances = rejected(n, m) @ stats.binom.pmf(np.arange(m + 1), m, rate)
 
     def enough(other: float) -> float:
-        return float(stats.binom.pmf(np.arange(n + 1), n, other) @ found) - POWER
+        return float(stats.binom.pmf(np.arange(n + 1), n, other) @ chances) - POWER
 
     ends = [end for end in (0.0, 1.0) if enough(end) >= 0]
     return min((abs(optimize.brentq(enough, rate, end) - rate) for end in ends), default=None)
@@ -331,10 +321,10 @@ def corrected(p: list[float]) -> list[float]:
     Not by statsmodels' multipletests, which collects garbage at every call: 0.1 s each, and there
     is a family for every measure of every driver. A test holds both against each other.
     """
-    found = np.asarray(p, dtype=float)
-    order = np.argsort(found, kind="stable")
+    family = np.asarray(p, dtype=float)
+    order = np.argsort(family, kind="stable")
     # The smallest is multiplied by the number of tests, the next by one less, and none falls.
-    steps = np.maximum.accumulate(found[order] * np.arange(len(found), 0, -1))
-    holm = np.empty_like(found)
+    steps = np.maximum.accumulate(family[order] * np.arange(len(family), 0, -1))
+    holm = np.empty_like(family)
     holm[order] = np.minimum(steps, 1)
-    return [float(value) for value in holm]
+    return [*map(float, holm)]

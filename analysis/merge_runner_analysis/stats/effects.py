@@ -20,29 +20,16 @@ from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.frames import KEYS
 from merge_runner_analysis.grouping import Group, levels_of
 from merge_runner_analysis.metrics import BOXES, COLLISIONS, LEFT_FIRST, METRICS, Metric
-from merge_runner_analysis.stats.contrasts import (
-    contrast_means,
-    contrast_rates,
-    corrected,
-    difference_of_contrasts,
-    means_within,
-    shared_cells,
-)
+from merge_runner_analysis.stats import contrasts
 from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.intervals import difference
-from merge_runner_analysis.stats.levels import (
-    DRIVER,
-    Level,
-    copied_cells,
-    levels_by_factor,
-)
+from merge_runner_analysis.stats.levels import DRIVER, Level, copied_cells, levels_by_factor
 from merge_runner_analysis.stats.measures import linear, undecided
 from merge_runner_analysis.stats.sides import from_both_sides, one_sided
 from merge_runner_analysis.study import Study, in_one_study
 from merge_runner_analysis.wording import TIMES
 
 PRIMARY = "goes_first"  # in a study's file, and where none is named
-Pair = tuple[pd.DataFrame, pd.DataFrame]
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,15 +74,19 @@ class Effect:
         return frozenset(names), level.mark, self.metric.name
 
     @property
+    def levels(self) -> tuple[Level, ...]:
+        """The two levels, or the four of an interaction."""
+        return (self.level, self.reference, *(self.across or ()))
+
+    @property
     def groups(self) -> tuple[str, ...]:
         """The ids of all groups whose trials it rests on."""
-        every = (self.level, self.reference, *(self.across or ()))
-        return tuple(dict.fromkeys(name for level in every for name in level.groups))
+        return tuple(dict.fromkeys(name for level in self.levels for name in level.groups))
 
 
 @remembered
 def effects(study: Study, by: str = "") -> list[Effect]:
-    """The effects of every factor, and the interactions of any two of them.
+    """Return the effects of every factor, and the interactions of any two of them.
 
     With ``by``, those of the others at each level of this one, and the interactions with it.
     Their p are corrected by Holm in two families: of the study's primary measure the main effects
@@ -106,31 +97,27 @@ def effects(study: Study, by: str = "") -> list[Effect]:
         main = [one for levels in levels_by_factor(study) for one in _of_levels(study, levels)]
         return _with_corrected(study, [*main, *_interactions(study)])
     if by == DRIVER:
-        shown = list(dict.fromkeys(group.driver for group in study.models))
+        names = list(dict.fromkeys(group.driver for group in study.models))
+        interactions = []
     else:
-        shown = require(levels_of(study.models, study.order), "factor", by)
-    simple = [
-        one
-        for at in shown
-        for levels in levels_by_factor(study, by, at)
-        for one in _of_levels(study, levels)
-    ]
-    crossed = [] if by == DRIVER else [*_interactions(study, by)]
-    p_corrected = {one.key: one.p_corrected for one in effects(study)} if crossed else {}
-    return [
-        *_with_corrected(study, simple),
-        *(replace(one, p_corrected=p_corrected.get(one.key)) for one in crossed),
-    ]
+        names = require(levels_of(study.models, study.order), "factor", by)
+        p_corrected = {one.key: one.p_corrected for one in effects(study)}
+        interactions = [
+            replace(one, p_corrected=p_corrected.get(one.key)) for one in _interactions(study, by)
+        ]
+    by_factor = chain.from_iterable(levels_by_factor(study, by, name) for name in names)
+    simple = [one for levels in by_factor for one in _of_levels(study, levels)]
+    return [*_with_corrected(study, simple), *interactions]
 
 
-def driver_effects(study: Study, one: Group, other: Group) -> list[Effect]:
-    """One driver with its prompt less another, in every measure, in the conditions of both.
+def driver_effects(study: Study, driver: Group, reference: Group) -> list[Effect]:
+    """Compare two drivers with their prompts in every measure, in the conditions of both.
 
     Their p are corrected together by Holm.
     """
     levels = []
-    for group in (other, one):
-        cells = pd.Series([(each,) for each in group.trials["condition"]], group.trials.index)
+    for group in (reference, driver):
+        cells = pd.Series([(name,) for name in group.trials["condition"]], group.trials.index)
         pooled = replace(group, trials=group.trials.assign(cell=cells), whole=None)
         levels.append(Level(DRIVER, group.id, (group.id,), pooled))
     return _with_corrected(study, [*_of_levels(study, levels)])
@@ -169,14 +156,13 @@ def measured(study: Study) -> list[Metric]:
 
 
 def _of_levels(study: Study, levels: Sequence[Level]) -> Iterator[Effect]:
-    """Each level but the first against that one, measure by measure."""
     reference, *others = levels
     for metric, level in product(measured(study), others):
         yield _effect(study, metric, (level, reference))
 
 
 def _interactions(study: Study, by: str = "") -> Iterator[Effect]:
-    """How far effects differ between the levels of another factor, or of this one, and its first.
+    """Compare effects between the levels of another factor, or of this one, and its first.
 
     The two differences are those of the factor that stands first, so that both ways round the
     interaction is one number.
@@ -187,122 +173,115 @@ def _interactions(study: Study, by: str = "") -> Iterator[Effect]:
     tested = [metric for metric in measured(study) if metric.estimator != "median"]
     pairs = [(name, by) for name in varying if name != by] if by else combinations(varying, 2)
     for factor, other in pairs:
-        turned = varying.index(other) < varying.index(factor) if other in varying else False
-        first, *others = ([*_at(study, factor, other, at)] for at in factors[other])
+        swapped = other in varying and varying.index(other) < varying.index(factor)
+        # Those of stand-ins are apart.
+        first, *others = (
+            [levels for levels in levels_by_factor(study, other, at) if levels[0].factor == factor]
+            for at in factors[other]
+        )
         for (base, *twins), (reference, *levels) in product(first, chain(*others)):
             if (base.name, base.mark) != (reference.name, reference.mark):
                 continue
-            same = {twin.name: twin for twin in twins}
+            twin_of = {twin.name: twin for twin in twins}
             for metric, level in product(tested, levels):
-                if level.name in same:
-                    four = (level, reference, same[level.name], base)
-                    yield _effect(study, metric, four, turned=turned)
-
-
-def _at(study: Study, factor: str, by: str, at: str) -> Iterator[list[Level]]:
-    """The levels of a factor at one of another, those of stand-ins apart."""
-    for levels in levels_by_factor(study, by, at):
-        if levels[0].factor == factor:
-            yield levels
+                if twin := twin_of.get(level.name):
+                    yield _effect(study, metric, (level, reference, twin, base), swapped=swapped)
 
 
 def _effect(
-    study: Study, metric: Metric, levels: Sequence[Level], *, turned: bool = False
+    study: Study, metric: Metric, levels: Sequence[Level], *, swapped: bool = False
 ) -> Effect:
-    """One level less another; of four, less that of the others."""
+    """Compare two levels; of four, the difference of the first two with that of the others."""
     frames = trials_by_cell(study, [level.pooled for level in levels], metric)
     left_out = {copy for level in levels for copy in level.copies}
     for level, frame in zip(levels, frames, strict=False):
-        trials = level.pooled.trials
-        unused = ~trials.index.isin(frame.index)
-        if unused.any():
-            left_out |= {*zip(*(trials[name].array[unused] for name in KEYS), strict=True)}
+        unused = level.pooled.trials[KEYS].drop(index=frame.index.unique())
+        left_out.update(unused.itertuples(index=False, name=None))
     values: tuple[float | None, float | None] = (None, None)
-    found = None
+    difference = None
     if frames and len(frames[0]):
-        one, other, *across = frames
-        if not across:
-            values, found = _compared(one, other, metric)
-        elif turned:
-            found = _interaction((one, across[0]), (other, across[1]), metric)
+        if len(frames) == 2:
+            values, difference = _compared(frames[0], frames[1], metric)
         else:
-            found = _interaction((one, other), (across[0], across[1]), metric)
-    counted = [_counted(frame, metric) for frame in frames] or [Estimate(), Estimate()]
-    found = found or Estimate()
+            ordered = [frames[place] for place in ((0, 2, 1, 3) if swapped else range(4))]
+            difference = _interaction(ordered, metric)
+    counts = [_counted(frame, metric) for frame in frames] or [Estimate(), Estimate()]
+    difference = difference or Estimate()
     return Effect(
         level=levels[0],
         reference=levels[1],
         metric=metric,
-        at_level=replace(counted[0], value=values[0]),
-        at_reference=replace(counted[1], value=values[1]),
+        at_level=replace(counts[0], value=values[0]),
+        at_reference=replace(counts[1], value=values[1]),
         # Where nothing varies it is not known what could have been seen.
-        difference=replace(found, detectable=found.detectable or None),
+        difference=replace(difference, detectable=difference.detectable or None),
         left_out=tuple(sorted(left_out)),
         across=(levels[2], levels[3]) if len(levels) > 2 else None,
     )
 
 
 def _counted(frame: pd.DataFrame, metric: Metric) -> Estimate:
-    """How many trials there are, and in how many it is so; not of those read from both sides."""
+    """Count the trials, and those in which it is so; not of those read from both sides."""
     from_both = "varies" in frame and not frame["varies"].all()
     k = int(frame["value"].sum()) if metric.rate and not from_both else None
     return Estimate(n=frame.index.nunique(), k=k)
 
 
 def _compared(
-    one: pd.DataFrame, other: pd.DataFrame, metric: Metric
+    level: pd.DataFrame, reference: pd.DataFrame, metric: Metric
 ) -> tuple[tuple[float, float], Estimate | None]:
-    """What two groups of trials come to, and their difference: None where that is not known."""
+    """Return both values and their difference, None where that is not known."""
     if metric.estimator == "median":
-        medians = float(one["value"].median()), float(other["value"].median())
+        medians = float(level["value"].median()), float(reference["value"].median())
         return medians, Estimate(medians[0] - medians[1])
-    if metric.rate and (cells := shared_cells(one, other, "value")):
+    if metric.rate and (cells := contrasts.shared_cells(level, reference, "value")):
         first, second = cells.rates
-        return (100 * first, 100 * second), contrast_rates(cells).times(100)
-    return means_within(one, other, "value"), contrast_means(one, other, "value")
+        return (100 * first, 100 * second), contrasts.contrast_rates(cells).times(100)
+    means = contrasts.means_within(level, reference, "value")
+    return means, contrasts.contrast_means(level, reference, "value")
 
 
-def _interaction(pair: Pair, twins: Pair, metric: Metric) -> Estimate | None:
-    """How far the difference of one pair is from the other's; None where one is not known."""
+def _interaction(frames: Sequence[pd.DataFrame], metric: Metric) -> Estimate | None:
+    """Return the difference of the first two less that of the others; None if one is not known."""
+    level, reference, twin, base = frames
     if metric.rate:
-        cells, others = shared_cells(*pair, "value"), shared_cells(*twins, "value")
-        return difference_of_contrasts(cells, others).times(100) if cells and others else None
-    mean, other = contrast_means(*pair, "value"), contrast_means(*twins, "value")
+        cells = contrasts.shared_cells(level, reference, "value")
+        others = contrasts.shared_cells(twin, base, "value")
+        if cells is None or others is None:
+            return None
+        return contrasts.difference_of_contrasts(cells, others).times(100)
+    mean = contrasts.contrast_means(level, reference, "value")
+    other = contrasts.contrast_means(twin, base, "value")
     return difference(mean, other) if mean and other else None
 
 
-def _with_corrected(study: Study, found: list[Effect]) -> list[Effect]:
-    """The effects with their corrected p, in the study's own family or in that of all others.
+def _with_corrected(study: Study, effects: list[Effect]) -> list[Effect]:
+    """Return the effects with their corrected p, in the study's own family or that of all others.
 
     Where nothing varies and nothing differs, as without a single collision, p is no part of it.
     """
-    asked = [_is_asked(study, one) for one in found]
-    p_of = {place: one.difference.p for place, one in enumerate(found)}
+    is_primary = [
+        one.metric is primary(study) and not one.across and one.level.factor not in (MODEL, DRIVER)
+        for one in effects
+    ]
+    p = {place: one.difference.p for place, one in enumerate(effects)}
     for own in (True, False):
         family = {
             place: one.difference.p
-            for place, one in enumerate(found)
-            if asked[place] is own and one.difference.p is not None and _can_differ(one)
+            for place, one in enumerate(effects)
+            if is_primary[place] is own
+            and one.difference.p is not None
+            and (one.difference.se or one.difference.value)
         }
-        p_of |= dict(zip(family, corrected([*family.values()]), strict=True))
+        p |= dict(zip(family, contrasts.corrected([*family.values()]), strict=True))
     return [
-        replace(one, primary=asked[place], p_corrected=p_of[place])
-        for place, one in enumerate(found)
+        replace(one, primary=is_primary[place], p_corrected=p[place])
+        for place, one in enumerate(effects)
     ]
 
 
-def _is_asked(study: Study, one: Effect) -> bool:
-    """Whether it is a main effect on the study's primary measure."""
-    is_main = not one.across and one.level.factor not in (MODEL, DRIVER)
-    return is_main and one.metric is primary(study)
-
-
-def _can_differ(one: Effect) -> bool:
-    return bool(one.difference.se or one.difference.value)
-
-
 def trials_by_cell(study: Study, groups: Sequence[Group], metric: Metric) -> list[pd.DataFrame]:
-    """The ``value`` of each group's trials with their cell as ``condition``, in cells of all.
+    """Return the ``value`` of each group's trials and their cell as ``condition``, in cells of all.
 
     Cells of programs that do not heed what the groups differ in are left out. Nothing where the
     groups are of several studies or have undecided trials.
@@ -316,12 +295,13 @@ def trials_by_cell(study: Study, groups: Sequence[Group], metric: Metric) -> lis
         if copied:
             counted = counted & ~trials["cell"].isin(copied).to_numpy()
         columns = {"condition": "cell", "value": metric.column, "weight": metric.weight_column}
-        named = {name: trials[own] for name, own in columns.items() if own in trials}
-        frame = pd.DataFrame(named)[counted]
+        frame = pd.DataFrame(
+            {name: trials[column] for name, column in columns.items() if column in trials}
+        )[counted]
         if metric.weight:
             frame["value"] = linear(frame["value"], frame["weight"], frame["condition"])
         elif metric is LEFT_FIRST and one_sided(study):
             frame = from_both_sides(study, frame, trials)
         frames.append(frame)
-    kept = set.intersection(*(set(one["condition"]) for one in frames))
-    return [frame[frame["condition"].isin(kept)] for frame in frames]
+    shared = set.intersection(*(set(frame["condition"]) for frame in frames))
+    return [frame[frame["condition"].isin(shared)] for frame in frames]

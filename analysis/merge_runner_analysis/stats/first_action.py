@@ -19,11 +19,17 @@ from scipy import stats
 from merge_runner.records import SIDES
 from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.drivers import has_chance
+from merge_runner_analysis.frames import KEYS
 from merge_runner_analysis.grouping import Group, of_trials
 from merge_runner_analysis.published import human_outcomes
 from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.intervals import LEVEL, estimate
-from merge_runner_analysis.stats.regressions import Array, unfit_for_logit, who_first_data
+from merge_runner_analysis.stats.regressions import (
+    CONDITION,
+    Array,
+    unfit_for_logit,
+    who_first_data,
+)
 from merge_runner_analysis.study import Study
 
 # One row a vehicle: the acceleration of the first step that its driver controls, and the word of
@@ -57,9 +63,9 @@ class Seat(NamedTuple):
         group, side = self
         if not side:
             return group.label
-        said = group.said if group.trials[f"{side}_scripted"].any() else group.caution
-        one = f"{group.models[SIDES.index(side)]} of {group.driver}"
-        return f"{one} ({said})" if said else one
+        remark = group.said if group.trials[f"{side}_scripted"].any() else group.caution
+        driver = f"{group.models[SIDES.index(side)]} of {group.driver}"
+        return f"{driver} ({remark})" if remark else driver
 
 
 def seats(group: Group) -> list[Seat]:
@@ -104,10 +110,8 @@ def repeats_itself(study: Study, seat: Seat) -> bool:
 
 @remembered
 def _stored(study: Study, seat: Seat) -> pd.DataFrame:
-    columns = ["trial_id", "spec_hash", "condition", "projected_headway_m", "relative_velocity_mps",
-               "pair", "ego"]  # fmt: skip
-    trials = seat.group.ended[columns]
-    rows = of_trials(study.read(FIRST_ACTIONS), trials).merge(trials, on=["trial_id", "spec_hash"])
+    trials = seat.group.ended[[*KEYS, *CONDITION, "condition", "pair", "ego"]]
+    rows = of_trials(study.read(FIRST_ACTIONS), trials).merge(trials, on=KEYS)
     return rows[rows["side"] == seat.side] if seat.side else rows
 
 

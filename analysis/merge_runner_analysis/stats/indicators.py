@@ -33,19 +33,14 @@ from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.frames import KEYS, SPEEDS, read
 from merge_runner_analysis.grouping import Group, of_trials
 from merge_runner_analysis.published import published
+from merge_runner_analysis.stats import regressions
 from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.held import measure_profiles
 from merge_runner_analysis.stats.intervals import difference, mean
-from merge_runner_analysis.stats.regressions import (
-    Regression,
-    gap_ols,
-    who_first_firth,
-    who_first_logit,
-)
+from merge_runner_analysis.stats.regressions import Regression
 from merge_runner_analysis.study import Study
-from merge_runner_analysis.wording import INDICATORS, Fact, Why
+from merge_runner_analysis.wording import ALPHA, INDICATORS, Fact, Why
 
-ALPHA = 0.05
 PUBLISHED, BY_EYE = Fact(Why.NO_TRACES), Fact(Why.BY_EYE)
 # By indicator: the term that decides it, and the sign that it needs; I4's is to have no effect.
 TESTED = {
@@ -69,7 +64,7 @@ def disagree(one: Judgement, other: Judgement) -> bool:
 
 
 def judge(who_first: Regression, gap: Regression, *, robust: bool) -> dict[str, Judgement]:
-    """I1 to I4 by the paper's rule, or by the ``robust`` one, for Firth's fit and HC3 errors."""
+    """Judge I1 to I4 by the paper's rule, or the ``robust`` one for Firth's fit and HC3 errors."""
     return {
         name: _judged(who_first if name in {"I1", "I2"} else gap, name, robust=robust)
         for name in TESTED
@@ -103,16 +98,15 @@ def _all_profiles(study: Study) -> pd.DataFrame:
 @remembered
 def gains(study: Study, group: Group) -> pd.DataFrame:
     """One row a finished trial: condition, pair, ``steady`` (nobody acted), and ``gain`` or NaN."""
-    trials = group.finished[[*KEYS, "condition", "pair"]]
     by_trial = profiles(study, group).groupby(KEYS, as_index=False)
-    found = by_trial.agg(steady=("steady", "all"), gain=("gain", "mean"))
-    return trials.merge(found, on=KEYS)
+    gain = by_trial.agg(steady=("steady", "all"), gain=("gain", "mean"))
+    return group.finished[[*KEYS, "condition", "pair"]].merge(gain, on=KEYS)
 
 
 def mean_gain(study: Study, group: Group) -> Estimate:
-    """The mean gain of a group's trials; that of humans over the means of their pairs."""
-    found = gains(study, group).dropna(subset="gain")
-    return replace(mean(_independent(found, "gain")), n=len(found))
+    """Return the mean gain of a group's trials; that of humans over the means of their pairs."""
+    known = gains(study, group).dropna(subset="gain")
+    return replace(mean(_independent(known, "gain")), n=len(known))
 
 
 def less_humans(study: Study, group: Group) -> Estimate | None:
@@ -140,10 +134,9 @@ def likeness(driver: pd.DataFrame, human: pd.DataFrame) -> Estimate:
     own, pairs = mean(apart / spread), mean(_independent(human, "apart") / spread)
     if own.value is None or own.se is None or pairs.se is None:
         return Estimate(own.value, n=own.n)
-    found = difference(own, replace(pairs, value=0.0))
-    if found is None or found.se is None:  # nothing varies: it is sure
-        return Estimate(own.value, own.value, own.value, own.n, 0.0)
-    return Estimate(own.value, found.low, found.high, own.n, found.se, found.freedom)
+    if test := difference(own, replace(pairs, value=0.0)):
+        return Estimate(own.value, test.low, test.high, own.n, test.se, test.freedom)
+    return Estimate(own.value, own.value, own.value, own.n, 0.0)  # nothing varies: it is sure
 
 
 def _independent(trials: pd.DataFrame, column: str) -> pd.Series:
@@ -155,12 +148,10 @@ def _independent(trials: pd.DataFrame, column: str) -> pd.Series:
 
 def piecewise_constant(study: Study, group: Group) -> Judgement:
     """I5: whether the accelerations of a group are held and jump, rather than move."""
-    found = mean_gain(study, group)
-    if not found.n:
-        return Judgement(None, Fact(Why.NO_ACTION))
-    if found.low is None:
-        return Judgement(None, Fact(Why.ONE_ACTION))
-    return Judgement(found.low > 0)
+    gain = mean_gain(study, group)
+    if gain.low is not None:
+        return Judgement(gain.low > 0)
+    return Judgement(None, Fact(Why.ONE_ACTION if gain.n else Why.NO_ACTION))
 
 
 class Fits(NamedTuple):
@@ -175,11 +166,13 @@ class Fits(NamedTuple):
 @remembered
 def fits(group: Group) -> Fits:
     """Fit a group's trials; without gaps the linear fits say so."""
-    logit, firth = who_first_logit(group.outcomes), who_first_firth(group.outcomes)
-    if not group.measured:
-        missing = Regression(0, {}, PUBLISHED)
-        return Fits(logit, firth, missing, missing)
-    return Fits(logit, firth, gap_ols(group.trials), gap_ols(group.trials, robust=True))
+    logit = regressions.who_first_logit(group.outcomes)
+    firth = regressions.who_first_firth(group.outcomes)
+    ols = hc3 = Regression(0, {}, PUBLISHED)
+    if group.measured:
+        ols = regressions.gap_ols(group.trials)
+        hc3 = regressions.gap_ols(group.trials, robust=True)
+    return Fits(logit, firth, ols, hc3)
 
 
 class Score(NamedTuple):

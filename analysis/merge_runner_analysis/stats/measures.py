@@ -23,7 +23,7 @@ PAPER = "paper_ablation_quantitative"
 
 
 def trials_of(group: Group, metric: Metric) -> pd.DataFrame:
-    """The trials that a metric is found in, of humans the published outcomes if these have it."""
+    """Return the trials that have a metric, of humans the published outcomes if these have it."""
     return group.outcomes if metric.column in group.outcomes else group.trials
 
 
@@ -33,9 +33,9 @@ def values(group: Group, metric: Metric) -> pd.Series:
 
 
 def counts(group: Group, metric: Metric) -> tuple[int, int]:
-    """Successes and n of a rate."""
-    found = values(group, metric)
-    return int(found.astype(bool).sum()), len(found)
+    """Return the successes and n of a rate."""
+    sample = values(group, metric)
+    return int(sample.astype(bool).sum()), len(sample)
 
 
 @remembered
@@ -60,12 +60,12 @@ def estimate(group: Group, metric: Metric) -> Estimate:
 
 
 def _ratio(trials: pd.DataFrame, metric: Metric) -> Estimate:
-    """A mean in which trials have weights: its interval is that of a ratio of their sums."""
+    """Return a mean in which trials have weights, with the interval of a ratio of their sums."""
     known = trials[[metric.column, metric.weight_column]].dropna()
     value, weight = known[metric.column], known[metric.weight_column]
-    found = mean(linear(value, weight, pd.Series("", known.index)).to_numpy(float))
+    sample = linear(value, weight, pd.Series("", known.index)).to_numpy(float)
     k = round(float((value * weight).sum()) / 100)
-    return replace(found, k=k, weight=float(weight.sum()))
+    return replace(mean(sample), k=k, weight=float(weight.sum()))
 
 
 def linear(value: pd.Series, weight: pd.Series, cells: pd.Series) -> pd.Series:
@@ -102,7 +102,6 @@ def mean_of(trials: pd.DataFrame, column: str, shares: pd.Series | None = None) 
 
 
 def _weighted_mean(trials: pd.DataFrame, column: str, shares: pd.Series) -> float:
-    """The mean over conditions, which weigh by these shares as far as they have trials."""
     means = trials.groupby("condition")[column].mean()
     weights = shares.reindex(means.index, fill_value=0)
     return float(means @ weights / weights.sum())
@@ -150,16 +149,18 @@ def undecided_note(group: Group, metric: Metric) -> Fact | None:
 
 def known(group: Group, metric: Metric) -> bool:
     """Whether a group's trials hold this metric: before an import humans have outcomes alone."""
-    found = trials_of(group, metric)
+    trials = trials_of(group, metric)
     if group.published_outcomes is None:
         return True
-    return metric.column in found and bool(found[metric.column].notna().any())
+    return metric.column in trials and bool(trials[metric.column].notna().any())
 
 
 def estimate_or_reference(group: Group, metric: Metric) -> Estimate | None:
     """What a group comes to; of humans without traces what the paper says, None where nothing."""
-    if known(group, metric) or not metric.paper_of_humans:
-        return estimate(group, metric) if known(group, metric) else None
+    if known(group, metric):
+        return estimate(group, metric)
+    if not metric.paper_of_humans:
+        return None
     row = published(PAPER).query("driver == 'human'").iloc[0]
     return Estimate(float(row[metric.paper_of_humans]), source=Fact(Why.CITED, (citation(PAPER),)))
 

@@ -355,8 +355,8 @@ class Moved:
     @property
     def within_p(self) -> float:
         """The p-value that all are below the margin: the largest of two one-sided tests each."""
-        each = zip(self.sizes, self.errors, strict=True)
-        return max(equivalence_p(float(b), float(se), self.freedom) for b, se in each)
+        pairs = zip(self.sizes.tolist(), self.errors.tolist(), strict=True)
+        return max(equivalence_p(size, se, self.freedom) for size, se in pairs)
 
     @property
     def beyond_p(self) -> float:
@@ -496,7 +496,6 @@ def by_pairs(
 
 
 def _terms(names: Sequence[str], b: Array, se: Array, freedom: float = inf) -> dict[str, Term]:
-    """The terms of these estimates and errors, with their tests against 0."""
     found = {}
     for name, value, error in zip(names, b.tolist(), se.tolist(), strict=True):
         statistic = value / error if error else inf
@@ -523,7 +522,6 @@ def _unidentified(design: Array, left: Array) -> Fact | None:
 
 
 def _cells(design: Array, left: Array) -> Counts:
-    """Trials of equal regressors as one binomial."""
     cells, place, trials = np.unique(design, axis=0, return_inverse=True, return_counts=True)
     return Counts(cells, trials.astype(float), np.bincount(place, weights=left).astype(float))
 

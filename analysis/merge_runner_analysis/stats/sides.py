@@ -49,12 +49,12 @@ def level_estimate(study: Study, level: Level, metric: Metric) -> Estimate:
 
 
 def cells_seen(study: Study, level: Level) -> set[Cell]:
-    """The cells of its trials that ended; where both drivers are told the same, of both sides."""
+    """Return the cells of its trials that ended, from both sides if they are read from both."""
     trials = level.pooled.ended
     seen = {*trials["cell"]}
     if one_sided(study):
         same = trials.loc[_told_the_same(trials), "cell"].unique()
-        seen |= {(_image(study, condition), *others) for condition, *others in same}
+        seen |= {(_mirrored(study, condition), *others) for condition, *others in same}
     return seen
 
 
@@ -67,39 +67,34 @@ def _of_equals(trials: pd.DataFrame) -> pd.Series:
 
 
 def from_both_sides(study: Study, frame: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
-    """Who goes first, by cell and side; trials of two that are given the same read from both.
+    """Return who goes first by cell and side; trials of two told the same are read from both.
 
     So whoever is given something on the left is compared with the left ones who are not, and on the
-    right with the right ones: no side is favoured. The readings of a trial are opposite, and the
-    sum of both does not vary.
+    right with the right ones: no side is favoured.
     """
     trials = trials.loc[frame.index]
-    same = _told_the_same(trials)
-    sides = _with_side(frame["condition"], trials["ego"])
-    left = frame.assign(condition=sides, varies=~same)
-    images = {name: _image(study, name) for name in trials["condition"].unique()}
-    named = [(images[cell[0]], *cell[1:]) for cell in frame.loc[same, "condition"]]
-    cells = pd.Series(named, frame.index[same], dtype=object)
-    right = pd.DataFrame(
-        {
-            "condition": _with_side(cells, pd.Series("right", cells.index)),
-            "value": ~frame.loc[same, "value"].astype(bool),
-            "varies": False,
-        }
-    )
-    return pd.concat([left, right])
+    sided = [(*cell, ego) for cell, ego in zip(frame["condition"], trials["ego"], strict=True)]
+    images = [(_mirrored(study, cell[0]), *cell[1:], "right") for cell in frame["condition"]]
+    cells, mirrored = (pd.Series(names, frame.index, dtype=object) for names in (sided, images))
+    frame = frame.assign(condition=cells, value=frame["value"].astype(float))
+    return read_twice(frame, mirrored.where(_told_the_same(trials)))
 
 
-def _with_side(cells: pd.Series, sides: pd.Series) -> pd.Series:
-    named = [(*cell, side) for cell, side in zip(cells, sides, strict=True)]
-    return pd.Series(named, cells.index, dtype=object)
+def read_twice(frame: pd.DataFrame, images: pd.Series) -> pd.DataFrame:
+    """Return trials by cell, and once more those with a cell from the right in ``images``.
+
+    Both readings of a trial are opposite, so that their sum does not vary.
+    """
+    again = images.notna()
+    right = frame.assign(condition=images, value=1 - frame["value"])[again]
+    return pd.concat([frame.assign(varies=~again), right.assign(varies=False)])
 
 
-def _image(study: Study, condition: str) -> str:
-    """A condition as the driver on the right sees it."""
+@remembered
+def _mirrored(study: Study, condition: str) -> str:
     headway_m, velocity_mps = study.conditions[condition]
-    mirrored = (0 - headway_m, 0 - velocity_mps)
-    if mirrored == (headway_m, velocity_mps):
+    numbers = (0 - headway_m, 0 - velocity_mps)
+    if numbers == (headway_m, velocity_mps):
         return condition
-    found = sorted(name for name, numbers in study.conditions.items() if numbers == mirrored)
-    return found[0] if found else f"{condition} mirrored"
+    names = [name for name, known in study.conditions.items() if known == numbers]
+    return min(names, default=f"{condition} mirrored")

@@ -29,51 +29,15 @@ from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.metrics import BOXES, COLLISIONS, GAP
-from merge_runner_analysis.published import (
-    HUMAN_GAP_SD_M,
-    PAIRS,
-    human_outcomes,
-    published,
-)
-from merge_runner_analysis.stats import intervals
-from merge_runner_analysis.stats.contrasts import (
-    corrected,
-    detectable_rate,
-    shared_cells,
-    weighted,
-)
+from merge_runner_analysis.published import HUMAN_GAP_SD_M, PAIRS, human_outcomes, published
+from merge_runner_analysis.stats import contrasts, intervals, measures, regressions
 from merge_runner_analysis.stats.estimate import Estimate
-from merge_runner_analysis.stats.indicators import (
-    ALPHA,
-    TESTED,
-    fits,
-    judge,
-    less_humans,
-)
-from merge_runner_analysis.stats.intervals import LEVEL, melded
-from merge_runner_analysis.stats.measures import (
-    counts,
-    estimate,
-    mean_of,
-    undecided,
-    undecided_note,
-    values,
-)
-from merge_runner_analysis.stats.regressions import (
-    CONDITION,
-    GAP_TERMS,
-    MIN_PAIRS,
-    Array,
-    Regression,
-    Term,
-    by_pairs,
-    gap_design,
-    gap_ols,
-    who_first_firth,
-)
+from merge_runner_analysis.stats.indicators import TESTED, fits, judge, less_humans
+from merge_runner_analysis.stats.regressions import CONDITION, GAP_TERMS, MIN_PAIRS, Regression
 from merge_runner_analysis.stats.score_interval import wilson
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.wording import (
+    ALPHA,
     MEASURES,
     OPEN,
     SHOWN,
@@ -88,8 +52,6 @@ from merge_runner_analysis.wording import (
 PUBLISHED = Fact(Why.PUBLISHED)
 # The level of an interval that lies within a margin where two one-sided tests at 5 % say so.
 WITHIN_LEVEL = 1 - 2 * ALPHA
-
-Ends = tuple[float, float] | None
 
 
 class Both(NamedTuple):
@@ -153,13 +115,13 @@ class Comparison:
 @remembered
 def compared(study: Study, group: Group) -> tuple[Comparison, ...]:
     """Compare a driver with the humans by every measure."""
-    alike = in_human_conditions(group)
+    alike = comparable(group)
     both = Both(alike, study.human, _likeness(study, alike))
     tests = tests_of(both)
     states = decided(both, tests)
     judgements = judge(fits(alike).firth, fits(alike).hc3, robust=True)
-    seen = counted(both)
-    found = []
+    counts = counted(both)
+    comparisons = []
     for name, measure in MEASURES.items():
         statistic = STATISTICS[name]
         own, human = statistic.own(both), statistic.human(both)
@@ -170,8 +132,9 @@ def compared(study: Study, group: Group) -> tuple[Comparison, ...]:
             tested = intervals.at(tests[name], tests[name].level)
             if measure.margin is not None and tested.low is not None:
                 own = replace(own, low=tested.low, high=tested.high)
-        found.append(Comparison(measure, own, human, tested, state, remarks, seen.get(name)))
-    return tuple(found)
+        comparison = Comparison(measure, own, human, tested, state, remarks, counts.get(name))
+        comparisons.append(comparison)
+    return tuple(comparisons)
 
 
 @remembered
@@ -182,63 +145,57 @@ def of_humans(study: Study) -> dict[str, Estimate]:
 
 
 def counted(both: Both) -> dict[str, Counted]:
-    """What a person counts, by measure; nothing is counted where no trial could go so.
+    """Return what a person counts, by measure; nothing where no trial could go so.
 
     Who goes first: the one ahead, and where neither is, the slower one.
     """
     played = both.human.outcomes["condition"].isin(both.group.ended["condition"])
     humans = both.human.outcomes[played]
-    seen = {
-        "collisions": values(replace(both.human, published_outcomes=humans), BOXES).astype(bool),
-        **{name: _went_first(humans, name) for name in ("headway", "velocity")},
-    }
-    own = {name: went_so(both.group, name) for name in seen}
-    return {
-        name: Counted(int(of.sum()), len(of), int(seen[name].sum()), len(seen[name]))
-        for name, of in own.items()
-        if len(of)
-    }
+    crashed = measures.values(replace(both.human, published_outcomes=humans), BOXES).astype(bool)
+    counts = {}
+    for name in ("collisions", "headway", "velocity"):
+        of_humans = crashed if name == "collisions" else _went_first(humans, name)
+        own = went_so(both.group, name)
+        if len(own):
+            counts[name] = Counted(int(own.sum()), len(own), int(of_humans.sum()), len(of_humans))
+    return counts
 
 
 def went_so(group: Group, measure: str) -> pd.Series:
-    """Whether each trial of a driver that could go as a measure counts it did, by its index.
+    """Return whether each trial of a driver went as a measure counts it, of those that could.
 
     Only those in conditions of humans count. Collisions are those by the humans' rule, or by the
     rule that was played where that of the humans does not decide all trials.
     """
-    alike = in_human_conditions(group)
+    alike = comparable(group)
     if measure == "collisions":
-        return values(alike, COLLISIONS if undecided(alike, BOXES) else BOXES).astype(bool)
+        metric = COLLISIONS if measures.undecided(alike, BOXES) else BOXES
+        return measures.values(alike, metric).astype(bool)
     return _went_first(alike.trials, measure)
 
 
 def _went_first(outcomes: pd.DataFrame, measure: str) -> pd.Series:
-    """Whether the one ahead, or side by side the slower one, went first, where there is one."""
+    """Return whether the one ahead, or side by side the slower one, went first."""
     headway, velocity = (np.sign(outcomes[name]) for name in CONDITION)
     expected = headway if measure == "headway" else -velocity.where(headway == 0, 0)
     first = outcomes["merged_first"].map({"left": 1, "right": -1})
     return (first == expected)[first.notna() & (expected != 0)]
 
 
-def in_human_conditions(group: Group) -> Group:
-    """The group's trials in conditions that humans drove: others would pass for a difference."""
+def comparable(group: Group) -> Group:
+    """Return the trials in conditions that humans drove: others would pass for a difference."""
     if group.trials["condition"].isin(HUMAN_CONDITIONS).all():
         return group
     return group.part(lambda trials: trials["condition"].isin(HUMAN_CONDITIONS))
 
 
 def tests_of(both: Both) -> dict[str, Estimate]:
-    """The tests of a driver's measures, corrected over all of them, each with its level.
-
-    Those that cannot be made are missing.
-    """
+    """Return a driver's tests with their levels and p corrected over all, as far as they can be."""
     tests = {
-        name: test
-        for name, statistic in STATISTICS.items()
-        if (test := statistic.tested(both)) is not None
+        name: test for name, statistic in STATISTICS.items() if (test := statistic.tested(both))
     }
     p = {name: test.p for name, test in tests.items() if test.p is not None}
-    p_holm = dict(zip(p, corrected([*p.values()]), strict=True))
+    p_holm = dict(zip(p, contrasts.corrected([*p.values()]), strict=True))
     levels = holm_levels(p, p_holm)
     for name in p:
         level = WITHIN_LEVEL if _within(MEASURES[name], tests[name]) else levels[name]
@@ -247,7 +204,7 @@ def tests_of(both: Both) -> dict[str, Estimate]:
 
 
 def decided(both: Both, tests: Mapping[str, Estimate]) -> dict[str, str]:
-    """The state of each measure that is tested; see ``Measure.rule``."""
+    """Return the state of each measure that is tested, by ``Measure.rule``."""
     judgements = judge(fits(both.group).firth, fits(both.group).hc3, robust=True)
     traits = {name for name, judgement in judgements.items() if judgement.passed}
     states = {}
@@ -258,20 +215,13 @@ def decided(both: Both, tests: Mapping[str, Estimate]) -> dict[str, str]:
         if _within(measure, test):
             states[name] = SHOWN
         elif measure.margin is None and statistic.indicator in traits:
-            states[name] = _strength(statistic, both) if differs else SHOWN
+            own, human = (abs(of(both).value or 0.0) for of in (statistic.own, statistic.human))
+            states[name] = (WEAKER if own < human else STRONGER) if differs else SHOWN
     return states
 
 
-def _strength(statistic: Statistic, both: Both) -> str:
-    """Whether a trait that differs is weaker or stronger than in humans."""
-    own, human = statistic.own(both).value, statistic.human(both).value
-    assert own is not None
-    assert human is not None
-    return WEAKER if abs(own) < abs(human) else STRONGER
-
-
 def _within(measure: Measure, test: Estimate) -> bool:
-    """Whether a value with a margin is inside by two one-sided tests (Schuirmann 1987)."""
+    """Return whether a value is within its margin by two one-sided tests (Schuirmann 1987)."""
     if measure.margin is None:
         return False
     ends = intervals.at(test, WITHIN_LEVEL).bounds()
@@ -279,7 +229,7 @@ def _within(measure: Measure, test: Estimate) -> bool:
 
 
 def holm_levels(p: Mapping[str, float], p_holm: Mapping[str, float]) -> dict[str, float]:
-    """The levels of intervals that exclude no difference where the corrected p are below ALPHA.
+    """Return the levels of intervals that exclude 0 exactly where the corrected p are below ALPHA.
 
     Holm tests the smallest of m p-values at ALPHA / m, the next at ALPHA / (m - 1), and so on; all
     from the first that fails are as at that step.
@@ -290,43 +240,42 @@ def holm_levels(p: Mapping[str, float], p_holm: Mapping[str, float]) -> dict[str
 
 
 def _who_first(both: Both, term: str) -> Estimate | None:
-    """A slope of who goes first: a term of one model of both, in which every term may differ."""
-    less = _less_humans(both.group, both.human)
+    """Return the difference of a slope, of one model of both in which every term may differ."""
+    difference = _less_humans(both.group, both.human)
     alone = fits(both.group).firth, fits(both.human).firth
-    if any(term not in fit.terms for fit in (*alone, less)):
+    if any(term not in fit.terms for fit in (*alone, difference)):
         return None
-    b, se, _, p = astuple(less.terms[term])
-    least = intervals.detectable(se)
-    return Estimate(b, se=se, p=p, detectable=least, ends_at=partial(less.interval, term))
+    b, se, _, p = astuple(difference.terms[term])
+    ends_at, least = partial(difference.interval, term), intervals.detectable(se)
+    return Estimate(b, se=se, p=p, detectable=least, ends_at=ends_at)
 
 
 @remembered
 def _less_humans(group: Group, human: Group) -> Regression:
-    return who_first_firth(group.outcomes, less=human.outcomes)
+    return regressions.who_first_firth(group.outcomes, less=human.outcomes)
 
 
 def _rates(both: Both) -> Estimate | None:
-    """Collisions in percent; None with undecided trials, whose rate has no value."""
+    """Return the difference in percent; None with undecided trials, whose rate has no value."""
     group, human = both.group, both.human
-    cells = shared_cells(group.ended_outcomes, human.outcomes, BOXES.column)
-    if cells is None or undecided(group, BOXES):
+    cells = contrasts.shared_cells(group.ended_outcomes, human.outcomes, BOXES.column)
+    if cells is None or measures.undecided(group, BOXES):
         return None
-    (k, n), humans = counts(group, BOXES), _standardised(both)
+    (k, n), humans, p = measures.counts(group, BOXES), _standardised(both), cells.p
     assert humans.value is not None
     assert humans.weight is not None
-    rates, p = ((k / n, n), (humans.value / 100, humans.weight)), cells.p
+    rate, human_rate = (k / n, n), (humans.value / 100, humans.weight)
 
-    def interval(level: float) -> Ends:
-        low, high = melded(*rates, p, level)
+    def interval(level: float) -> tuple[float, float]:
+        low, high = intervals.melded(rate, human_rate, p, level)
         return 100 * low, 100 * high
 
-    least = detectable_rate(n, humans.n, humans.value / 100)
+    least = contrasts.detectable_rate(n, humans.n, humans.value / 100)
     least = None if least is None else 100 * least
     return Estimate(100 * k / n - humans.value, p=p, detectable=least, ends_at=interval)
 
 
 def _velocity(both: Both) -> Estimate | None:
-    """I4, against its margin."""
     moved = fits(both.group).hc3.moved(both.group.trials)
     if moved is None:
         return None
@@ -334,7 +283,6 @@ def _velocity(both: Both) -> Estimate | None:
 
 
 def _held(both: Both) -> Estimate | None:
-    """I5, against its margin."""
     likeness = both.likeness
     value, se, margin = likeness.value, likeness.se, MEASURES["held"].margin
     if value is None or se is None or margin is None:
@@ -346,7 +294,6 @@ def _held(both: Both) -> Estimate | None:
 
 
 def _likeness(study: Study, group: Group) -> Estimate:
-    """How far accelerations are held, less the humans, in human standard deviations."""
     likeness = less_humans(study, group) if len(group.finished) else None
     if likeness is not None and likeness.value is not None:
         return likeness
@@ -354,27 +301,25 @@ def _likeness(study: Study, group: Group) -> Estimate:
     return Estimate(n=len(group.finished), problem=Fact(why))
 
 
-def _of_fit(human: Group, found: Estimate) -> Estimate:
-    """What follows from the humans' regression of the gap, and where that is from."""
-    if found.problem:
-        return replace(found, problem=Fact(Why.OF_HUMANS, (found.problem,)))
-    return found if _imported(human) else replace(found, source=PUBLISHED)
+def _of_fit(human: Group, estimate: Estimate) -> Estimate:
+    """Return what follows from the humans' regression of the gap, with its source."""
+    if estimate.problem:
+        return replace(estimate, problem=Fact(Why.OF_HUMANS, (estimate.problem,)))
+    return estimate if _imported(human) else replace(estimate, source=PUBLISHED)
 
 
 def _imported(human: Group) -> bool:
-    """Whether so many pairs are imported that their gaps are known."""
     return human.measured and human.finished["pair"].nunique() >= MIN_PAIRS
 
 
 def _gap(group: Group) -> Estimate:
-    """The mean gap of a driver."""
-    found = mean_of(group.finished, GAP.column)
-    why = Why.ONE_GAP if found.n else Why.NO_GAP
-    return replace(found, problem=Fact(why)) if found.se is None else found
+    estimate = measures.mean_of(group.finished, GAP.column)
+    why = Why.ONE_GAP if estimate.n else Why.NO_GAP
+    return replace(estimate, problem=Fact(why)) if estimate.se is None else estimate
 
 
 def human_gap(human: Group, group: Group) -> Estimate:
-    """The humans' mean gap in the conditions of a group's trials with a gap, as these weigh.
+    """Return the humans' mean gap in the conditions of a group's trials with one, as these weigh.
 
     The published mean is moved by what the published regression predicts for these conditions. It
     has the spread of the nine pairs: of their random intercepts, which are shrunken, so that it is
@@ -382,20 +327,19 @@ def human_gap(human: Group, group: Group) -> Estimate:
     """
     gaps = group.finished[group.finished[GAP.column].notna()] if group.measured else None
     if _imported(human):
-        shares = None if gaps is None else gaps["condition"].value_counts()
-        there = human.finished.loc[human.finished[GAP.column].notna(), "condition"]
-        if shares is not None and (lacking := {*shares.index} - {*there}):
-            return Estimate(n=len(there), problem=Fact(Why.NO_GAP_THERE, (len(lacking),)))
-        if shares is not None and not len(shares):
-            shares = None
-        within = there if shares is None else there[there.isin(shares.index)]
-        trials = human.finished.loc[within.index]
-        return mean_of(trials, GAP.column, None if group is human else shares)
+        known = human.finished[human.finished[GAP.column].notna()]
+        if gaps is None or gaps.empty:
+            return measures.mean_of(known, GAP.column)
+        shares = gaps["condition"].value_counts()
+        if lacking := {*shares.index} - {*known["condition"]}:
+            return Estimate(n=len(known), problem=Fact(Why.NO_GAP_THERE, (len(lacking),)))
+        shared = known[known["condition"].isin(shares.index)]
+        return measures.mean_of(shared, GAP.column, None if group is human else shares)
     row = published("paper_ablation_quantitative").query("driver == 'human'").iloc[0]
     fit, outcomes = human_fit(human), human_outcomes().query("status == 'finished'")
     moved = np.zeros(len(GAP_TERMS))
     if gaps is not None and len(gaps):
-        moved = _mean_design(gaps) - _mean_design(outcomes)
+        moved = _gap_design(gaps).mean(axis=0) - _gap_design(outcomes).mean(axis=0)
     assert fit.covariance is not None
     spread = published("human_gap_intercepts")["intercept_m"].std() / len(PAIRS) ** 0.5
     se = float(spread**2 + moved @ fit.covariance @ moved) ** 0.5
@@ -403,25 +347,24 @@ def human_gap(human: Group, group: Group) -> Estimate:
     return replace(intervals.estimate(value, se, len(PAIRS) - 1, fit.n), source=PUBLISHED)
 
 
-def _mean_design(trials: pd.DataFrame) -> Array:
-    return np.asarray(gap_design(*trials[CONDITION].to_numpy(float).T).mean(axis=0))
+def _gap_design(trials: pd.DataFrame) -> regressions.Array:
+    return regressions.gap_design(*trials[CONDITION].to_numpy(float).T)
 
 
 @remembered
 def human_fit(human: Group) -> Regression:
-    """The humans' regression of the gap: by pairs, or as published.
+    """Return the humans' regression of the gap: by pairs, or as published.
 
     The errors that are published follow from the published outcomes and one standard deviation of
     the gaps about their regression; so do the covariances that are not.
     """
     if _imported(human):
-        return by_pairs(gap_ols, human.trials, "gap_m")
+        return regressions.by_pairs(regressions.gap_ols, human.trials, "gap_m")
     rows = published("paper_gap").query("driver == 'human'").set_index("term")
-    finished = human_outcomes().query("status == 'finished'")
-    design = gap_design(*finished[CONDITION].to_numpy(float).T)
+    design = _gap_design(human_outcomes().query("status == 'finished'"))
     covariance = HUMAN_GAP_SD_M**2 * np.asarray(np.linalg.inv(design.T @ design))
     terms = {
-        name: Term(float(rows.at[name, "b"]), float(rows.at[name, "se"]), None, np.nan)
+        name: regressions.Term(float(rows.at[name, "b"]), float(rows.at[name, "se"]), None, np.nan)
         for name in GAP_TERMS
     }
     n = int(rows["n"].iloc[0])
@@ -430,18 +373,16 @@ def human_fit(human: Group) -> Regression:
 
 @remembered
 def _slope(group: Group, term: str) -> Estimate:
-    """A slope of who goes first by Firth's fit."""
     fit = fits(group).firth
     if fit.problem:
         return Estimate(n=fit.n, problem=fit.problem)
-    found, ends = fit.terms[term], fit.interval(term, LEVEL)
-    if ends is None:
-        return Estimate(found.b, n=fit.n, se=found.se, problem=Fact(Why.NO_PROFILE))
-    return Estimate(found.b, *ends, fit.n, found.se)
+    b, se = fit.terms[term].b, fit.terms[term].se
+    if ends := fit.interval(term, intervals.LEVEL):
+        return Estimate(b, *ends, fit.n, se)
+    return Estimate(b, n=fit.n, se=se, problem=Fact(Why.NO_PROFILE))
 
 
 def _headway(fit: Regression) -> Estimate:
-    """The slope of the gap on headway."""
     if fit.problem:
         return Estimate(n=fit.n, problem=fit.problem)
     term = fit.terms[TESTED["I3"][0]]
@@ -449,38 +390,37 @@ def _headway(fit: Regression) -> Estimate:
 
 
 def _moved(fit: Regression, group: Group) -> Estimate:
-    """The largest difference of gaps that relative velocity alone makes in a group's conditions."""
+    """Return the largest difference of gaps that relative velocity alone makes for a group."""
     moved = fit.moved(group.trials)
     if moved is None:
         return Estimate(n=fit.n, problem=fit.problem or Fact(Why.NONE_APART))
-    return Estimate(moved.most, *moved.interval(LEVEL), fit.n)
+    return Estimate(moved.most, *moved.interval(intervals.LEVEL), fit.n)
 
 
 def _collided(group: Group) -> Estimate:
-    """The share of ended trials with a collision by the humans' rule, in percent."""
-    (k, n), cut_off = counts(group, BOXES), undecided(group, BOXES)
+    """Return the share of ended trials with a collision by the humans' rule, in percent."""
+    (k, n), cut_off = measures.counts(group, BOXES), measures.undecided(group, BOXES)
     if not n + cut_off:
         return Estimate(problem=Fact(Why.NONE_ENDED, (group.left_out,)))
-    found, problem = estimate(group, BOXES), undecided_note(group, BOXES)
-    return replace(found, problem=problem, k=k, undecided=cut_off)
+    problem = measures.undecided_note(group, BOXES)
+    return replace(measures.estimate(group, BOXES), problem=problem, k=k, undecided=cut_off)
 
 
 def _standardised(both: Both) -> Estimate:
-    """The humans' collisions in the conditions of a group, which weigh as they do there."""
-    group, human = both.group, both.human
-    played = group.ended_outcomes["condition"].value_counts()  # with those that are undecided
-    there = human.outcomes[human.outcomes["condition"].isin(played.index)]
-    if there.empty:
+    """Return the humans' collisions in the conditions of a group, which weigh as they do there."""
+    played = both.group.ended_outcomes["condition"].value_counts()  # with those undecided
+    outcomes = both.human.outcomes
+    shared = outcomes[outcomes["condition"].isin(played.index)]
+    if shared.empty:
         return Estimate(problem=Fact(Why.NOBODY_THERE))
-    humans = there.groupby("condition")[BOXES.column].agg(["sum", "size"]).astype(int)
-    k, n = humans.to_numpy().T
-    rate, as_good_as = weighted(k, n, played[humans.index].to_numpy(float))
+    counts = shared.groupby("condition")[BOXES.column].agg(["sum", "size"]).astype(int)
+    k, n = counts.to_numpy().T
+    rate, as_good_as = contrasts.weighted(k, n, played[counts.index].to_numpy(float))
     low, high = wilson(rate, as_good_as)
-    return Estimate(100 * rate, 100 * low, 100 * high, len(there), weight=as_good_as)
+    return Estimate(100 * rate, 100 * low, 100 * high, len(shared), weight=as_good_as)
 
 
 def _goes_first(indicator: str) -> Statistic:
-    """The slope of who goes first that an indicator tests."""
     term = TESTED[indicator][0]
     return Statistic(
         lambda both: _slope(both.group, term),

@@ -106,21 +106,20 @@ def finished_tables(
     Raises UsageError for an unknown name.
     """
     wanted, selection = _valid(names), selection or Selection()
-    chosen = study.options if study else selection.key(db)
+    options = study.options if study else selection.key(db)
     state = study.state if study else present_state(db)
-    kept = finished(db, state, chosen, wanted)
-    found = {name: from_text(text) for name, text in kept.items()}
+    tables = {name: from_text(text) for name, text in finished(db, state, options, wanted).items()}
     # A name may be given twice; the table is computed once.
-    missing = [name for name in dict.fromkeys(wanted) if name not in found]
+    missing = [name for name in dict.fromkeys(wanted) if name not in tables]
     if missing:
         from merge_runner_analysis.study import Study
 
         study = study or Study(db, selection)
         made = dict(zip(missing, make_tables(study, missing), strict=True))
         # The state is the one before the study was read: trials stored since then outdate it.
-        keep_finished(db, study.state, chosen, {name: to_text(made[name]) for name in missing})
-        found |= made
-    return [found[name] for name in wanted]
+        keep_finished(db, study.state, options, {name: to_text(made[name]) for name in missing})
+        tables |= made
+    return [tables[name] for name in wanted]
 
 
 def table(study: Study | Path | str, name: str, selection: Selection | None = None) -> pd.DataFrame:

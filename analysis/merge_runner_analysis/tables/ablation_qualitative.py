@@ -49,10 +49,10 @@ def ablation_qualitative(study: Study) -> Table:
 
 
 def _group_row(study: Study, group: Group) -> Row:
-    found = score(study, group)
+    judged = score(study, group)
     values: dict[str, Value] = {"n": len(group.ended_outcomes)}
     for name in INDICATORS:
-        values |= verdict_values(found, name, f"{name.lower()}_")
-    values |= verdict_values(found, SCORE, "score_") | ceiling_values(group, found, SCORE)
-    remarks = reasons(found, *INDICATORS), no_ceiling(group), outcomes_note(group)
+        values |= verdict_values(judged, name, f"{name.lower()}_")
+    values |= verdict_values(judged, SCORE, "score_") | ceiling_values(group, judged, SCORE)
+    remarks = reasons(judged, *INDICATORS), no_ceiling(group), outcomes_note(group)
     return row_of(group, values, *remarks, rests_on=ENDED)

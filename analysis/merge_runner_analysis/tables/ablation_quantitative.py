@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 from merge_runner_analysis.grouping import Group
-from merge_runner_analysis.metrics import (
-    INTERVALS,
-    RULES_NOTE,
-    Metric,
-    shown_in,
-)
+from merge_runner_analysis.metrics import INTERVALS, RULES_NOTE, Metric, shown_in
 from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.measures import (
     estimate_or_reference,
@@ -24,6 +19,7 @@ from merge_runner_analysis.tables.model import (
     Kind,
     Optional,
     Table,
+    Value,
     interval,
     row_of,
 )
@@ -40,48 +36,44 @@ def metric_table(name: str, groups: list[Group], place: str, *notes: str) -> Tab
     """A row for each group, with the metrics that a place of ``metrics.SHOWN`` has."""
     metrics = shown_in(place)
     columns = [*GROUP_COLUMNS, Column("n", "n", "count", "trials that ended")]
-    for one in metrics:
-        kind: Kind = "percent" if one.rate else "number"
-        counts = one.column if one.rate else ""
-        meaning, rests_on = one.meaning, ""
-        if one.estimator == "median":
-            of, rests_on = f"{one.trials} trials that have the measure", one.column
+    for metric in metrics:
+        kind: Kind = "percent" if metric.rate else "number"
+        counts = metric.column if metric.rate else ""
+        meaning, rests_on = metric.meaning, ""
+        if metric.estimator == "median":
+            of, rests_on = f"{metric.trials} trials that have the measure", metric.column
             meaning = f"median over the {of}: {meaning}"
-            columns.append(Optional(f"{one.name}_n", "n", "count", of, rests_on=rests_on))
+            columns.append(Optional(f"{metric.name}_n", "n", "count", of, rests_on=rests_on))
         columns += [
-            Column(one.name, one.heading, kind, meaning, counts, rests_on=rests_on),
-            interval(f"{one.name}_ci", f"of {one.label}", rests_on=rests_on),
+            Column(metric.name, metric.heading, kind, meaning, counts, rests_on=rests_on),
+            interval(f"{metric.name}_ci", f"of {metric.label}", rests_on=rests_on),
         ]
     rows = []
     for group in groups:
-        found, remarks = measured(group, metrics)
-        values = {name: one.value for name, one in found.items()}
-        intervals = {f"{name}_ci": one.bounds() for name, one in found.items()}
-        sizes = {
-            f"{one.name}_n": estimate.n or None
-            for one in metrics
-            if one.estimator == "median" and (estimate := found.get(one.name))
-        }
-        cells = {"n": len(group.ended_outcomes), **sizes, **values, **intervals}
-        rows.append(row_of(group, cells, *remarks, rests_on=ENDED))
+        estimates, remarks = measured(group, metrics)
+        values: dict[str, Value] = {"n": len(group.ended_outcomes)}
+        for measure, estimate in estimates.items():
+            values |= {measure: estimate.value, f"{measure}_ci": estimate.bounds()}
+            values[f"{measure}_n"] = estimate.n or None
+        rows.append(row_of(group, values, *remarks, rests_on=ENDED))
     return Table(name, columns, rows, (f"intervals: {INTERVALS}", *notes))
 
 
 def measured(group: Group, metrics: list[Metric]) -> tuple[dict[str, Estimate], list[object]]:
-    """What a group comes to by each metric, and remarks on those that are published or missing."""
-    found: dict[str, Estimate] = {}
+    """Return a group's estimates by metric, and remarks on those that are published or missing."""
+    estimates: dict[str, Estimate] = {}
     remarks: list[object] = [outcomes_note(group)]
     reasons: dict[str, list[str]] = {}
     for metric in metrics:
-        one = estimate_or_reference(group, metric)
-        if one is None:
+        estimate = estimate_or_reference(group, metric)
+        if estimate is None:
             remarks.append(no_human_value(metric))
             continue
-        found[metric.name] = one
-        if one.source:
-            reasons.setdefault(str(one.source), []).append(metric.heading)
-        elif one.value is None and one.bounds() is None:
+        estimates[metric.name] = estimate
+        if estimate.source:
+            reasons.setdefault(str(estimate.source), []).append(metric.heading)
+        elif estimate.value is None and estimate.bounds() is None:
             reasons.setdefault("no trial has it", []).append(metric.heading)
         else:
             remarks.append(undecided_note(group, metric))
-    return found, [*remarks, *(f"{', '.join(names)}: {why}" for why, names in reasons.items())]
+    return estimates, [*remarks, *(f"{', '.join(names)}: {why}" for why, names in reasons.items())]

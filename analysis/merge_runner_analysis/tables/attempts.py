@@ -9,7 +9,6 @@ from merge_runner_analysis.provenance import tally
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.model import GROUP_COLUMNS, STORED, Column, Table, row_of
 
-NO_CALLS = "no call: this driver asks no model, or its calls are not in the database"
 # Failures with a share of the answers beside their number; the others are malformed answers, and
 # have a column where they occur.
 FAILURES = {"refused": "refusal", "truncated": "truncated", "empty": "empty"}
@@ -35,12 +34,12 @@ SHARES = {"retried", "lost", *FAILURES, "invalid", NO_DECISION, "fallback"}
 
 def attempts(study: Study) -> Table:
     """A row per driver and variant: trials, calls, attempts, and what went wrong with them."""
-    found = {group: tally(study, group.stored) for group in study.played}
+    tallies = {group: tally(study, group.stored) for group in study.played}
     known = {"answers", "decisions", *MEANINGS, *FAILURES.values()}
-    reasons = dict.fromkeys(name for one in found.values() for name in sorted({*one} - known))
-    names = [
-        name for name in MEANINGS if name != NO_DECISION or any(one[name] for one in found.values())
-    ]
+    reasons = dict.fromkeys(name for of in tallies.values() for name in sorted({*of} - known))
+    names = [*MEANINGS]
+    if not any(of[NO_DECISION] for of in tallies.values()):
+        names.remove(NO_DECISION)
     names[names.index("invalid") : names.index("invalid")] = reasons
     columns = [column for name in names for column in _columns(name)]
     return Table(
@@ -48,7 +47,7 @@ def attempts(study: Study) -> Table:
         (*GROUP_COLUMNS, *columns),
         [
             row_of(group, _values(columns, counts), _note(counts), rests_on=STORED)
-            for group, counts in found.items()
+            for group, counts in tallies.items()
         ],
         (
             "a call is asked at one decision, in one or more attempts; retried is of all attempts, "
@@ -59,7 +58,6 @@ def attempts(study: Study) -> Table:
 
 
 def _columns(name: str) -> list[Column]:
-    """A column of counts, and one of their shares."""
     meaning = MEANINGS.get(name, f"answers without a valid plan: {name}")
     counts = "" if name == "trials" else FAILURES.get(name, name)
     count = Column(name, name.replace("_", " "), "count", meaning, counts)
@@ -80,5 +78,7 @@ def _values(columns: list[Column], counts: Counter[str]) -> dict[str, int | floa
 def _note(counts: Counter[str]) -> str:
     if counts["answers"]:
         return ""
-    decided = "" if counts["decisions"] else "; no decision is stored"
-    return ("no call was answered" if counts["calls"] else NO_CALLS) + decided
+    note = "no call: this driver asks no model, or its calls are not in the database"
+    if counts["calls"]:
+        note = "no call was answered"
+    return note if counts["decisions"] else f"{note}; no decision is stored"

@@ -39,13 +39,13 @@ BY_PAIR = ", errors by pair"
 
 def row_of_term(group: Group, term: str, fit: Fit, rests_on: str, note: object = "") -> Row:
     """The row of a term by one of a group's fits, of the trials with a value in this column."""
-    item, label, found = fit
+    item, label, regressions = fit
     values: dict[str, Value] = {
         "term": TERM_NAMES[term],
         "driver": group.label + label,
-        "n": found[""].n,
+        "n": regressions[""].n,
     }
-    for prefix, regression in found.items():
+    for prefix, regression in regressions.items():
         if term in regression.terms:
             b, se, statistic, p = astuple(regression.terms[term])
             # A table shows one of z and t.
@@ -53,10 +53,11 @@ def row_of_term(group: Group, term: str, fit: Fit, rests_on: str, note: object =
             values |= {prefix + name: value for name, value in named.items()}
     # I4 claims that these effects are absent. A large p is no evidence of that, so equivalence is
     # tested (Schuirmann 1987).
-    if "hc3_" in found and term == "abs_relative_velocity":
-        values["equivalence_p"] = found["hc3_"].equivalence_p
-        values["velocity_p"] = found["hc3_"].velocity_p
-    remarks = dict.fromkeys(fact for one in found.values() for fact in (one.problem, one.remark))
+    if "hc3_" in regressions and term == "abs_relative_velocity":
+        values["equivalence_p"] = regressions["hc3_"].equivalence_p
+        values["velocity_p"] = regressions["hc3_"].velocity_p
+    fits = regressions.values()
+    remarks = dict.fromkeys(fact for fitted in fits for fact in (fitted.problem, fitted.remark))
     return row_of(group, values, *remarks, note, item=item + term, rests_on=rests_on)
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
+from itertools import chain
 from math import isinf
 
 from merge_runner.study.crossing import PROMPT
@@ -25,21 +26,6 @@ from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Val
 from merge_runner_analysis.wording import SAME_TRIALS, note_of
 
 TEST = "of the test of Mantel and Haenszel, or of Welch's"
-HOW = (
-    "compared within the cells that both have, a condition with one level of each other factor: "
-    "shares by the test of Mantel and Haenszel with the score interval that agrees with it, means "
-    "by Welch's test in a model with a level for each cell"
-)
-CROSSED = (
-    "an interaction (×) is the difference of a level minus that at the reference of the other "
-    "factor, in the cells that all four have"
-)
-FAMILIES = (
-    "p, corrected: by Holm in two families. The effects of factors on {primary}, the primary "
-    "measure, are one, without those of the model; all others are the other one"
-)
-DETECTABLE = "detectable: found at p < .05, before correction, with power .8"
-SAME_VALUE = "the same in every trial, so that there is nothing to test"
 UNTESTED = (
     "no test without cells that all have, spread within cells, or with undecided trials, trials of "
     "several studies or the same ones at two levels"
@@ -101,16 +87,13 @@ def comparison(study: Study, one: str, other: str) -> Table:
 
 
 def _compared_row(study: Study, one: Effect) -> Row:
-    values: dict[str, Value] = {
-        "measure": one.metric.heading,
-        **_tested(one),
-    }
+    values: dict[str, Value] = {}
     sides = (one.level, one.at_level), (one.reference, one.at_reference)
     for of, (level, own) in zip(SIDES, sides, strict=True):
         shown = level_estimate(study, level, one.metric) if own.value is None else own
         k = shown.k if one.metric.rate else None  # that of valid replies counts replies
         values |= {f"k{of}": k, f"n{of}": shown.n, f"value{of}": shown.value}
-    return Row(one.id, one.groups, values, problem(study, one), one.metric.column, (), one.left_out)
+    return _row(study, one, values)
 
 
 def _is_shown(one: Effect) -> bool:
@@ -118,7 +101,9 @@ def _is_shown(one: Effect) -> bool:
     return one.metric.estimator != "median" and not (one.across and one.difference.p is None)
 
 
-def _row(study: Study, one: Effect) -> Row:
+def _row(study: Study, one: Effect, others: dict[str, Value] | None = None) -> Row:
+    """Return the row of an effect, with ``others`` beside or instead of its values."""
+    difference = one.difference
     values: dict[str, Value] = {
         "at": _place(one.level, one.across),
         "factor": one.factor,
@@ -128,58 +113,57 @@ def _row(study: Study, one: Effect) -> Row:
         "measure": one.metric.heading,
         "estimate": one.at_level.value,
         "estimate_reference": one.at_reference.value,
-        **_tested(one),
+        "difference": difference.value,
+        "ci": difference.bounds(),
+        "p": difference.p,
+        "p_corrected": one.p_corrected,
+        "detectable": difference.detectable,
         "n": one.at_level.n,
         "n_reference": one.at_reference.n,
         "primary": "primary" if one.primary else None,
     }
-    return Row(one.id, one.groups, values, problem(study, one), one.metric.column, (), one.left_out)
+    return Row(
+        one.id,
+        one.groups,
+        values | (others or {}),
+        problem(study, one),
+        one.metric.column,
+        copies=one.left_out,
+    )
 
 
 def _place(level: Level, across: tuple[Level, Level] | None) -> str:
-    """Where a level stands that is shown by another factor, and of an interaction what with."""
+    """Return where a level stands that is shown by another factor, and of an interaction both."""
     at = level.at.partition("=")[2]
     return f"{at} - {across[0].at.partition('=')[2]}" if across else at
 
 
-def _tested(one: Effect) -> dict[str, Value]:
-    found = one.difference
-    return {**_difference(one), "p_corrected": one.p_corrected, "detectable": found.detectable}
-
-
-def _difference(one: Effect) -> dict[str, Value]:
-    found = one.difference
-    return {"difference": found.value, "ci": found.bounds(), "p": found.p}
-
-
 def problem(study: Study, one: Effect) -> str:
     """Why an effect has no test, or which cells its test leaves out."""
-    levels = (one.level, one.reference, *(one.across or ()))
-    copies, shared = copied_of_shared(study, *levels)
-    said = [note_of(undecided_note(level.pooled, one.metric)) for level in levels]
+    copies, shared = copied_of_shared(study, *one.levels)
+    remarks = [note_of(undecided_note(level.pooled, one.metric)) for level in one.levels]
     column = one.metric.column
-    if not one.across and any(level.pooled.trials[column].isna().all() for level in levels):
-        said.append(f"{one.metric.heading}: a level has no trial with this measure")
+    if not one.across and any(level.pooled.trials[column].isna().all() for level in one.levels):
+        remarks.append(f"{one.metric.heading}: a level has no trial with this measure")
     elif copies and copies == shared:
-        said.append(SAME_TRIALS)
+        remarks.append(SAME_TRIALS)
     elif one.difference.value is None:
-        said.append(f"{one.metric.heading}: {UNTESTED}")
+        remarks.append(f"{one.metric.heading}: {UNTESTED}")
     elif one.difference.p is None and not one.difference.se and one.metric.estimator != "median":
-        said.append(SAME_VALUE)
+        remarks.append("the same in every trial, so that there is nothing to test")
     elif copies:
-        said.append(
+        remarks.append(
             f"the difference leaves out {copies} of {shared} shared cells, those with the same "
             "trials at both levels"
         )
     elif one.metric.rate and one.difference.p is not None and one.difference.detectable is None:
-        said.append(f"{one.metric.heading}: so few trials can show no difference, however large")
+        remarks.append(f"{one.metric.heading}: so few trials can show no difference, however large")
     if one.metric.trials == "ended" and one.metric.value not in JUDGED:
-        said += [_left_out(level, one.metric) for level in levels]
-    return note_of(*dict.fromkeys(said))
+        remarks += [_left_out(level, one.metric) for level in one.levels]
+    return note_of(*dict.fromkeys(remarks))
 
 
 def _left_out(level: Level, metric: Metric) -> str:
-    """How many trials of a level have no value, as of calls whose price is not known."""
     ended = level.pooled.ended
     lacking = int(ended[metric.column].isna().sum())
     if lacking in (0, len(ended)):
@@ -191,25 +175,28 @@ def _left_out(level: Level, metric: Metric) -> str:
 
 
 def _notes(study: Study, by: str) -> Iterator[str]:
-    found = [one for one in effects(study, by) if one.difference.p is not None]
+    tested = any(one.difference.p is not None for one in effects(study, by))
     every = levels_by_factor(study)
-    if not found and not every:
+    if not tested and not every:
         yield "the trials of judged drivers differ in no factor"
         return
-    yield f"levels are {HOW}. {CROSSED}"
-    if found:
-        yield f"{FAMILIES.format(primary=primary(study).heading)}. {DETECTABLE}"
-    yield from _copies(every)
-    yield from (f"{levels[0].factor}{levels[0].mark}: {balance(study, levels)}" for levels in every)
-    yield RULES_NOTE
-
-
-def _copies(found: Sequence[Sequence[Level]]) -> Iterator[str]:
-    """Which levels have copies of trials from levels of other factors."""
+    yield (
+        "levels are compared within the cells that both have, a condition with one level of each "
+        "other factor: shares by the test of Mantel and Haenszel with the score interval that "
+        "agrees with it, means by Welch's test in a model with a level for each cell. an "
+        "interaction (×) is the difference of a level minus that at the reference of the other "
+        "factor, in the cells that all four have"
+    )
+    if tested:
+        yield (
+            "p, corrected: by Holm in two families. The effects of factors on "
+            f"{primary(study).heading}, the primary measure, are one, without those of the model; "
+            "all others are the other one. detectable: found at p < .05, before correction, with "
+            "power .8"
+        )
     counts = [
         f"{level.id}: {level.pooled.repeated} of {len(level.pooled.stored.trials)}"
-        for levels in found
-        for level in levels
+        for level in chain.from_iterable(every)
         if level.pooled.repeated
     ]
     if counts:
@@ -217,23 +204,28 @@ def _copies(found: Sequence[Sequence[Level]]) -> Iterator[str]:
             f"{', '.join(counts)} trials went as others of the level to the last state, at another "
             "level of a factor that their drivers do not read: each counts once, in one cell"
         )
+    yield from (f"{levels[0].factor}{levels[0].mark}: {balance(study, levels)}" for levels in every)
+    yield RULES_NOTE
 
 
 def factors(study: Study) -> Table:
-    """The effects with a row for every level, also the references."""
+    """Return the effects with a row for every level, also the references."""
     by = study.selection.by or ""
     rows: dict[str, Row] = {}
     for one in effects(study, by):
         if not one.across:
             name = f"{one.reference.id}/{one.metric.name}"
-            if name not in rows:
-                rows[name] = _level_row(study, name, one, one.reference)
+            rows.setdefault(name, _level_row(study, name, one, one.reference))
         if by or not one.across:
             row = _level_row(study, one.id, one, one.level)
-            different = _difference(one) | {"p_holm": one.p_corrected}
-            different["difference_ci"] = different.pop("ci")
-            note = problem(study, one)
-            rows[one.id] = replace(row, values={**row.values, **different}, note=note)
+            difference = {
+                "difference": one.difference.value,
+                "difference_ci": one.difference.bounds(),
+                "p": one.difference.p,
+                "p_holm": one.p_corrected,
+            }
+            values = {**row.values, **difference}
+            rows[one.id] = replace(row, values=values, note=problem(study, one))
     return Table(
         "factors",
         (
@@ -260,7 +252,6 @@ def factors(study: Study) -> Table:
 
 
 def _level_row(study: Study, name: str, one: Effect, level: Level) -> Row:
-    """A level's own value in the measure of an effect, of all its trials."""
     own = Estimate() if one.across else level_estimate(study, level, one.metric)
     values: dict[str, Value] = {
         "at": _place(level, one.across),
@@ -286,25 +277,18 @@ def contrasts(study: Study) -> Table:
         if one.across or one.level.factor != PROMPT or one.metric not in shown:
             continue
         group, other = (known[level.groups[0]] for level in (one.level, one.reference))
-        found = one.difference
-        if found.p is None:
+        if one.difference.p is None:
             continue
+        freedom = one.difference.freedom
         values: dict[str, Value] = {
             "driver": group.label,
             "setting": group.setting,
             "reference": other.setting,
-            "measure": one.metric.heading,
-            **_difference(one),
             "p_holm": one.p_corrected,
-            "detectable": found.detectable,
-            "n": one.at_level.n,
-            "n_reference": one.at_reference.n,
-            "freedom": None if isinf(found.freedom) else found.freedom,
+            "freedom": None if isinf(freedom) else freedom,
         }
         name = f"{group.id}/{other.setting}/{one.metric.name}"
-        rows.append(
-            Row(name, one.groups, values, problem(study, one), one.metric.column, (), one.left_out)
-        )
+        rows.append(replace(_row(study, one, values), id=name))
     return Table(
         "contrasts",
         (
@@ -340,12 +324,12 @@ def _same_as_reference(study: Study) -> Iterator[str]:
 
 
 def balance(study: Study, levels: list[Level]) -> str:
-    """Whether all levels of a factor have the same cells."""
-    found = {level.name: cells_seen(study, level) for level in levels}
-    every = set().union(*found.values())
+    """Return whether all levels of a factor have the same cells."""
+    cells_of = {level.name: cells_seen(study, level) for level in levels}
+    every = set().union(*cells_of.values())
     lacking = [
         f"{name} lacks {len(every) - len(cells)} of {len(every)} cells"
-        for name, cells in found.items()
+        for name, cells in cells_of.items()
         if len(cells) < len(every)
     ]
     if lacking:

@@ -9,16 +9,9 @@ import pandas as pd
 
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.published import citation, published
+from merge_runner_analysis.stats import first_action as first
 from merge_runner_analysis.stats.estimate import Estimate
-from merge_runner_analysis.stats.first_action import (
-    HOLD_MPS2,
-    exchange_rate,
-    first_actions,
-    human_exchange_rate,
-    repeats_itself,
-    seats,
-    slope,
-)
+from merge_runner_analysis.stats.first_action import HOLD_MPS2, human_exchange_rate
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.model import (
     ENDED,
@@ -36,28 +29,13 @@ NO_ACTION = (
     "no trial that ended has a first action of both: none did, or with control_start = "
     '"own_exit" one driver acts while the other is in its tunnel yet'
 )
-REPEATS = (
-    "{name} declares no chance, and does the same first in all repetitions of a situation: each "
-    "situation counts once"
-)
-UNBOUNDED = "exchange rate: no finite interval, as the slope on headway may be 0 (Fieller 1954)"
-ONLY_ASKED = (
-    "asked without the loop (`merge-runner sweep --first`), in {trials} trials that end before a "
-    "second decision"
-)
 # By the sign of the own relative velocity.
 VELOCITIES = {-1: "slower", 0: "equal", 1: "faster"}
 FIRST_ACTIONS = (
     Optional("n", "n", "count", "first actions: two a trial, one of a mixed pair"),
     *(
-        Optional(
-            f"mean_{name}",
-            name,
-            "number",
-            f"mean (m/s²) where the own velocity is {name}",
-            digits=3,
-        )
-        for name in VELOCITIES.values()
+        Optional(f"mean_{x}", x, "number", f"mean (m/s²) where the own velocity is {x}", digits=3)
+        for x in VELOCITIES.values()
     ),
     Optional("brake_percent", "brake (%)", "percent", f"below -{HOLD_MPS2} m/s²", digits=1),
     Optional("hold_percent", "hold (%)", "percent", f"within {HOLD_MPS2} m/s² of 0", digits=1),
@@ -94,13 +72,13 @@ def _first_rows(study: Study, group: Group) -> Iterator[Row]:
     if group is study.human and not study.complete:
         yield _published_row(group)
         return
-    for seat in seats(group):
-        rows = first_actions(study, seat)
-        rate = human_exchange_rate() if group is study.human else exchange_rate(rows)
+    for seat in first.seats(group):
+        rows = first.first_actions(study, seat)
+        rate = human_exchange_rate() if group is study.human else first.exchange_rate(rows)
         values: dict[str, Value] = {"driver": seat.name, "n": len(rows)}
         if len(rows):
             action, sign = rows["first_mps2"], np.sign(rows["velocity_mps"].round(6))
-            means, fitted = action.groupby(sign).mean(), slope(rows)
+            means, fitted = action.groupby(sign).mean(), first.slope(rows)
             values |= {f"mean_{VELOCITIES[at]}": float(mean) for at, mean in means.items()}
             values |= {
                 "brake_percent": float(100 * (action < -HOLD_MPS2).mean()),
@@ -110,23 +88,32 @@ def _first_rows(study: Study, group: Group) -> Iterator[Row]:
                 **_estimate("slope", fitted),
                 **_estimate("exchange_rate", rate),
             }
-        remarks = (
-            "" if len(rows) else NO_ACTION,
-            REPEATS.format(name=seat.name) if repeats_itself(study, seat) else "",
-            UNBOUNDED if len(rows) and rate and rate.low is None else "",
-            ONLY_ASKED.format(trials=len(group.ended)) if group in study.asked else "",
-        )
+        remarks = [] if len(rows) else [NO_ACTION]
+        if first.repeats_itself(study, seat):
+            remarks.append(
+                f"{seat.name} declares no chance, and does the same first in all repetitions of a "
+                "situation: each situation counts once"
+            )
+        if len(rows) and rate and rate.low is None:
+            remarks.append(
+                "exchange rate: no finite interval, as the slope on headway may be 0 (Fieller 1954)"
+            )
+        if group in study.asked:
+            remarks.append(
+                f"asked without the loop (`merge-runner sweep --first`), in {len(group.ended)} "
+                "trials that end before a second decision"
+            )
         yield row_of(group, values, *remarks, item=seat.side, rests_on=ENDED)
 
 
 def _published_row(group: Group) -> Row:
     rows, known = published(FIRST_FILE), _published_slope()
     weights = rows["n"] / rows["n"].sum()
-    names = np.sign(rows["relative_velocity_mps"]).map(VELOCITIES)
+    names = "mean_" + np.sign(rows["relative_velocity_mps"]).map(VELOCITIES)
     shares = {"brake": "slow", "hold": "hold", "go": "go"}
     values: dict[str, Value] = {
         "n": int(rows["n"].sum()),
-        **{f"mean_{name}": mean for name, mean in zip(names, rows["mean_mps2"], strict=True)},
+        **dict(zip(names, rows["mean_mps2"], strict=True)),
         **{
             f"{name}_percent": float((weights * rows[f"{of}_percent"]).sum())
             for name, of in shares.items()

@@ -64,10 +64,9 @@ def render(tables: Sequence[Table], form: TableFormat, width: int | None = None)
 
 
 def _grid(table: Table) -> tuple[list[Column], list[list[str]]]:
-    """The columns that are shown; their headings, and each row, as a reader sees them."""
-    shown = shown_columns(table)
-    rows = [[shown_value(c, row.values.get(c.name)) for c in shown] for row in table.rows]
-    return shown, [[column.heading for column in shown], *rows]
+    columns = shown_columns(table)
+    rows = [[shown_value(c, row.values.get(c.name)) for c in columns] for row in table.rows]
+    return columns, [[column.heading for column in columns], *rows]
 
 
 def as_text(table: Table, width: int | None = None) -> str:
@@ -81,29 +80,28 @@ def as_text(table: Table, width: int | None = None) -> str:
     if hidden := [column.name for place, column in enumerate(columns) if place not in fitting]:
         number = f"{len(hidden)} column{'s' * (len(hidden) > 1)}"
         notes.insert(0, f"{number} hidden: --wide shows {', '.join(hidden)}")
-    lines = []
-    for cells in grid if columns else ():
-        texts = []
-        for place in fitting:
-            blank = " " * (widths[place] - cell_len(cells[place]))
-            text = columns[place].kind == "text"
-            texts.append(cells[place] + blank if text else blank + cells[place])
-        lines.append(BETWEEN.join(texts))
-    lines[1:1] = ["─" * max(map(cell_len, lines))] if lines else []
-    said = [table.heading, *(f"  {note}" for note in notes)]
+
+    def padded(cell: str, place: int) -> str:
+        blank = " " * (widths[place] - cell_len(cell))
+        return cell + blank if columns[place].kind == "text" else blank + cell
+
+    lines = [BETWEEN.join(padded(cells[place], place) for place in fitting) for cells in grid]
+    if columns:
+        lines.insert(1, "─" * max(map(cell_len, lines)))
+    else:
+        lines = []
+    texts = [table.heading, *(f"  {note}" for note in notes)]
     if width is not None:
-        said = [
-            textwrap.fill(text, width, subsequent_indent="    ", break_on_hyphens=False)
-            for text in said
-        ]
-    return "\n".join([said[0], *(line.rstrip() for line in lines), *said[1:]])
+        wrap = partial(textwrap.fill, subsequent_indent="    ", break_on_hyphens=False)
+        texts = [wrap(text, width) for text in texts]
+    return "\n".join([texts[0], *(line.rstrip() for line in lines), *texts[1:]])
 
 
 def _fitting(columns: Sequence[Column], widths: Sequence[int], width: int) -> list[int]:
     """The places of the columns that fit a terminal; of equal weight, the right ones go first."""
     fitting = [*range(len(columns))]
     for place in sorted(fitting, key=lambda place: (_weight(columns[place]), -place))[:-1]:
-        if sum(widths[each] + len(BETWEEN) for each in fitting) - len(BETWEEN) <= width:
+        if sum(widths[shown] + len(BETWEEN) for shown in fitting) - len(BETWEEN) <= width:
             break
         fitting.remove(place)
     return fitting

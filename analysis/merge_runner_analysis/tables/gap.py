@@ -24,7 +24,7 @@ from merge_runner_analysis.tables.model import Column, Optional, Row, Table, row
 def gap(study: Study) -> Table:
     """Table IV: linear regression of the gap (m) on |h|, |dv| and h*dv."""
     mean100 = "random intercept per pair, gap where the mean position reaches 100 m"
-    found = {group: _fits(group) for group in study.measured}
+    fitted = {group: _fits(group) for group in study.measured}
     return Table(
         "gap",
         (
@@ -41,8 +41,8 @@ def gap(study: Study) -> Table:
             for term in GAP_TERMS
             for group in study.groups
             for row in (
-                [row_of_term(group, term, fit, GAP.column) for fit in found[group]]
-                if group in found
+                [row_of_term(group, term, fit, GAP.column) for fit in fitted[group]]
+                if group in fitted
                 else [_published(group, term)]
             )
         ],
@@ -60,18 +60,17 @@ def gap(study: Study) -> Table:
 def _fits(group: Group) -> list[Fit]:
     """By least squares and with HC3 errors, the humans also with errors by pair."""
     # HC3 errors (MacKinnon and White 1985) hold for unequal variances.
-    found: list[Fit] = [("", "", {"": fits(group).ols, "hc3_": fits(group).hc3})]
+    every: list[Fit] = [("", "", {"": fits(group).ols, "hc3_": fits(group).hc3})]
     if not group.setting:
         mean100 = "gap_mean100_m"  # the definition of the gap that the published mixed model uses
         paired = by_pairs(gap_ols, group.trials, "gap_m")
         of_mean = by_pairs(lambda trials: gap_ols(trials, mean100), group.trials, mean100)
-        found.append(("clustered/", BY_PAIR, {"": paired}))
-        found.append(("clustered-mean100/", f"{BY_PAIR}, mean at 100 m", {"": of_mean}))
-    return found
+        every.append(("clustered/", BY_PAIR, {"": paired}))
+        every.append(("clustered-mean100/", f"{BY_PAIR}, mean at 100 m", {"": of_mean}))
+    return every
 
 
 def _published(group: Group, term: str) -> Row:
-    """The humans' row of Table IV as the paper prints it."""
     printed = published("paper_gap").query("driver == 'human' and term == @term").iloc[0]
     values = {name: printed_value(printed[name]) for name in ("b", "se", "t", "p")}
     note = f"published values, no human traces are imported ({citation('paper_gap')})"

@@ -5,14 +5,7 @@ from __future__ import annotations
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.metrics import RULES_NOTE, Metric, shown_in
 from merge_runner_analysis.published import HUMAN_GAP_SD_M
-from merge_runner_analysis.stats.indicators import (
-    Score,
-    disagree,
-    gains,
-    mean_gain,
-    score,
-    total,
-)
+from merge_runner_analysis.stats.indicators import Score, disagree, gains, mean_gain, score, total
 from merge_runner_analysis.stats.measures import outcomes_note
 from merge_runner_analysis.stats.regressions import GAP_MARGIN_M
 from merge_runner_analysis.study import Study
@@ -48,7 +41,6 @@ NOTES = (
     "move. Robust: the 95 % interval of the mean gain lies above 0. Vehicles that took no action "
     "do not count",
 )
-NO_CEILING = "not all conditions of the humans were played: no ceiling"
 
 
 def indicators(study: Study) -> Table:
@@ -88,15 +80,15 @@ def ceiling_columns(paper: str, robust: str) -> list[Column]:
 
 
 def _verdict_row(study: Study, group: Group, name: str) -> Row:
-    found = score(study, group)
+    judged = score(study, group)
     trials = group.outcomes if name in OF_OUTCOMES else group.trials
     values: dict[str, Value] = {
         "indicator": name,
-        **verdict_values(found, name),
-        **ceiling_values(group, found, name),
+        **verdict_values(judged, name),
+        **ceiling_values(group, judged, name),
         "n": int((trials["status"] == "finished").sum()),
     }
-    remarks: list[object] = [reasons(found, name)]
+    remarks: list[object] = [reasons(judged, name)]
     # I5 compares with human traces directly and has no ceiling.
     if name != "I5":
         remarks.append(no_ceiling(group))
@@ -110,22 +102,21 @@ def _verdict_row(study: Study, group: Group, name: str) -> Row:
 
 
 def _metric_row(group: Group, metric: Metric) -> Row:
-    found, remarks = measured(group, [metric])
+    estimates, remarks = measured(group, [metric])
     values: dict[str, Value] = {"indicator": metric.heading}
-    one = found.get(metric.name)
-    if one:
-        values |= {"value": one.value, "interval": one.bounds()}
     rests_on = FINISHED
-    if one and not one.source:
-        values["n"], rests_on = one.n, metric.column
+    if estimate := estimates.get(metric.name):
+        values |= {"value": estimate.value, "interval": estimate.bounds()}
+        if not estimate.source:
+            values["n"], rests_on = estimate.n, metric.column
     return row_of(group, values, *remarks, item=metric.name, rests_on=rests_on)
 
 
-def verdict_values(found: Score, name: str, prefix: str = "") -> dict[str, Value]:
-    """An indicator by both rules, and whether they disagree; or the score by both."""
+def verdict_values(judged: Score, name: str, prefix: str = "") -> dict[str, Value]:
+    """Return an indicator by both rules, and whether they disagree; or the score by both."""
     if name == SCORE:
-        return {f"{prefix}paper": total(found.paper), f"{prefix}robust": total(found.robust)}
-    paper, robust = found.paper[name], found.robust[name]
+        return {f"{prefix}paper": total(judged.paper), f"{prefix}robust": total(judged.robust)}
+    paper, robust = judged.paper[name], judged.robust[name]
     return {
         f"{prefix}paper": paper.passed,
         f"{prefix}robust": robust.passed,
@@ -133,27 +124,27 @@ def verdict_values(found: Score, name: str, prefix: str = "") -> dict[str, Value
     }
 
 
-def ceiling_values(group: Group, found: Score, name: str) -> dict[str, Value]:
-    """Which percentages of human data sets pass an indicator, or I1 to I4 together, by rule."""
+def ceiling_values(group: Group, judged: Score, name: str) -> dict[str, Value]:
+    """Return by rule which percentages of human data sets pass an indicator, or I1 to I4."""
     # A ceiling is for as many trials as there are outcomes. It does not fit indicators of the gap
     # or the speeds where only some of these trials have traces.
     if name not in OF_OUTCOMES and outcomes_note(group):
         return {}
     key = "I1-I4" if name == SCORE else name
-    shares = found.ceiling.items()
+    shares = judged.ceiling.items()
     return {f"ceiling_{rule}": 100 * share[key] for rule, share in shares if key in share}
 
 
-def reasons(found: Score, *names: str) -> str:
-    """Why a verdict is missing, or what it rests on if not on a test."""
+def reasons(judged: Score, *names: str) -> str:
+    """Return why verdicts are missing, or what they rest on if not on a test."""
     which: dict[str, list[str]] = {}
-    for rule, judged in found.rules.items():
+    for rule, judgements in judged.rules.items():
         for name in names:
-            if name in judged and judged[name].why:
-                which.setdefault(f"{RULES[rule]}: {judged[name].why}", []).append(name)
+            if name in judgements and judgements[name].why:
+                which.setdefault(f"{RULES[rule]}: {judgements[name].why}", []).append(name)
     return "; ".join(f"{', '.join(names)} {why}" for why, names in which.items())
 
 
 def no_ceiling(group: Group) -> str:
-    """Why a group has no ceiling; empty where it has one."""
-    return "" if min(group.sizes) else NO_CEILING
+    """Return why a group has no ceiling; empty where it has one."""
+    return "" if min(group.sizes) else "not all conditions of the humans were played: no ceiling"

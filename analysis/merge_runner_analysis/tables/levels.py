@@ -69,27 +69,22 @@ def varied(study: Study) -> tuple[str, ...]:
 
 def _every(study: Study) -> Iterator[tuple[str, Level]]:
     """Each level of all drivers, then of each driver, then each crossing of each driver."""
-    drivers = {group.levels[MODEL] for group in study.models if MODEL in group.levels}
-    ordered = [name for name in dict.fromkeys(_drivers(study)) if name in drivers]
+    levels = [group.levels for group in study.models]
+    drivers = [*dict.fromkeys(named[MODEL] for named in levels if MODEL in named)]
     for of_factor in levels_by_factor(study):
         yield from (("", level) for level in of_factor)
-    for driver in ordered:
+    for driver in drivers:
         for of_factor in levels_by_factor(study, MODEL, driver):
             yield from ((driver, level) for level in of_factor)
     factors = varied(study)
     if len(factors) < 2:
         return
-    for driver, names in product(ordered, product(*_names(study, factors))):
+    for driver, names in product(drivers, product(*_names(study, factors))):
         wanted = {MODEL: driver, **dict(zip(factors, names, strict=True))}
         yield from ((driver, level) for level in crossing(study, factors, wanted))
 
 
-def _drivers(study: Study) -> Iterator[str]:
-    return (group.levels.get(MODEL, "") for group in study.models)
-
-
 def _names(study: Study, factors: tuple[str, ...]) -> list[list[str]]:
-    """The names of the levels of each of these factors."""
     names: dict[str, dict[str, None]] = {factor: {} for factor in factors}
     for of_factor in levels_by_factor(study):
         if of_factor[0].factor in names:

@@ -31,7 +31,6 @@ def footnoted(table: Table, study: Study) -> Table:
 
 
 def _of_trials(table: Table, study: Study) -> Iterator[str]:
-    """What to know of the trials behind a table."""
     ids = {name for row in table.rows for name in row.groups}
     groups = [group for group in (*study.groups, *study.asked) if group.id in ids]
     if study.empty:
@@ -95,7 +94,6 @@ def _human_notes(study: Study, table: Table) -> Iterator[str]:
 
 
 def _seats(group: Group) -> str:
-    """On which sides two different drivers sat."""
     left, right = group.seats
     sat = f"{group.models[0]} sat on the left in {left} trials, and on the right in {right}"
     if left and right:

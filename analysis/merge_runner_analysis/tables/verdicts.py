@@ -5,7 +5,8 @@ Headlines, sentences, the report and the pages read this table and nothing else.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.records import SIDES
@@ -74,14 +75,8 @@ VERDICT_COLUMNS = (
 def verdicts(study: Study) -> Table:
     """Every driver and prompt that is judged, and the humans first, by every measure."""
     rows = [] if study.human not in study.groups else [*_human_rows(study)]
-    for group in study.models:
-        if not group.caution:
-            kind, by = _kind(study, group), _played_rule(study, group)
-            rows += [_compared(group, kind, one, by) for one in compared(study, group)]
-    rows += [
-        Row(group.id, (group.id,), _driver(group, _kind(study, group)), group.unjudged)
-        for group in study.unjudged
-    ]
+    for group in (*(group for group in study.models if not group.caution), *study.unjudged):
+        rows += _driver_rows(study, group)
     return Table(
         TABLE,
         VERDICT_COLUMNS,
@@ -111,70 +106,74 @@ def verdicts(study: Study) -> Table:
     )
 
 
-def _kind(study: Study, group: Group) -> str:
+def _kind(group: Group, spec: Mapping[str, Any]) -> str:
     if group.scripted:
         return MOCK
     models = dict(zip(SIDES, (*group.models, *group.models), strict=False))
-    asked = language_models(models, study.frames.specs.get(group.spec_hash, {}))
-    return LANGUAGE_MODEL if asked else PROGRAM
+    return LANGUAGE_MODEL if language_models(models, spec) else PROGRAM
 
 
 def _driver(group: Group, kind: str) -> dict[str, Value]:
     return {"driver": group.label, "setting": group.setting, "kind": kind}
 
 
-def _played_rule(study: Study, group: Group) -> str:
-    """The collision rule of a group's scenario, as sentences name it."""
-    scenario = study.frames.specs.get(group.spec_hash, {}).get("scenario", {})
-    return PLAYED_RULES[ScenarioConfig.model_validate(scenario).collision_rule]
+def _driver_rows(study: Study, group: Group) -> Iterator[Row]:
+    spec = study.frames.specs.get(group.spec_hash, {})
+    driver = _driver(group, _kind(group, spec))
+    if group.unjudged:
+        yield Row(group.id, (group.id,), driver, group.unjudged)
+        return
+    rule = ScenarioConfig.model_validate(spec.get("scenario", {})).collision_rule
+    for comparison in compared(study, group):
+        yield _compared(group, driver, comparison, PLAYED_RULES[rule])
 
 
-def _compared(group: Group, kind: str, found: Comparison, played_rule: str) -> Row:
-    measure, tested = found.measure, found.tested
-    apart = tested if measure.margin is None else Estimate()
-    values: dict[str, Value] = _driver(group, kind) | {
+def _compared(
+    group: Group, driver: dict[str, Value], comparison: Comparison, played_rule: str
+) -> Row:
+    measure, tested = comparison.measure, comparison.tested
+    difference = tested if measure.margin is None else Estimate()
+    values = driver | {
         "measure": measure.name,
-        **_known(found.own),
-        "human": found.human.value,
-        "human_ci": found.human.bounds(),
-        "difference": apart.value,
-        "difference_ci": apart.bounds(),
+        **_known(comparison.own),
+        "human": comparison.human.value,
+        "human_ci": comparison.human.bounds(),
+        "difference": difference.value,
+        "difference_ci": difference.bounds(),
         "level": None if tested.p is None else 100 * tested.level,
         "p": tested.p,
         "p_holm": tested.p_holm,
         "detectable": tested.detectable,
-        "state": found.state or None,
+        "state": comparison.state or None,
         "rule": measure.rule,
     }
-    if seen := found.counted:
-        values["counted"] = f"{seen.k} of {seen.n}"
-        values["human_counted"] = f"{seen.human_k} of {seen.human_n}"
+    if counts := comparison.counted:
+        values["counted"] = f"{counts.k} of {counts.n}"
+        values["human_counted"] = f"{counts.human_k} of {counts.human_n}"
         values["counted_by"] = played_rule if measure.rests_on == BOXES.column else None
-    note, played = note_of(*found.remarks), {*group.trials["condition"]}
+    note, played = note_of(*comparison.remarks), {*group.trials["condition"]}
     # Only trials in conditions of humans are compared.
-    conditions = (
-        () if played <= {*HUMAN_CONDITIONS} else tuple(sorted(played & {*HUMAN_CONDITIONS}))
-    )
+    shared = played & {*HUMAN_CONDITIONS}
+    conditions = () if played == shared else tuple(sorted(shared))
     row_id = f"{group.id}/{measure.name}"
     return Row(row_id, (group.id,), values, note, measure.rests_on, conditions)
 
 
 def _human_rows(study: Study) -> Iterator[Row]:
-    for name, found in of_humans(study).items():
-        values = _driver(study.human, HUMANS) | {"measure": name, **_known(found)}
+    for name, estimate in of_humans(study).items():
+        values = _driver(study.human, HUMANS) | {"measure": name, **_known(estimate)}
         # What is published rests on no trials here.
-        rests_on = MEASURES[name].rests_on
-        if found.source or not study.human.measured:
-            rests_on = ""
-        note = note_of(found.problem, found.source)
+        published = estimate.source or not study.human.measured
+        rests_on = "" if published else MEASURES[name].rests_on
+        note = note_of(estimate.problem, estimate.source)
         yield Row(f"{HUMAN}/{name}", (HUMAN,), values, note, rests_on)
 
 
-def _known(found: Estimate) -> dict[str, Value]:
+def _known(estimate: Estimate) -> dict[str, Value]:
     return {
-        "n": found.n,
-        "k": found.k,
-        "undecided": found.undecided or None,
-        "estimate": found.value,
-        "ci": found.bounds(),
+        "n": estimate.n,
+        "k": estimate.k,
+        "undecided": estimate.undecided or None,
+        "estimate": estimate.value,
+        "ci": estimate.bounds(),
     }

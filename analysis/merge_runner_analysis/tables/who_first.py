@@ -19,15 +19,10 @@ from merge_runner_analysis.tables.coefficients import (
 )
 from merge_runner_analysis.tables.model import Column, Optional, Table
 
-ESTIMATORS = (
-    "b, SE, z and p: the paper's maximum likelihood with Wald's tests; Firth b, SE and LR p: the "
-    "penalised estimate that the verdicts rest on, with its likelihood-ratio test"
-)
-
 
 def who_first(study: Study) -> Table:
     """Table III: logistic regression of left-first on h (m) and dv (m/s)."""
-    found = {group: _fits(group) for group in study.groups}
+    fitted = {group: _fits(group) for group in study.groups}
     return Table(
         "who-first",
         (
@@ -42,9 +37,14 @@ def who_first(study: Study) -> Table:
             row_of_term(group, term, fit, LEFT_FIRST.column, "" if fit[1] else outcomes_note(group))
             for term in WHO_FIRST_TERMS
             for group in study.groups
-            for fit in found[group]
+            for fit in fitted[group]
         ],
-        (ESTIMATORS, TESTED_ELSEWHERE, *mixed_note(study, "S4", "random intercept per pair")),
+        (
+            "b, SE, z and p: the paper's maximum likelihood with Wald's tests; Firth b, SE and LR "
+            "p: the penalised estimate that the verdicts rest on, with its likelihood-ratio test",
+            TESTED_ELSEWHERE,
+            *mixed_note(study, "S4", "random intercept per pair"),
+        ),
     )
 
 
@@ -52,9 +52,9 @@ def _fits(group: Group) -> list[Fit]:
     """By maximum likelihood and by Firth's fit, the humans also with errors by pair."""
     # Wald's p fails where conditions nearly separate the outcomes, as those of humans do (Hauck and
     # Donner 1977); Firth's penalty (1993) keeps estimates finite there.
-    found: list[Fit] = [("", "", {"": fits(group).logit, "firth_": fits(group).firth})]
+    every: list[Fit] = [("", "", {"": fits(group).logit, "firth_": fits(group).firth})]
     if not group.setting and group.measured:
         # Repeated trials of a pair are alike, which the pooled fit ignores.
         paired = by_pairs(who_first_logit, group.trials, "merged_first")
-        found.append(("clustered/", BY_PAIR, {"": paired}))
-    return found
+        every.append(("clustered/", BY_PAIR, {"": paired}))
+    return every

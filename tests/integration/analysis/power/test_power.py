@@ -100,10 +100,10 @@ def level(truth, *, cell="", side="left", equal=False):
 
 
 def test_what_is_the_same_has_no_chance_to_be_told_apart():
-    conditions = list(HUMAN_CONDITIONS)
-    assert Case(human(), 10, HUMANS).effects(conditions) == {}
+    conditions = tuple(HUMAN_CONDITIONS)
+    assert Case(human(), conditions, 10, HUMANS).effects() == {}
     braver = replace(human(), gap_m=9.0, collided=0.5)
-    assert list(Case(braver, 10, HUMANS).effects(conditions)) == ["collisions"]
+    assert list(Case(braver, conditions, 10, HUMANS).effects()) == ["collisions"]
     same = Contrast(level(human()), level(human()), "goes first", "default")
     assert same.size == pytest.approx(0)
     apart = (Contrast(level(braver), level(human()), of, "default") for of in ("collisions", "gap"))
@@ -118,7 +118,7 @@ def test_two_equal_drivers_are_read_from_both_sides_and_favour_none():
     own = level(sure, side="left") + level(sure, side="right")
     contrast = Contrast(own, level(human(), equal=True), "goes first", "default", one_sided=True)
     assert contrast.size == pytest.approx(50, abs=0.5), "the left one goes as often as the other"
-    assert power(contrast, list(HUMAN_CONDITIONS), 1, 20) == {"goes first": 1.0}
+    assert power(contrast, 1, 20) == {"goes first": 1.0}
 
 
 def test_an_effect_on_who_goes_first_is_that_many_points_over_the_conditions():
