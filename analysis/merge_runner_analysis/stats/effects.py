@@ -113,7 +113,8 @@ def effects(study: Study, by: str = "") -> list[Effect]:
 def driver_effects(study: Study, driver: Group, reference: Group) -> list[Effect]:
     """Compare two drivers with their prompts in every measure, in the conditions of both.
 
-    Their p are corrected together by Holm.
+    Their p are corrected by Holm; that of the primary measure is no part of that where the study
+    ``asks_of_models``.
     """
     levels = []
     for group in (reference, driver):
@@ -127,16 +128,30 @@ def driver_effects(study: Study, driver: Group, reference: Group) -> list[Effect
 def primary(study: Study) -> Metric:
     """The measure that the study names as its primary one, else who goes first.
 
-    Without a chosen study it is the one whose parts are in use, as in the explorer.
-
     Raises UsageError where there is no such measure.
     """
-    in_use_here = StudySource(name="", text=text, plugins={}) if (text := in_use().text) else None
-    source = study.source or in_use_here
+    source = _source(study)
     named = source.file.primary if source else PRIMARY
     known = {PRIMARY: LEFT_FIRST, "collided": COLLISIONS, **METRICS}
     require(known, "measure", named, "as the study's primary one")
     return known[named]
+
+
+@remembered
+def asks_of_models(study: Study) -> bool:
+    """Return whether a study names a primary measure, and varies nothing but the model."""
+    source, factors = _source(study), levels_of(study.models, study.order)
+    varying = {name for name, levels in factors.items() if len(levels) > 1}
+    if source is None or varying != {MODEL}:
+        return False
+    return "primary" in source.file.model_fields_set
+
+
+def _source(study: Study) -> StudySource | None:
+    """The chosen study, else the one whose parts are in use, as in the explorer."""
+    if study.source or not (text := in_use().text):
+        return study.source
+    return StudySource(name="", text=text, plugins={})
 
 
 @remembered
@@ -260,8 +275,11 @@ def _with_corrected(study: Study, effects: list[Effect]) -> list[Effect]:
 
     Where nothing varies and nothing differs, as without a single collision, p is no part of it.
     """
+    of_model = {MODEL, DRIVER} if asks_of_models(study) else set()
     is_primary = [
-        one.metric is primary(study) and not one.across and one.level.factor not in (MODEL, DRIVER)
+        one.metric is primary(study)
+        and not one.across
+        and (one.level.factor in of_model or one.level.factor not in (MODEL, DRIVER))
         for one in effects
     ]
     p = {place: one.difference.p for place, one in enumerate(effects)}

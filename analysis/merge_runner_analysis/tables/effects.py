@@ -16,7 +16,13 @@ from merge_runner_analysis.metrics import (
     Metric,
     shown_in,
 )
-from merge_runner_analysis.stats.effects import Effect, driver_effects, effects, primary
+from merge_runner_analysis.stats.effects import (
+    Effect,
+    asks_of_models,
+    driver_effects,
+    effects,
+    primary,
+)
 from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.levels import DRIVER, Level, copied_of_shared, levels_by_factor
 from merge_runner_analysis.stats.measures import undecided_note
@@ -188,11 +194,11 @@ def _notes(study: Study, by: str) -> Iterator[str]:
         "factor, in the cells that all four have"
     )
     if tested:
+        without = "" if asks_of_models(study) else ", without those of the model"
         yield (
             "p, corrected: by Holm in two families. The effects of factors on "
-            f"{primary(study).heading}, the primary measure, are one, without those of the model; "
-            "all others are the other one. detectable: found at p < .05, before correction, with "
-            "power .8"
+            f"{primary(study).heading}, the primary measure, are one{without}; all others are "
+            "the other one. detectable: found at p < .05, before correction, with power .8"
         )
     counts = [
         f"{level.id}: {level.pooled.repeated} of {len(level.pooled.stored.trials)}"

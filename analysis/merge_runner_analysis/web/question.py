@@ -163,6 +163,8 @@ def answered(rows: Sequence[Row]) -> tuple[str, str]:
     none it says so, and the rest what could have been seen. It is of scripted stand-ins only where
     there is no other driver, and then says so.
     """
+    # Where models alone vary, their comparison answers.
+    rows = [row for row in rows if not (row.values["factor"] == MODEL and row.values["primary"])]
     unscripted = [row for row in rows if not row.values.get("drivers")]
     rehearsed = "" if unscripted else "In a rehearsal with a scripted stand-in, "
     rows = unscripted or rows

@@ -45,7 +45,7 @@ from merge_runner_analysis.web.question import answer_of
 from merge_runner_analysis.web.rendering import STYLE, environment, inlined_texts, policy_of
 from merge_runner_analysis.web.scope import DESCRIPTIONS
 from merge_runner_analysis.web.urls import Links
-from merge_runner_analysis.wording import TABLE, number, sentences
+from merge_runner_analysis.wording import HUMANS, LANGUAGE_MODEL, TABLE, number, sentences
 
 # What each variant asks first: of all of them in the same condition, as far as that was played.
 PROMPTS = """
@@ -137,7 +137,12 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
     origin = provenance(study.db)
     finished = next((table for table in tables if table.name == TABLE), None)
     descriptions, levels, prompts = design(study)
-    headline, *others = sentences((finished or verdicts(study)).rows)
+    rows = (finished or verdicts(study)).rows
+    headline, *others = sentences(rows)
+    apart = _apart(study)
+    kinds = {row.values["kind"] for row in rows} - {HUMANS}
+    if apart and kinds == {LANGUAGE_MODEL}:  # two models are the question
+        headline = f"{apart.claim} {headline}"
     made = {table.name: table for table in tables}
     question = answer_of(made.get("effects"), made.get("levels"))
     beside = (against(table, study) if table.name in FILES else table for table in tables)
@@ -156,7 +161,7 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
         headline=headline,
         sentences=others,
         question=question,
-        apart=_apart(study),
+        apart=apart,
         linked=False,
         part={},
         middle=MIDDLE,

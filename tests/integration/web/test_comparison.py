@@ -6,8 +6,11 @@ from html import unescape
 
 import pytest
 
+from merge_runner.study.file import read_study
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import Study
+from merge_runner_analysis.tables import make_tables
+from merge_runner_analysis.web.report import report_html
 from merge_runner_analysis.wording import brackets, number, p_value
 from tests.support.serving import client_of, listed
 from tests.support.studies import Said, write_study, yielding
@@ -69,6 +72,30 @@ def test_the_headline_says_crashes_in_counts_then_points_interval_and_p(client):
     turned = text_of(client.get(f"/drivers/{B}?with={A}").text)
     assert f"{B} crashed in 33 of 55 trials, {A} in 11 of 54" in turned
     assert "points more" in turned
+
+
+def test_two_models_without_factors_are_what_the_first_page_and_the_report_answer(db, client):
+    study = Study(db)
+    table = make_tables(study, ["verdicts"])
+    claim = f"{A} crashed in 11 of 54 trials, {B} in 33 of 55: "
+    answer = re.search(r'<p class="answer">(.*?)</p>', client.get("/").text, re.S)[1]
+    assert text_of(answer).startswith(claim)
+    assert claim in text_of(report_html(study, table, {}))
+
+
+def test_the_measure_that_a_study_of_models_asks_about_is_tested_by_itself(db, tmp_path):
+    (tmp_path / "study.toml").write_text(
+        f'models = ["{A}", "{B}"]\nrepetitions = 1\nprimary = "collided"'
+    )
+    together, study = values_of(Study(db), "effects"), Study(db)
+    study.source = read_study(str(tmp_path / "study.toml"))
+    alone = values_of(study, "effects")
+    name = f"model={B}/collided_percent"
+    assert together[name]["primary"] is None
+    assert (alone[name]["primary"], alone[name]["p_corrected"]) == ("primary", alone[name]["p"])
+    others = {row for row in alone if alone[row]["p"] is not None} - {name}
+    assert all(not alone[row]["primary"] for row in others)
+    assert any(alone[row]["p_corrected"] > alone[row]["p"] for row in others)
 
 
 def test_every_count_leads_to_so_many_trials(client):
