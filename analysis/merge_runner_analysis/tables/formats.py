@@ -25,7 +25,8 @@ ASIDE = {
     *(("detectable", "number"), ("freedom", "number"), ("human_ci", "interval")),
     ("primary", "text"),
 }
-FINDINGS = {"estimate", "value", "b", "difference"}
+WEIGHTS = {"state": 6, "p_corrected": 6, "p_holm": 6, "difference": 5, "measure": 5, "reference": 2}
+WEIGHTS |= dict.fromkeys(("estimate", "value", "b"), 4)
 LATEX = str.maketrans(
     {
         "\\": r"\textbackslash{}",
@@ -108,12 +109,14 @@ def _fitting(columns: Sequence[Column], widths: Sequence[int], width: int) -> li
 
 
 def _weight(column: Column) -> int:
-    """How much a reader misses a column: what names a row and what is found weigh most."""
+    """How much a reader misses a column: what is found weighs most, then what names a row."""
     if (column.name, column.kind) in ASIDE:
         return 0
-    if column.kind in {"text", "p", "verdict"} or column.name in FINDINGS:
-        return 3
-    return 2 if column.kind == "interval" else 1
+    if column.name in WEIGHTS:
+        return WEIGHTS[column.name]
+    if column.kind == "text" and not column.optional:
+        return 5
+    return {"verdict": 4, "p": 3, "interval": 2}.get(column.kind, 1)
 
 
 def as_csv(table: Table) -> str:
