@@ -38,7 +38,7 @@ METRIC_NAMES = {
     LEFT_FIRST.name: "goes first",
     COLLISIONS.name: "crashes",
     GAP.name: "gap at the merge point",
-    RMSE.name: "departs from its speed",
+    RMSE.name: "deviation from the initial speed",
     BOXES.name: "crashes by people's rule",
     JOINT.name: "both adapt their speed",
     COST.name: "cost of a trial",
@@ -63,7 +63,7 @@ PLAYED_RULES = {
     "shared_lane": "the rule of its scenario",
 }
 # Of levels that nobody reads.
-SAME_TRIALS = "not tested: the same trials at both levels, since no driver reads what differs"
+SAME_TRIALS = "not tested: both levels have equal trials, as the drivers do not read what differs"
 MISSING, MINUS = "–", "−"
 TIMES = " × "  # between the factors of an interaction
 

@@ -47,7 +47,7 @@ from merge_runner_analysis.wording import (
 )
 
 # A change of the measure, as a claim names it.
-CHANGED = {LEFT_FIRST.name: "who goes first", RMSE.name: "how far it departs from its speed"}
+CHANGED = {LEFT_FIRST.name: "who goes first", RMSE.name: "the deviation from the initial speed"}
 # More levels that show nothing are counted, not listed.
 FEW = 3
 
@@ -311,11 +311,14 @@ def _change(row: Row, sides: dict[str, Row], end: float, primary: str) -> Change
         )
         for name, side in (("estimate_reference", f"{base}{mark}"), ("estimate", of))
     )
-    # Of an interaction the id has both levels.
-    said = row.id.partition("/interaction/")[0].replace("/", ", ") if is_interaction(row) else ""
+    said = ""
+    if is_interaction(row):  # whose id has the level of the other factor, too
+        named_level = f"{str(row.values['factor']).partition(TIMES)[0]}={of}"
+        at = row.id.partition("/interaction/")[0].removesuffix(f"/{named_level}")
+        said = f"{named_level}: its effect with {at}, less that without"
     said = said or (named(str(of)) if is_own else f"{row.values['factor']}: {named(str(of))}")
     if is_own and row.values.get("primary"):
-        said += ", primary"
+        said += ", primary test"
     return Change(
         capital(str(row.values["factor"])) if is_own else capital(name_of(row)),
         said,
