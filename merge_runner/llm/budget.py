@@ -241,7 +241,7 @@ class Budget:
     def _suspended(self, what: str) -> TrialSuspended:
         """Return the error of a trial that cannot be paid."""
         spending, kept_usd = self.ledger.read(), self._needed_usd()
-        reserved_usd = spending.reserved_usd + self.queued_usd
+        reserved_usd = max(0.0, spending.reserved_usd + self.queued_usd)  # not minus nothing
         elsewhere_usd = self.ledger.committed_usd - spending.committed_usd
         is_elsewhere = elsewhere_usd > TOLERANCE_USD
         elsewhere = f", {elsewhere_usd:.4f} by others under this cap" if is_elsewhere else ""
