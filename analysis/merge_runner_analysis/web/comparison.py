@@ -69,14 +69,18 @@ class Comparison:
 
 def set_apart(
     site: Site, own: Driver, other: Driver, scope: Scope
-) -> tuple[Job, Comparison | None]:
-    """One driver less another, each with its prompt, once that is computed."""
+) -> tuple[Job, bool, Comparison | None]:
+    """One driver less another, each with its prompt: the computation, if it is awaited, the result.
+
+    The computation may end meanwhile: whether it is awaited is what was found.
+    """
     groups = (f"{one.name}/{one.prompt}" for one in (own, other))
     job = computed(site, ("comparison", *groups, scope.sweep, scope.condition))
-    if job.content is None:
-        return job, None
+    if (content := job.content) is None:
+        return job, True, None
     trials = trials_of(own, scope), trials_of(other, scope)
-    return job, comparison_of(from_text(job.content["table"]), (own.name, other.name), trials)
+    table = from_text(content["table"])
+    return job, False, comparison_of(table, (own.name, other.name), trials)
 
 
 def comparison_of(

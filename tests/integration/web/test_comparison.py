@@ -10,6 +10,7 @@ from merge_runner.study.file import read_study
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables import make_tables
+from merge_runner_analysis.web import comparison
 from merge_runner_analysis.web.report import report_html
 from merge_runner_analysis.wording import brackets, number, p_value
 from tests.support.serving import client_of, listed
@@ -81,6 +82,30 @@ def test_two_models_without_factors_are_what_the_first_page_and_the_report_answe
     answer = re.search(r'<p class="answer">(.*?)</p>', client.get("/").text, re.S)[1]
     assert text_of(answer).startswith(claim)
     assert claim in text_of(report_html(study, table, {}))
+
+
+def test_a_comparison_that_is_computed_while_its_page_is_made_is_still_awaited(db, monkeypatch):
+    made = client_of(db)
+    made.get(f"/drivers/{A}?with={B}")  # the table of verdicts is there from now on
+    whole = comparison.computed
+
+    class Ending:
+        """A computation that ends once it was looked at."""
+
+        def __init__(self, job):
+            self.job, self.looks = job, 0
+
+        def __getattr__(self, name):
+            return getattr(self.job, name)
+
+        @property
+        def content(self):
+            self.looks += 1
+            return self.job.content if self.looks > 1 else None
+
+    monkeypatch.setattr(comparison, "computed", lambda *asked: Ending(whole(*asked)))
+    for address in (f"/drivers/{A}?with={B}", "/"):
+        assert "Computing" in text_of(made.get(address).text), address
 
 
 def test_the_measure_that_a_study_of_models_asks_about_is_tested_by_itself(db, tmp_path):

@@ -60,7 +60,9 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     beside = by_name.get(asked.get("with", ""))
     was_asked = own and own.facts and own.facts["asked"] and not beside
     awaited, first = _first(site, name, scope) if was_asked else (None, "")
-    compared, apart = set_apart(site, own, beside, scope) if own and beside else (None, None)
+    compared, is_awaited, apart = None, False, None
+    if own and beside:
+        compared, is_awaited, apart = set_apart(site, own, beside, scope)
     both = [one for one in (own, beside) if one]
     conditions = by_condition(site, scope, both)
     # Of each condition, the humans' and the drivers' share of trials in which left goes first.
@@ -74,7 +76,7 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         name=name,
         own=own,
         beside=beside,
-        compared=compared,
+        compared=compared if is_awaited else None,
         apart=apart,
         linked=True,
         middle=MIDDLE,
@@ -128,8 +130,8 @@ def _summary(own: Driver) -> str:
     )
 
 
-def _first(site: Site, driver: str, scope: Scope) -> tuple[Job, str]:
-    """What a driver does first, by the table of first actions; empty until that is made."""
+def _first(site: Site, driver: str, scope: Scope) -> tuple[Job | None, str]:
+    """What is awaited, and what a driver does first, by the table of first actions."""
     found, table = computed_table(site, "first-action", scope.sweep, scope.condition)
     told = []
     for row in table.rows if table else []:
@@ -141,7 +143,7 @@ def _first(site: Site, driver: str, scope: Scope) -> tuple[Job, str]:
                 f"{of['go_percent']} % speed up, of {of['n']}. Per m/s that they are faster, they "
                 f"{_harder(row)}."
             )
-    return found, with_minus(" ".join(told)) if len(told) > 1 else ""
+    return None if table else found, with_minus(" ".join(told)) if len(told) > 1 else ""
 
 
 def _harder(row: TableRow) -> str:

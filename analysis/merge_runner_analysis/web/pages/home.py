@@ -52,8 +52,8 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
     kinds = by_kind(shown)
     apart = None
     if not jobs and len(models) == len(shown) == 2:  # two language models are the question
-        job, apart = set_apart(site, shown[0], shown[1], scope)
-        jobs, asking = [job], [job] * (apart is None and not job.failure)
+        job, is_awaited, apart = set_apart(site, shown[0], shown[1], scope)
+        jobs, asking = [job], [job] * is_awaited
     older = [job.older for job in (values["computed"], *jobs)]
     now = standing, site.catalogue.state, site.catalogue.held, older
     seen = news_of(now, asked.get("seen", ""))
