@@ -122,7 +122,8 @@ KEYS = ["trial_id", "spec_hash"]
 # The newest run comes first: the order of its levels counts.
 SWEEPS = """
 SELECT sweep_id, name, coalesce('-' || nullif(config->>'$.seat', ''), '') AS seat,
-    coalesce(config->'$.levels', '{}') AS levels, config->>'$.run_name' AS run_name
+    coalesce(config->'$.levels', '{}') AS levels, config->>'$.run_name' AS run_name,
+    config->>'$.study.text' AS text
 FROM sweeps ORDER BY started_at DESC, sweep_id
 """
 LINKS = "SELECT DISTINCT trial_id, spec_hash, sweep_id FROM sweep_trials"
@@ -167,6 +168,8 @@ class Studies(NamedTuple):
     """By study the levels of each factor, in the order of the study."""
     called: Mapping[str, str]
     """By the id of each run what its user calls it; empty without a name."""
+    texts: Mapping[str, str]
+    """By study the text of its file in the newest run."""
 
     def holds(self, study: str, frame: pd.DataFrame) -> pd.Series:
         """Return which rows of a frame are of trials that were played for a study."""
@@ -221,4 +224,6 @@ def _studies(sweeps: pd.DataFrame, links: pd.DataFrame) -> Studies:
         for factor, levels in order.items():
             known[factor] = list(dict.fromkeys([*known.get(factor, ()), *levels]))
     called = sweeps.set_index("sweep_id")["run_name"].fillna("").to_dict()
-    return Studies(links.assign(study=links["sweep_id"].map(names)), orders, called)
+    written = sweeps.dropna(subset="text").iloc[::-1]  # of several the newest stands
+    texts = dict(zip(written["sweep_id"].map(names), written["text"], strict=True))
+    return Studies(links.assign(study=links["sweep_id"].map(names)), orders, called, texts)

@@ -63,7 +63,7 @@ PLAYED_RULES = {
     "shared_lane": "the rule of its scenario",
 }
 # Of levels that nobody reads.
-SAME_TRIALS = "not tested: both levels have equal trials, as the drivers do not read what differs"
+SAME_TRIALS = "not tested: the same trials at both levels, as the drivers do not read what differs"
 MISSING, MINUS = "–", "−"
 TIMES = " × "  # between the factors of an interaction
 

@@ -130,28 +130,40 @@ def primary(study: Study) -> Metric:
 
     Raises UsageError where there is no such measure.
     """
-    source = _source(study)
-    named = source.file.primary if source else PRIMARY
-    known = {PRIMARY: LEFT_FIRST, "collided": COLLISIONS, **METRICS}
-    require(known, "measure", named, "as the study's primary one")
-    return known[named]
+    return _measures()[_named(study) or PRIMARY]
 
 
 @remembered
 def asks_of_models(study: Study) -> bool:
     """Return whether a study names a primary measure, and varies nothing but the model."""
-    source, factors = _source(study), levels_of(study.models, study.order)
+    factors = levels_of(study.models, study.order)
     varying = {name for name, levels in factors.items() if len(levels) > 1}
-    if source is None or varying != {MODEL}:
-        return False
-    return "primary" in source.file.model_fields_set
+    return varying == {MODEL} and bool(_named(study))
 
 
-def _source(study: Study) -> StudySource | None:
-    """The chosen study, else the one whose parts are in use, as in the explorer."""
-    if study.source or not (text := in_use().text):
-        return study.source
-    return StudySource(name="", text=text, plugins={})
+def _measures() -> dict[str, Metric]:
+    """What a study may call its primary measure."""
+    return {PRIMARY: LEFT_FIRST, "collided": COLLISIONS, **METRICS}
+
+
+def _named(study: Study) -> str:
+    """The primary measure that stands in the study's file: empty without one.
+
+    The file is that of the chosen study, else the one whose parts are in use, else the only one
+    that was played, whose own measures are missing where its plug-ins are not in use.
+    """
+    played = study.frames.studies
+    text = study.source.text if study.source else in_use().text
+    stored = next((played.texts.get(name, "") for name in played.orders), "")
+    if not text and len(played.orders) == 1:
+        text = stored
+    file = StudySource(name="", text=text, plugins={}).file if text else None
+    if file is None or "primary" not in file.model_fields_set:
+        return ""
+    if file.primary not in _measures() and not (study.source or in_use().text):
+        return ""
+    require(_measures(), "measure", file.primary, "as the study's primary one")
+    return file.primary
 
 
 @remembered

@@ -21,7 +21,7 @@ A, B = "gpt-5.2", "o3"
 
 
 @pytest.fixture(scope="module")
-def db(tmp_path_factory):
+def drives():
     """B collides in three of five repetitions, A in one and brakes harder; a trial of A is lost."""
     drives = []
     for name, crashes, strength in ((A, {5}, 1.0), (B, {3, 4, 5}, 0.8)):
@@ -32,6 +32,11 @@ def db(tmp_path_factory):
             is_lost = (name, drive.condition, drive.rep) == (A, "N_0_0", 2)
             said = {1: Said(("timeout",), lost=True)} if is_lost else {}
             drives.append(replace(drive, **sides, said=said))
+    return drives
+
+
+@pytest.fixture(scope="module")
+def db(drives, tmp_path_factory):
     return write_study(tmp_path_factory.mktemp("compared") / "t.duckdb", drives)
 
 
@@ -121,6 +126,17 @@ def test_the_measure_that_a_study_of_models_asks_about_is_tested_by_itself(db, t
     others = {row for row in alone if alone[row]["p"] is not None} - {name}
     assert all(not alone[row]["primary"] for row in others)
     assert any(alone[row]["p_corrected"] > alone[row]["p"] for row in others)
+
+
+@pytest.mark.parametrize(
+    ("asked", "found"), [("collided", "collided_percent"), ("of_a_plugin", None), (None, None)]
+)
+def test_a_database_of_one_study_says_what_it_asks(drives, tmp_path, asked, found):
+    text = f'models = ["{A}"]\nrepetitions = 1\n' + (f'primary = "{asked}"' if asked else "")
+    db = write_study(tmp_path / "t.duckdb", drives, config={"study": {"text": text}})
+    rows = values_of(Study(db), "effects")
+    primary = [name for name, row in rows.items() if row["primary"]]
+    assert primary == ([f"model={B}/{found}"] if found else [])
 
 
 def test_every_count_leads_to_so_many_trials(client):

@@ -8,7 +8,7 @@ from merge_runner_analysis.web.comparison import set_apart
 from merge_runner_analysis.web.computed import computed_table
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.effect_rows import MIDDLE
-from merge_runner_analysis.web.judged import by_condition, by_kind, judged, noted
+from merge_runner_analysis.web.judged import by_condition, by_kind, humans_of, judged, noted
 from merge_runner_analysis.web.people import HEADINGS, likeness_of, people_of
 from merge_runner_analysis.web.question import Answer, answer_of
 from merge_runner_analysis.web.runs import standing_of
@@ -64,7 +64,8 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         **values,
         likeness=[(one, likeness_of(one)) for of_kind in kinds.values() for one in of_kind],
         likeness_headings=HEADINGS,
-        people=people_of(conditions, values["human"]),
+        # People's gap is that of the situations in which the first driver finished.
+        people=people_of(conditions, humans_of(values["table"], next(iter(shown), None))),
         part=scope.part,
         standing=standing,
         seen=seen,
