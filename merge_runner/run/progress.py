@@ -267,7 +267,9 @@ class Log:
                 self.once.add(same)
         rows = dict(reversed(snapshot.rows))  # the first of each name
         ended = snapshot.ended + snapshot.failed - progress.stored
+        workers = progress.runner.workers
         line = f"trials: {ended}/{progress.planned - progress.stored} ended"
+        line += "" if workers is None else f" on {workers} workers"
         line += f"; failed: {snapshot.failed}" if snapshot.failed else ""
         line += f"; cost: {rows['cost']}" if snapshot.cost_usd >= CENT_USD else ""
         if line != self.said or progress.doing == "playing":
