@@ -379,26 +379,26 @@ def apart(one: str, other: str, rows: Mapping[str, Values]) -> tuple[str, str]:
     crashed = rows.get(COLLISIONS.name, {})
     counts = [crashed.get(f"{name}{of}") for of in ("", "_reference") for name in ("k", "n")]
     if any(count is None for count in counts):
-        return f"{one} against {other}.", _others(rows)
+        return f"{one} against {other}.", _others(one, rows)
     k, n, k_other, n_other = counts
     claim = f"{one} crashed in {k} of {n} trials, {other} in {k_other} of {n_other}"
     difference, p, ci = (crashed.get(name) for name in ("difference", "p_corrected", "ci"))
     if min(n or 0, n_other or 0) < ENOUGH:
         return f"{claim}: too few to say more.", ""
     if difference is None or p is None:
-        return f"{claim}.", _others(rows)
+        return f"{claim}.", _others(one, rows)
     if p >= ALPHA:
         said = f"no difference is shown, {number(difference)} points {brackets(ci)}"
-        return f"{claim}: {said}; corrected p {equal_p(p)}.", _others(rows)
+        return f"{claim}: {said}; corrected p {equal_p(p)}.", _others(one, rows)
     # Of fewer, the ends change their signs and their places.
     ends = ci and sorted(end if difference > 0 else -end for end in ci)
     more = "more" if difference > 0 else "fewer"
     said = f"{number(abs(difference))} points {more} {brackets(ends)}".rstrip()
-    return f"{claim}: {said}; corrected p {equal_p(p)}.", _others(rows)
+    return f"{claim}: {said}; corrected p {equal_p(p)}.", _others(one, rows)
 
 
-def _others(rows: Mapping[str, Values]) -> str:
-    """Of all measures but crashes, in which a difference is shown and in which not."""
+def _others(one: str, rows: Mapping[str, Values]) -> str:
+    """Of all measures but crashes, in which a driver is shown to differ and in which not."""
     shown, unshown = [], []
     for name, (more, less, what) in COMPARED.items():
         values = rows.get(name, {})
@@ -408,7 +408,7 @@ def _others(rows: Mapping[str, Values]) -> str:
             shown.append(more if values["difference"] > 0 else less)
         else:
             unshown.append(what)
-    said = [f"The first one {joined(shown)}."] if shown else []
+    said = [f"{one} {joined(shown)}."] if shown else []
     said += [f"No difference is shown in {joined(unshown)}."] if unshown else []
     return " ".join(said)
 

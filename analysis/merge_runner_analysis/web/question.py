@@ -10,8 +10,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.prompts.blocks import title_of
-from merge_runner.study.crossing import MODEL, PROMPT
+from merge_runner.study.crossing import MODEL, OPPONENT, PROMPT
 from merge_runner_analysis.metrics import COLLISIONS, GAP, LEFT_FIRST, RMSE
 from merge_runner_analysis.tables.model import Row, Table
 from merge_runner_analysis.web.effect_rows import (
@@ -86,7 +87,7 @@ class Answer:
     """The claim, what else there is to say, charts, and the effects behind them.
 
     ``asked`` is the question in words, for a study that has none of its own; ``crossed`` a factor
-    at whose levels another one may be shown.
+    at whose levels another one may be shown. ``programs`` are opponents with what they do.
     """
 
     asked: str
@@ -98,6 +99,7 @@ class Answer:
     halves: bool
     charts: list[Chart]
     crossed: str
+    programs: list[tuple[str, str]]
     crossings: str
     changes: list[Change]
     others: list[Change]
@@ -149,6 +151,7 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
         any(row.values["k"] is None for row in known) and metric == LEFT_FIRST.name,
         [chart for chart in charts if chart],
         names[-1] if len(names) > 1 else "",
+        _programs(known),
         unbroken(_interactions(tested, {str(row.values["factor"]) for row in known})),
         _changes(tested, sides, metric),
         _changes(others, sides, metric),
@@ -347,6 +350,12 @@ def _untested(effects: Sequence[Row]) -> set[str]:
     """The factors of which every level has the trials of its reference."""
     asked = [row for row in effects if row.values.get("primary")]
     return {*_factors(asked)} - {*_factors(row for row in asked if not is_copied(row))}
+
+
+def _programs(levels: Sequence[Row]) -> list[tuple[str, str]]:
+    """The programs among the opponents, each with what it does, where that is known here."""
+    names = [str(row.values["level"]) for row in levels if row.values["factor"] == OPPONENT]
+    return [(name, PROGRAMS[name].meaning) for name in dict.fromkeys(names) if name in PROGRAMS]
 
 
 def _crossing_of(levels: Sequence[Row]) -> str:
