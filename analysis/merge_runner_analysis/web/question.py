@@ -39,6 +39,7 @@ from merge_runner_analysis.web.marks import Mark
 from merge_runner_analysis.wording import (
     ENOUGH,
     METRIC_NAMES,
+    SAME_TRIALS,
     TIMES,
     brackets,
     capital,
@@ -49,6 +50,8 @@ from merge_runner_analysis.wording import (
 
 # A change of the measure, as a claim names it.
 CHANGED = {LEFT_FIRST.name: "who goes first", RMSE.name: "the deviation from the initial speed"}
+# Of a scripted stand-in, why both levels have the same trials.
+UNREAD = "not tested: the scripted stand-in does not read it, and no effect is planted for it"
 # More levels that show nothing are counted, not listed.
 FEW = 3
 
@@ -175,7 +178,8 @@ def answered(rows: Sequence[Row]) -> tuple[str, str]:
     primary = sorted(
         (row for row in tested if row.values.get("primary")), key=lambda row: value_of(row, "p")
     )
-    copied = [f"{level_text(row)} is {row.note}" for row in rows if is_copied(row)]
+    why = UNREAD if rehearsed else SAME_TRIALS
+    copied = [f"{level_text(row)} is {why}" for row in rows if is_copied(row)]
     if not primary:
         return capital(rehearsed + f"{'; '.join(copied)}.") if copied else "", ""
     what = _changed(primary[0])
@@ -318,7 +322,7 @@ def _change(row: Row, sides: dict[str, Row], end: float, primary: str) -> Change
     if is_interaction(row):  # whose id has the level of the other factor, too
         named_level = f"{str(row.values['factor']).partition(TIMES)[0]}={of}"
         at = row.id.partition("/interaction/")[0].removesuffix(f"/{named_level}")
-        said = f"{named_level}: its effect with {at}, less that without"
+        said = f"effect of {named_level} with {at}, less its effect otherwise"
     said = said or (named(str(of)) if is_own else f"{row.values['factor']}: {named(str(of))}")
     if is_own and row.values.get("primary"):
         said += ", primary test"

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from merge_runner_analysis.tables.model import Column, Row, Table
-from merge_runner_analysis.web.question import answer_of, answered
+from merge_runner_analysis.web.question import UNREAD, answer_of, answered
 from merge_runner_analysis.wording import SAME_TRIALS
 
 GOES_FIRST, GAP = "goes first (%)", "gap (m)"
@@ -70,7 +70,7 @@ SEEN = "A change of 10.00 points or more would have been seen in four of five st
         (
             [effect(drivers="scripted"), copied("persona")],
             f"In a rehearsal with a scripted stand-in, h{HURRY[1:]}",
-            f"{SAME}p = 0.001. Persona=yes is {SAME_TRIALS}.",
+            f"{SAME}p = 0.001. Persona=yes is {UNREAD}.",
         ),
         (
             [effect(f"words{n}", 0.9 - n / 10, difference=1.0) for n in range(4)],
@@ -80,7 +80,7 @@ SEEN = "A change of 10.00 points or more would have been seen in four of five st
         ),
         (
             [copied("hurry")],
-            f"In a rehearsal with a scripted stand-in, hurry=yes is {SAME_TRIALS}.",
+            f"In a rehearsal with a scripted stand-in, hurry=yes is {UNREAD}.",
             "",
         ),
         (
