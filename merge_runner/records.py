@@ -252,7 +252,7 @@ class Decision:
 class TrialSpec:
     """One trial to play, or one that humans drove.
 
-    ``seat`` is the source of one that only asks: it ends before its drivers decide again.
+    A trial of the source ``first_decision`` ends before its drivers decide again.
     ``order`` is its place in the sweep: lower goes first. ``scripted`` says that the emulator
     takes part, a stand-in and no language model. Humans have a ``pair`` and no ``variant``.
     ``factors`` are the levels of the study's factors, those of ``words`` among them, ``arm`` names
@@ -263,7 +263,7 @@ class TrialSpec:
 
     trial_id: str
     spec_hash: str
-    source: Literal["llm", "driver", "human", "seat"]
+    source: Literal["llm", "driver", "human", "first_decision"]
     model_left: str
     model_right: str
     variant: str | None

@@ -156,7 +156,7 @@ def load_trials(db: Path | str = DEFAULT_DB) -> pd.DataFrame:
     See docs/tables.md. A trial whose ego sat on the right is mirrored: its left is the
     ego's side. First situations that were only asked are left out.
     """
-    return load(f"FROM ({TRIALS}) WHERE source <> 'seat'", db)
+    return load(f"FROM ({TRIALS}) WHERE source <> 'first_decision'", db)
 
 
 class Studies(NamedTuple):
@@ -207,7 +207,7 @@ def read_frames(db: Path) -> Frames:
         specs = {row.spec_hash: json.loads(row.spec) for row in rows(SPECS).itertuples()}
         calls = rows(CALLS.format(others=sql_of(other_models(connection))))
         trials = with_metrics(connection, TRIALS).merge(rows(TRACES), on=KEYS, how="left")
-        asked = trials["source"] == "seat"
+        asked = trials["source"] == "first_decision"
         played = judged(connection, trials[~asked], specs)
         studies = _studies(rows(SWEEPS), rows(LINKS))
         decisions, levels = rows(ASKED_DECISIONS), rows("FROM trial_levels")

@@ -285,7 +285,7 @@ def groups_of(
         own = [specs.get(name, {}) for name in rows["spec_hash"].unique()]
         # Of a first decision that was only asked, what follows is not known: draws that differ
         # later may be equal until then.
-        only_asked = rows["source"].iloc[0] == "seat" and any(map(has_chance, own))
+        only_asked = rows["source"].iloc[0] == "first_decision" and any(map(has_chance, own))
         programs = all(map(programs_alone, own)) and not only_asked
         group = _distinct(group, programs=programs, scripted=group.scripted and not only_asked)
         groups.append(replace(group, levels=levels_of_group(levels, group)))

@@ -51,7 +51,7 @@ GROUP BY provider, model_requested, model_served ORDER BY ALL
 SPECS = """
 SELECT DISTINCT driver, variant, spec_hash, spec
 FROM specs JOIN trials USING (spec_hash) JOIN trial_drivers USING (trial_id, spec_hash)
-WHERE source NOT IN ('human', 'seat') ORDER BY ALL
+WHERE source NOT IN ('human', 'first_decision') ORDER BY ALL
 """
 # Answers by each other model than was asked for.
 SERVED = """

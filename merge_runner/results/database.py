@@ -26,7 +26,7 @@ from merge_runner.errors import StoreError, StoreLocked, UsageError
 from merge_runner.scenarios.merge.measures import measures_sql, measures_version
 from merge_runner.text_safety import first_line, quoted
 
-SCHEMA_VERSION = 9
+SCHEMA_VERSION = 10
 SCHEMA = Path(__file__).with_name("schema.sql")
 """The tables; see ``schema_sql`` for all that a database has."""
 LOCK_RETRY_S = 0.05

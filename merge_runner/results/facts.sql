@@ -72,7 +72,7 @@ FROM decisions SEMI JOIN played USING (trial_id, spec_hash);
 -- other's; the action is the net acceleration over the first step, of the fallback where the reply
 -- was invalid; the share of M is that among answers with a tactical word.
 CREATE OR REPLACE TEMP VIEW first_looks AS
-WITH asked AS (FROM played WHERE source = 'seat' AND status <> 'failed')
+WITH asked AS (FROM played WHERE source = 'first_decision' AND status <> 'failed')
 SELECT driver, variant, if(side = 'left', model_left, model_right) AS model, side,
     if(side = 'left', 1, -1) * relative_velocity_mps + 0 AS relative_velocity_mps,
     count(*) AS asked, count(*) FILTER (NOT valid) AS invalid,

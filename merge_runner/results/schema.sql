@@ -73,12 +73,12 @@ CREATE TABLE trials (
 COMMENT ON TABLE trials IS 'One row per trial. One trial_id may occur with two specs: join and '
     'group by (trial_id, spec_hash).';
 COMMENT ON COLUMN trials.trial_id IS 'drivers/variant/condition/repetition, then the sample set; '
-    'levels of factors follow; of first decisions alone it begins with seat/';
+    'levels of factors follow; that of a first decision begins with seat/';
 COMMENT ON COLUMN trials.spec_hash IS 'hash of all that determines the result, except condition '
     'and rep';
 COMMENT ON COLUMN trials.pair IS 'the human pair; NULL: no human trial';
-COMMENT ON COLUMN trials.source IS 'llm, driver, human; seat: first decisions alone, without the '
-    'closed loop';
+COMMENT ON COLUMN trials.source IS 'llm, driver, human; first_decision: the first decisions '
+    'alone, without the closed loop';
 COMMENT ON COLUMN trials.model_left IS 'left driver: a model of the registry or a program';
 COMMENT ON COLUMN trials.model_right IS 'right driver';
 COMMENT ON COLUMN trials.variant IS 'prompt variant, with its levels of text factors';
@@ -151,12 +151,12 @@ CREATE TABLE decisions (
     prompt_hash VARCHAR,
     call_key VARCHAR,
     other_seen BOOLEAN,
-    told_own_position_m DOUBLE,
-    told_own_speed_mps DOUBLE,
-    told_distance_m DOUBLE,
-    told_other_speed_mps DOUBLE,
-    told_other_acceleration_mps2 DOUBLE,
-    told_other_speeds_mps DOUBLE[]
+    perceived_own_position_m DOUBLE,
+    perceived_own_speed_mps DOUBLE,
+    perceived_distance_m DOUBLE,
+    perceived_other_speed_mps DOUBLE,
+    perceived_other_acceleration_mps2 DOUBLE,
+    perceived_other_speeds_mps DOUBLE[]
 );
 COMMENT ON TABLE decisions IS 'One row per driver and decision instant.';
 COMMENT ON COLUMN decisions.decision IS 'number of the instant at this driver''s rate, 0 at the '
@@ -176,15 +176,15 @@ COMMENT ON COLUMN decisions.prompt_hash IS 'SHA-256 of the prompt';
 COMMENT ON COLUMN decisions.call_key IS 'key in calls; NULL: a program decided';
 COMMENT ON COLUMN decisions.other_seen IS 'whether the other vehicle was seen; NULL: perfect '
     'perception';
-COMMENT ON COLUMN decisions.told_own_position_m IS 'observed value; NULL: the true one';
-COMMENT ON COLUMN decisions.told_own_speed_mps IS 'observed value; NULL: the true one';
-COMMENT ON COLUMN decisions.told_distance_m IS 'observed distance to the other vehicle, ahead '
+COMMENT ON COLUMN decisions.perceived_own_position_m IS 'observed value; NULL: the true one';
+COMMENT ON COLUMN decisions.perceived_own_speed_mps IS 'observed value; NULL: the true one';
+COMMENT ON COLUMN decisions.perceived_distance_m IS 'observed distance to the other vehicle, ahead '
     'positive; NULL: not seen, or the true one';
-COMMENT ON COLUMN decisions.told_other_speed_mps IS 'observed value; NULL: not seen, or the true '
+COMMENT ON COLUMN decisions.perceived_other_speed_mps IS 'observed value; NULL: not seen, or the true '
     'one';
-COMMENT ON COLUMN decisions.told_other_acceleration_mps2 IS 'value that programs observed; NULL: '
+COMMENT ON COLUMN decisions.perceived_other_acceleration_mps2 IS 'value that programs observed; NULL: '
     'not seen, or the true one';
-COMMENT ON COLUMN decisions.told_other_speeds_mps IS 'observed history; NULL: not seen, or the '
+COMMENT ON COLUMN decisions.perceived_other_speeds_mps IS 'observed history; NULL: not seen, or the '
     'true one';
 
 CREATE TABLE calls (
@@ -246,13 +246,13 @@ CREATE MACRO driver_name(model, endpoint) AS
 CREATE VIEW perceptions AS
 SELECT trial_id, spec_hash, decision, decisions.time_s, decisions.side, other_seen,
     other.position_m - own.position_m AS distance_m,
-    told_distance_m,
+    perceived_distance_m,
     other.velocity_mps AS other_speed_mps,
-    told_other_speed_mps,
+    perceived_other_speed_mps,
     own.position_m AS own_position_m,
-    told_own_position_m,
+    perceived_own_position_m,
     own.velocity_mps AS own_speed_mps,
-    told_own_speed_mps
+    perceived_own_speed_mps
 FROM decisions
 JOIN states AS own USING (trial_id, spec_hash, time_s, side)
 JOIN states AS other USING (trial_id, spec_hash, step)

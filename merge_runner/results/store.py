@@ -72,10 +72,11 @@ SELECT sweep_id FROM sweeps SEMI JOIN (
     FROM sweep_trials SEMI JOIN calls USING (trial_id, spec_hash)
 ) USING (sweep_id) ORDER BY started_at
 """
-# The first and the third of these columns order the rows of a trial.
+# The first and the third of these columns order the rows of a trial. Digests keep the value that
+# the source of a first decision had in schema 9.
 OF_THE_DIGEST = {
-    "trials": "pair, source, model_left, model_right, variant, condition, rep, sample_set, "
-    "status, merged_first, end_time_s, error",
+    "trials": "pair, if(source = 'first_decision', 'seat', source), model_left, model_right, "
+    "variant, condition, rep, sample_set, status, merged_first, end_time_s, error",
     "states": "step, time_s, side, position_m, velocity_mps, acceleration_mps2",
     "decisions": "decision, time_s, side, valid, failure, tactical, rationale, plan, applied, "
     "fallback, prompt",

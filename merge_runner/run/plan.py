@@ -312,7 +312,7 @@ class Plan(BaseModel):
             TrialSpec(
                 trial_id=self.trial_id_of(arm, condition, repetition),
                 spec_hash=hashed,
-                source="seat" if self.seat else "llm" if arm.entries else "driver",
+                source="first_decision" if self.seat else "llm" if arm.entries else "driver",
                 model_left=arm.sides["left"],
                 model_right=arm.sides["right"],
                 variant=arm.variant,
@@ -469,8 +469,8 @@ def _first_decision(arm: Arm) -> Arm:
     """The arm in trials whose time is up before their drivers would decide again.
 
     Such a trial is planned, played, kept and checked as any other; its calls have the texts and the
-    slots, and so the keys, of the first decisions of the study's sweep. Its source is ``seat``,
-    which tables of trials that were driven to their end leave out
+    slots, and so the keys, of the first decisions of the study's sweep. Its source is
+    ``first_decision``, which tables of trials that were driven to their end leave out
     (``merge_runner_analysis.frames.TRIALS``).
     """
     given = arm.scenario.model_dump(exclude_unset=True)

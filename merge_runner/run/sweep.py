@@ -599,7 +599,7 @@ def _others_under_the_cap(
 def _played_as(spec: TrialSpec) -> str:
     """The drivers and the prompt of a trial, as its name begins."""
     name = spec.trial_id.rsplit("/", 2)[0]
-    return name.removeprefix("seat/") if spec.source == "seat" else name
+    return name.removeprefix("seat/") if spec.source == "first_decision" else name
 
 
 def _unbalanced(waiting: Counter[str]) -> str:

@@ -87,7 +87,7 @@ async def test_an_outcome_holds_the_trials_of_its_own_sweep_which_a_replay_gives
 async def test_first_situations_are_asked_alone_in_the_conditions_or_on_a_grid(folder):
     wanted = {"temperature": 0.2, "memory_s": 2.0, "opponent": "self"}
     outcome = await Study("study.toml", only=wanted).arun(first=True)
-    assert set(outcome.trials()["source"]) == {"seat"}
+    assert set(outcome.trials()["source"]) == {"first_decision"}
     assert sum(look["asked"] for look in outcome.facts["first_looks"]) == 4
     gridded = await Study("study.toml", only=wanted).arun(first=True, grid="h=2,dv=0:0.8:0.4")
     assert set(gridded.trials()["relative_velocity_mps"]) == {0.0, 0.4, 0.8}

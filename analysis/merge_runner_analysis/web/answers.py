@@ -68,7 +68,9 @@ class Numbers:
             case _:
                 raise UsageError(f"nothing answers {request!r}")
         with read_database(self.db) as connection:
-            counted = connection.execute("SELECT count(*) FROM trials WHERE source <> 'seat'")
+            counted = connection.execute(
+                "SELECT count(*) FROM trials WHERE source <> 'first_decision'"
+            )
             return {"counted": counted.fetchall()[0][0], **found}
 
     @cached_property

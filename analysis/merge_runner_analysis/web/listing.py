@@ -103,7 +103,7 @@ SELECT row_number() OVER (ORDER BY trials.trial_id, spec_hash)::INTEGER AS numbe
     decisions, asked, invalid, fallbacks, no_decision, attempts, cost_usd, faults, answers, others,
     unpriced, of_several, left_mps, right_mps, left_range_mps,
     right_range_mps, levels
-FROM (FROM trials WHERE source <> 'seat') AS trials
+FROM (FROM trials WHERE source <> 'first_decision') AS trials
 JOIN trial_metrics USING (trial_id, spec_hash)
 JOIN trial_drivers USING (trial_id, spec_hash)
 JOIN posed USING (trial_id, spec_hash) JOIN said USING (place)
@@ -114,7 +114,7 @@ LEFT JOIN (
         list(struct_pack(reply := hash(call_key, attempt), usd := cost_usd)) AS of_several
     FROM calls SEMI JOIN (
         SELECT call_key, attempt FROM calls JOIN trials USING (trial_id, spec_hash)
-        WHERE source <> 'seat' GROUP BY ALL HAVING count(*) > 1
+        WHERE source <> 'first_decision' GROUP BY ALL HAVING count(*) > 1
     ) USING (call_key, attempt) GROUP BY ALL
 ) USING (trial_id, spec_hash)
 LEFT JOIN ({ALONE}) USING (trial_id, spec_hash)

@@ -51,7 +51,7 @@ def published_humans() -> pd.DataFrame:
 def read(db: str, study: str = "") -> pd.DataFrame:
     """Every trial with its driver, levels and measures; ``study`` keeps those played for it."""
     with duckdb.connect(db, read_only=True) as connection:
-        trials = connection.sql("FROM trials WHERE source <> 'seat'").df()
+        trials = connection.sql("FROM trials WHERE source <> 'first_decision'").df()
         specs = dict(connection.sql("SELECT spec_hash, spec::TEXT FROM specs").fetchall())
         states = connection.sql("FROM states ORDER BY trial_id, spec_hash, side, step").df()
         decisions = connection.sql(

@@ -52,12 +52,14 @@ async def test_a_sweep_answers_the_situations_and_they_answer_its_first_decision
             tmp_path / DB,
             "select condition, side, step, time_s, position_m, velocity_mps, acceleration_mps2 "
             "from states join trials using (trial_id, spec_hash) "
-            f"where step <= 5 and (source = 'seat') = {seat} order by all",
+            f"where step <= 5 and (source = 'first_decision') = {seat} order by all",
         )[1]
         for seat in (False, True)
     )
     assert (situation, len(situation)) == (begun, 2 * 2 * 6)
-    ends = query(tmp_path / DB, "select max(end_time_s) from trials where source = 'seat'")
+    ends = query(
+        tmp_path / DB, "select max(end_time_s) from trials where source = 'first_decision'"
+    )
     assert ends[1] == [(1.0,)]
     elsewhere = (*part, "--db", "other.duckdb", "--cache", "other")
     first = (await merge_runner(*FIRST, *elsewhere)).summary

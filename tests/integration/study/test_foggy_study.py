@@ -38,8 +38,8 @@ range_m = 3.0
 """
 HOST = "127.0.0.1:8700"
 BESIDE = """
-SELECT trial_id, side, told_distance_m - distance_m AS error_m,
-    told_other_speed_mps - other_speed_mps AS error_mps, other_seen
+SELECT trial_id, side, perceived_distance_m - distance_m AS error_m,
+    perceived_other_speed_mps - other_speed_mps AS error_mps, other_seen
 FROM perceptions ORDER BY ALL
 """
 
@@ -66,9 +66,11 @@ async def test_a_foggy_study_replays_sealed_to_the_same_digest_and_is_audited(
     audit = await merge_runner("audit", "--db", "r")
     assert (audit.code, "12 replayed" in audit.out) == (0, True), audit.out
     with duckdb.connect(str(tmp_path / "r")) as connection:
-        connection.execute("UPDATE decisions SET told_distance_m = told_distance_m + 0.01")
+        connection.execute(
+            "UPDATE decisions SET perceived_distance_m = perceived_distance_m + 0.01"
+        )
     audit = await merge_runner("audit", "--db", "r")
-    assert (audit.code, "decisions.told_distance_m" in audit.out) == (1, True)
+    assert (audit.code, "decisions.perceived_distance_m" in audit.out) == (1, True)
 
 
 def test_what_was_so_stands_beside_what_was_told(db):
@@ -90,7 +92,7 @@ def test_what_was_so_stands_beside_what_was_told(db):
 def test_the_prompt_says_what_was_told_and_not_what_was_so(db):
     _, rows = query(
         db,
-        "SELECT prompt, other_seen, told_distance_m, told_other_speed_mps FROM decisions "
+        "SELECT prompt, other_seen, perceived_distance_m, perceived_other_speed_mps FROM decisions "
         "WHERE prompt IS NOT NULL AND other_seen IS NOT NULL",
     )
     assert {seen for _, seen, *_ in rows} == {True, False}
@@ -112,7 +114,7 @@ def test_the_panel_of_a_decision_shows_both_beside_each_other(db):
 
     with duckdb.connect(str(db), read_only=True) as connection:
         so, told = connection.execute(
-            "SELECT distance_m, told_distance_m FROM perceptions WHERE side = 'right' "
+            "SELECT distance_m, perceived_distance_m FROM perceptions WHERE side = 'right' "
             "AND decision = 0 AND trial_id = 'emulator/told_more/L_4_0/rep01/perception=foggy'"
         ).fetchone()
     said = f"how far ahead the other is (m) {so:.2f} {told:.2f} {told - so:+.2f}"
