@@ -30,6 +30,10 @@ SENT = {
     },
     "my-model": {"model": "qwen3-32b", "temperature": 0.7, "top_p": 0.95},
     "my-azure-o3": {"model": "my-deployment", "max_completion_tokens": 16000},
+    "llama-70b": {
+        "model": "meta-llama/llama-3.3-70b-instruct",
+        "provider": {"order": ["deepinfra"], "allow_fallbacks": False},
+    },
 }
 
 
