@@ -32,7 +32,7 @@ def test_every_command_and_every_make_target_is_in_the_docs():
 
 
 def test_what_a_person_reads_is_short_and_in_plain_words():
-    words = {page.name: len(page.read_text().split()) for page in WRITTEN}
+    words = {page: len(page.read_text().split()) for page in WRITTEN}
     assert sum(words.values()) <= 20_000, words
     assert len(words) <= 22
     assert len((PROJECT / "README.md").read_text().split()) <= 900
