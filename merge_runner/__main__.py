@@ -7,8 +7,8 @@ import sys
 
 
 def main() -> None:
-    """Run all commands, those of the analysis among them."""
-    from merge_runner_analysis.commands import main as run
+    """Run the command line, which is imported only after the path is set."""
+    from merge_runner.cli import main as run
 
     run()
 

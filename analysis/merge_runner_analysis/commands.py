@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from merge_runner.cli import app, main
+from merge_runner.cli import app
 from merge_runner.cli import options as cli
 from merge_runner.cli.app import KEEP, LOOK, PLAY
 from merge_runner.cli.options import (
@@ -40,8 +40,6 @@ from merge_runner_analysis.table_format import TableFormat
 
 if TYPE_CHECKING:
     from merge_runner_analysis.study import Study
-
-__all__ = ["app", "main"]
 
 HTML = b"<!doctype html"
 TOLD_EVERY = 100  # pages

@@ -1,5 +1,5 @@
 """The command line. Results go to stdout, progress and messages to stderr."""
 
-from merge_runner.cli.app import app, main
+from merge_runner.cli.app import app, complete_app, main
 
-__all__ = ["app", "main"]
+__all__ = ["app", "complete_app", "main"]

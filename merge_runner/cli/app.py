@@ -16,6 +16,7 @@ from merge_runner import __version__
 from merge_runner.cli import commands
 from merge_runner.cli.help import Program
 from merge_runner.cli.options import flag, print_out
+from merge_runner.cli.packages import load_commands
 from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner.text_safety import say
 
@@ -54,6 +55,15 @@ for _panel, _commands in {
     for _command in _commands:
         app.command(rich_help_panel=_panel)(_command)
 app.add_typer(commands.recording_app, name="recording", rich_help_panel=KEEP)
+# No other command needs to be looked up to run one of these.
+OWN = {info.callback.__name__ for info in app.registered_commands if info.callback}
+OWN |= {str(info.name) for info in app.registered_groups}
+
+
+def complete_app() -> typer.Typer:
+    """Return the program with the commands of all installed packages."""
+    load_commands()
+    return app
 
 
 def alone(command: str | None) -> typer.Typer:
@@ -82,7 +92,10 @@ def main() -> None:
     completing = COMPLETION in os.environ  # a shell asks, whose words are not in argv
     words = (argument for argument in sys.argv[1:] if not argument.startswith("-"))
     try:
-        run = app if completing else alone(next(words, None))
+        command = next(words, None)
+        if completing or sys.argv[1:2] != [command] or command not in OWN:
+            load_commands()
+        run = app if completing else alone(command)
         sys.exit(run(prog_name="merge-runner", standalone_mode=False))
     except typer.Abort:
         say("Aborted!")

@@ -18,7 +18,8 @@ import pytest
 import typer.main
 from typer.testing import CliRunner
 
-from merge_runner_analysis.commands import app, open_browser
+from merge_runner.cli import complete_app
+from merge_runner_analysis.commands import open_browser
 from merge_runner_analysis.tables import TABLES
 from tests.support import program
 from tests.support.harness import PROGRAM, environment
@@ -41,8 +42,8 @@ SQL = "select condition, count(*) as n from trials group by all order by all lim
 
 
 def test_every_help_has_a_short_form_and_cuts_no_line():
-    for path, _ in every_command(typer.main.get_command(app)):
-        run = CliRunner().invoke(app, [*path, "-h"], env={"COLUMNS": "80"})
+    for path, _ in every_command(typer.main.get_command(complete_app())):
+        run = CliRunner().invoke(complete_app(), [*path, "-h"], env={"COLUMNS": "80"})
         assert run.exit_code == 0, path
         for line in run.output.splitlines()[2:]:  # the usage goes first
             assert len(line) <= 80, (path, line)
@@ -61,20 +62,20 @@ def groups_of(shown):
 
 
 def test_the_menu_and_the_options_of_a_sweep_are_in_groups():
-    menu = groups_of(CliRunner().invoke(app, ["-h"]).output)
+    menu = groups_of(CliRunner().invoke(complete_app(), ["-h"]).output)
     assert [*menu][-4:] == ["Play", "Look", "Keep", "Check"]
     assert {"sweep", "replay", "init", "power"} <= {*menu["Play"]}
     assert {"tables", "explain", "figures", "report", "view", "sql"} == {*menu["Look"]}
     assert {"recording", "export", "forget", "human"} == {*menu["Keep"]}
     assert {"audit", "digest", "ledger"} == {*menu["Check"]}
-    options = groups_of(CliRunner().invoke(app, ["sweep", "-h"]).output)
+    options = groups_of(CliRunner().invoke(complete_app(), ["sweep", "-h"]).output)
     assert len(options) > 5
     assert "Options" not in options or options["Options"] == ["-h,"]
     assert {"--max-cost", "--dry-run", "--rpm"} <= {*options["Money and pace"]}
 
 
 def test_every_command_has_an_example_that_it_can_read():
-    for path, command in every_command(typer.main.get_command(app)):
+    for path, command in every_command(typer.main.get_command(complete_app())):
         if not hasattr(command, "commands"):
             (example,) = re.findall("^Example: (.*)$", command.help, re.MULTILINE)
             words = shlex.split(example)
@@ -83,7 +84,7 @@ def test_every_command_has_an_example_that_it_can_read():
 
 
 def test_the_help_of_tables_names_each_of_them():
-    shown = CliRunner().invoke(app, ["tables", "-h"]).output
+    shown = CliRunner().invoke(complete_app(), ["tables", "-h"]).output
     assert {*TABLES} <= {*re.findall(r"[\w-]+", " ".join(shown.split()))}
 
 

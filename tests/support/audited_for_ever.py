@@ -6,8 +6,8 @@ import time
 from pathlib import Path
 
 from merge_runner.audit.checks import audit_sweep, audited_database
+from merge_runner.cli import main
 from merge_runner.run import sweep
-from merge_runner_analysis.commands import main
 
 
 def audited(path, sweep_id, planned, *, finished):

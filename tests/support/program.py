@@ -16,9 +16,9 @@ from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdo
 from pathlib import Path
 from unittest.mock import patch
 
+from merge_runner.cli import main
 from merge_runner.results import database
 from merge_runner_analysis import cache
-from merge_runner_analysis.commands import main
 from tests.support.harness import PROGRAM, Run
 
 # A folder, an environment and streams are those of the whole process.

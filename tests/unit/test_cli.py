@@ -8,9 +8,9 @@ import typer.main
 from typer.testing import CliRunner
 
 import merge_runner as package
+from merge_runner.cli import complete_app
 from merge_runner.cli.app import alone
 from merge_runner.run.plan import Options
-from merge_runner_analysis.commands import app
 
 COMMANDS = {
     *("sweep", "replay", "sql", "digest", "models", "emulate", "recording", "audit"),
@@ -40,7 +40,7 @@ WORDS = """sweep mine.toml --first --grid h=0:1:1,dv=0:1:1 --model emulator+cons
 
 
 def test_the_menu_is_what_was_promised():
-    command = typer.main.get_command(app)
+    command = typer.main.get_command(complete_app())
     assert set(command.commands) == COMMANDS
     assert {o for p in command.commands["sweep"].params for o in p.opts} >= SWEEP_OPTIONS
     assert set(command.commands["recording"].commands) == {"export", "import", "verify", "info"}
@@ -50,10 +50,10 @@ def test_the_menu_is_what_was_promised():
 
 
 def test_a_command_has_its_options_where_those_of_the_others_are_left_out():
-    whole = typer.main.get_command(app)
-    for name in whole.commands:
+    whole = complete_app()
+    for name in typer.main.get_command(whole).commands:
         for words in ([name, "-h"], ["-h"]):
-            shown, same = (CliRunner().invoke(each, words).output for each in (alone(name), app))
+            shown, same = (CliRunner().invoke(each, words).output for each in (alone(name), whole))
             assert shown == same
             assert "Usage:" in shown
 
@@ -65,7 +65,7 @@ def every_command(command, path=()):
 
 
 def test_every_command_that_prints_a_result_prints_it_as_json():
-    for path, command in every_command(typer.main.get_command(app)):
+    for path, command in every_command(typer.main.get_command(complete_app())):
         if not hasattr(command, "commands") and " ".join(path) not in PRINT_NO_RESULT:
             assert any("--json" in parameter.opts for parameter in command.params), path
 
@@ -83,9 +83,9 @@ def test_every_option_of_a_sweep_reaches_its_plan_or_its_run(monkeypatch, tmp_pa
     monkeypatch.setattr("merge_runner.run.sweep.play", play)
     words = WORDS.split()
     monkeypatch.setattr(sys, "argv", ["merge-runner", *words])
-    assert CliRunner().invoke(app, words).exit_code == 0
+    assert CliRunner().invoke(complete_app(), words).exit_code == 0
     options = ("--conditions", "L_4_8", "--recording", "r.parquet", "--model", "emulator", "--json")
-    assert CliRunner().invoke(app, ["replay", "mine.toml", *options]).exit_code == 0
+    assert CliRunner().invoke(complete_app(), ["replay", "mine.toml", *options]).exit_code == 0
     (plan, options, whole), (replayed, replaying, _) = played
     assert whole
     assert options == Options(

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import typer.main
 
-from merge_runner_analysis.commands import app
+from merge_runner.cli import complete_app
 from merge_runner_analysis.published import published
 from tests.support.harness import PROJECT
 
 DOCS = PROJECT / "docs"
 PAGES_OF_THE_PROGRAM = ("commands", "model-list", "promises", "prompt-blocks", "python", "tables")
-PAGES = [PROJECT / "README.md", *PROJECT.glob("plugins/*/README.md"), *DOCS.rglob("*.md")]
+PAGES = [PROJECT / "README.md", *PROJECT.glob("analysis/research/*/README.md"), *DOCS.rglob("*.md")]
 GENERATED = {DOCS / f"{name}.md" for name in PAGES_OF_THE_PROGRAM}
 WRITTEN = [PROJECT / "README.md", *sorted({*DOCS.glob("*.md")} - GENERATED)]
 # Words of a dialect that a reader would have to learn.
@@ -23,7 +23,7 @@ LINKING = [*PAGES, *PROJECT.glob("*.md"), *PROJECT.glob("*/README.md")]
 
 def test_every_command_and_every_make_target_is_in_the_docs():
     text = "\n".join(page.read_text() for page in PAGES)
-    command = typer.main.get_command(app)
+    command = typer.main.get_command(complete_app())
     for name in command.commands:
         assert f"merge-runner {name}" in text or f"make {name}" in text, name
     targets = re.findall(r"^([a-z]+):.*## ", (PROJECT / "Makefile").read_text(), re.MULTILINE)

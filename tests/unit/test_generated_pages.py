@@ -11,10 +11,10 @@ import pytest
 import typer
 import typer.main
 
+from merge_runner.cli import complete_app
 from merge_runner.config import ScenarioConfig
 from merge_runner.llm.models import read_models
 from merge_runner.prompts.blocks import BLOCKS, FIELDS, VARIANTS, Situation
-from merge_runner_analysis.commands import app
 from tests.support.harness import PROJECT, asked_to_write
 from tests.unit.prompts.test_render import FIRST
 
@@ -56,7 +56,7 @@ def _commands() -> Iterator[str]:
     yield COMMANDS
     targets = re.findall(r"^([a-z-]+):.*## (.*)", (PROJECT / "Makefile").read_text(), re.MULTILINE)
     yield from (f"| `make {target}` | {does} |\n" for target, does in targets)
-    whole = typer.main.get_command(app)
+    whole = typer.main.get_command(complete_app())
     root = typer.Context(
         whole,
         info_name="merge-runner",
@@ -126,7 +126,7 @@ def test_a_generated_page_is_what_the_program_says(name):
 
 
 def test_every_option_says_what_it_does():
-    for name, command in typer.main.get_command(app).commands.items():
+    for name, command in typer.main.get_command(complete_app()).commands.items():
         for inner in getattr(command, "commands", {"": command}).values():
             for param in inner.params:
                 if not getattr(param, "hidden", False):
