@@ -1,4 +1,4 @@
-"""Chance that is a function of its arguments: equal on every machine, in any order."""
+"""Random draws as a function of their arguments: equal on every machine, in any order."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import hashlib
 
 
 def draw(*what: object) -> float:
-    """A uniform number in [0, 1) that depends on the arguments' texts alone."""
+    """Return a uniform number in [0, 1) that depends on the arguments' texts alone."""
     digest = hashlib.sha256("\x1f".join(map(str, what)).encode()).digest()
     return int.from_bytes(digest[:7]) / 2**56
 
 
 def draw_index(count: int, *what: object) -> int:
-    """A uniform whole number in [0, count)."""
+    """Return a uniform whole number in [0, count)."""
     return int(draw(*what) * count)
 
 
 def draw_between(low: float, high: float, *what: object) -> float:
-    """A uniform number between two bounds."""
+    """Return a uniform number between two bounds."""
     return low + (high - low) * draw(*what)

@@ -1,4 +1,4 @@
-"""An effect that a study plants in the emulator, so that an analysis can be rehearsed on it."""
+"""Effect that a study plants in the mock model, to rehearse an analysis on it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ OfOneDriver = Annotated[Number, Field(exclude_if=lambda value: value == 0.0)]
 
 
 class Persona(BaseModel):
-    """What changes where a prompt contains the ``text``: each number is added to its namesake."""
+    """Change of the effect by a prompt that contains ``text``: each number is added."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
@@ -31,14 +31,15 @@ class Persona(BaseModel):
 
 
 class PlantedEffect(BaseModel):
-    """Who goes first: logit P(left first) = k (x_left_first + x_headway h + x_relative_speed dv).
+    """Odds of going first in the mock model, as planted by a study.
 
-    h is the projected headway in m, dv the relative speed in m/s, both left minus right, and
-    k = exp(-x_temperature (T - 1)) at the request's ``temperature`` T. What is not given is as in
-    humans (arXiv 2604.09609, Table III). ``x_noise`` is the standard deviation of what is added to
-    the logit of each trial; it flattens the coefficients that a regression finds. ``x_gap_m`` is
-    added to the gap that both aim at. ``x_own_first`` is added to the log-odds that the driver goes
-    first that is asked with it, ``x_other_first`` to those of the driver that it meets.
+    logit P(left first) = k (x_left_first + x_headway h + x_relative_speed dv): h is the projected
+    headway in m, dv the relative speed in m/s, both left minus right, and
+    k = exp(-x_temperature (T - 1)) at the request's ``temperature`` T. The defaults are those of
+    humans (arXiv 2604.09609, Table III). ``x_noise`` is the standard deviation of noise in the
+    logit of each trial; it lowers the coefficients of a regression. ``x_gap_m`` is added to the gap
+    that both aim at. ``x_own_first`` is added to the log-odds that the asked driver goes first,
+    ``x_other_first`` to those of the other driver.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
@@ -55,9 +56,9 @@ class PlantedEffect(BaseModel):
     temperature: Temperature = 1.0
 
     def before(self, prompt: str, sign: int = 1) -> Self:
-        """The effect on the reader of this prompt, without a persona, as the left driver has it.
+        """Return the effect with the persona of this prompt applied, as the left driver has it.
 
-        ``sign`` is 1 where the reader is on the left and -1 where it is on the right.
+        ``sign`` is 1 if the asked driver is on the left and -1 if it is on the right.
         """
         persona, added = self.x_persona, {}
         if persona is not None and persona.text in prompt:
@@ -69,12 +70,12 @@ class PlantedEffect(BaseModel):
 
     @property
     def lead(self) -> float:
-        """What is added to the log-odds that the driver goes first that is asked."""
+        """Log-odds that are added for the asked driver to go first."""
         return self.x_own_first - self.x_other_first
 
     @property
     def coefficients(self) -> tuple[float, float, float]:
-        """Those of the left driver's logit, without noise: the intercept, that of h and of dv."""
+        """Coefficients of the left driver's logit, without noise: intercept, h and dv."""
         k = math.exp(-self.x_temperature * (self.temperature - 1))
         return k * (self.x_left_first + self.lead), k * self.x_headway, k * self.x_relative_speed
 
@@ -84,7 +85,7 @@ PARAMETERS = frozenset(name for name in PlantedEffect.model_fields if name.start
 
 
 def planted_fields(parameters: dict[str, JsonValue]) -> dict[str, JsonValue]:
-    """Those of a request's parameters that say what is planted; empty where nothing is."""
+    """Return the parameters of a request that plant an effect; empty if none does."""
     planted = {name: value for name, value in parameters.items() if name.startswith(PREFIX)}
     if planted and "temperature" in parameters:
         planted["temperature"] = parameters["temperature"]

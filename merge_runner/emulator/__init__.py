@@ -1,1 +1,1 @@
-"""The emulator: a mock model in the place of a provider, with a scripted driver behind it."""
+"""The emulator: a mock model in place of a provider."""

@@ -1,4 +1,4 @@
-"""The emulator answers HTTP requests: within this process, as a transport of httpx, or as a server.
+"""The emulator as a handler of HTTP requests: a transport of httpx, or the core of its server.
 
 Requests and responses are those of httpx in both cases.
 """
@@ -30,9 +30,9 @@ from merge_runner.records import (
 )
 
 MODEL, RANDOM_MODEL = "scripted-driver", "random-driver"
-# What anything but a chat request can raise: refused with 400.
+# A body that is no chat request can raise these: it is refused with 400.
 UNREADABLE = (ValueError, TypeError, AttributeError, KeyError, IndexError, RecursionError)
-# How OpenAI, Gemini and Anthropic name it.
+# The names of a refusal by OpenAI, Gemini and Anthropic.
 REFUSAL = {"type": "invalid_request_error", "code": 400, "status": "INVALID_ARGUMENT"}
 CREATED = 1_760_000_000
 Body = dict[str, Any]
@@ -40,13 +40,12 @@ Body = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class ServedFormat:
-    """A wire format from the server's side.
+    """Wire format on the server's side.
 
-    ``path`` is a regular expression. A request has its messages in the member ``turns``, or is one
-    text there, and the text of a message in ``content``; ``parameters_in`` names the member with
-    its parameters, if they do not stand at the top. ``answer`` makes a body of an id, the model,
-    the text and the billed tokens: those of the prompt, of the output, and those of the output that
-    no reply shows.
+    ``path`` is a regular expression. The member ``turns`` of a request has its messages, or one
+    text; ``content`` of a message has its text; ``parameters_in`` names the member with the
+    parameters (None: the top level). ``answer`` makes a response's body of an id, the model, the
+    text and the billed tokens: of the prompt, of the output, and of reasoning within the output.
     """
 
     path: str
@@ -67,7 +66,7 @@ class ServedFormat:
 
 
 def _chat(reply: str, model: str, text: str, tokens: int, output: int, reasoning: int) -> Body:
-    """Whole, as in the shipped recording, which the emulator makes byte for byte."""
+    """Return every member of a response, so that the shipped recording stays byte for byte."""
     message: Body = {"role": "assistant", "content": text, "refusal": None, "annotations": []}
     return {
         "id": f"chatcmpl-{reply}",
@@ -156,11 +155,8 @@ SERVED = (CHAT, RESPONSES, GEMINI, MESSAGES)
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
-    """A chat request as it came; ``slot`` and ``attempt`` as the client sent them.
-
-    ``model`` is the one in the path, where it stands there.
-    """
+class ReceivedRequest:
+    """A chat request; ``slot`` and ``attempt`` are headers, ``model`` is the one in the path."""
 
     wire: ServedFormat
     path: str
@@ -171,12 +167,12 @@ class Asked:
 
     @property
     def body_sha256(self) -> str:
-        """The hash of its body."""
+        """SHA-256 of the body."""
         return hashlib.sha256(self.raw).hexdigest()
 
     @property
     def where(self) -> str:
-        """The name of the request among all that may be asked."""
+        """Identity of the request: its slot, or the hash of its body."""
         return self.slot or self.body_sha256
 
 
@@ -184,21 +180,21 @@ class Emulator:
     """Answers chat requests of every format in SERVED."""
 
     def __init__(self) -> None:
-        self._asked: Counter[str] = Counter()
+        self._attempts: Counter[str] = Counter()
 
     def transport(self) -> httpx.MockTransport:
-        """Return a transport that carries requests here: no server, no socket."""
+        """Return a transport that passes requests to this emulator, without a socket."""
         return httpx.MockTransport(self.respond)
 
     async def respond(self, request: httpx.Request) -> httpx.Response:
-        """Answer a request of any kind."""
+        """Return the response to any request."""
         path = request.url.path
         if (request.method, path) == ("GET", "/v1/models"):
             model = {"id": MODEL, "object": "model", "owned_by": "emulator"}
             return as_json({"object": "list", "data": [model]})
         for wire in SERVED:
             if request.method == "POST" and (match := re.fullmatch(wire.path, path)):
-                asked = Asked(
+                received = ReceivedRequest(
                     wire,
                     path,
                     request.content,
@@ -207,31 +203,31 @@ class Emulator:
                     request.headers.get(ATTEMPT_HEADER, ""),
                 )
                 try:
-                    return await self.reply(asked, self.attempt(asked))
+                    return await self.reply(received, self.attempt(received))
                 except UsageError as exc:
                     error = {**REFUSAL, "message": str(exc)}
                     return as_json({"type": "error", "error": error, SCRIPTED_FIELD: True}, 400)
         return as_response(b"404: Not Found", 404, {"content-type": "text/plain"})
 
-    def attempt(self, asked: Asked) -> int:
-        """Return the attempt's number: the client's own count, or how often this was asked."""
-        self._asked[asked.where] += 1
-        is_number = re.fullmatch("[0-9]{1,6}", asked.attempt)
-        return int(asked.attempt) if is_number else self._asked[asked.where]
+    def attempt(self, received: ReceivedRequest) -> int:
+        """Return the number of the attempt: the client's, or the count of equal requests."""
+        self._attempts[received.where] += 1
+        is_number = re.fullmatch("[0-9]{1,6}", received.attempt)
+        return int(received.attempt) if is_number else self._attempts[received.where]
 
-    async def reply(self, asked: Asked, attempt: int) -> httpx.Response:
-        """Return the response to a chat request; raises UsageError where it is none."""
-        return as_json(self.answer(asked, attempt))
+    async def reply(self, received: ReceivedRequest, attempt: int) -> httpx.Response:
+        """Return the response to a chat request; raise UsageError if it is none."""
+        return as_json(self.answer(received, attempt))
 
-    def answer(self, asked: Asked, attempt: int) -> Body:
-        """Return the body of an answer; raises UsageError where the request is none."""
+    def answer(self, received: ReceivedRequest, attempt: int) -> Body:
+        """Return the body of that response; raise UsageError if the request is no chat request."""
         try:
-            body = json.loads(asked.raw)
-            slot = None if asked.slot is None else Slot(**json.loads(asked.slot))
-            prompt = asked.wire.prompt(body)
-            model = asked.model or str(body.get("model", MODEL))
+            body = json.loads(received.raw)
+            slot = None if received.slot is None else Slot(**json.loads(received.slot))
+            prompt = received.wire.prompt(body)
+            model = received.model or str(body.get("model", MODEL))
             (prompt + model).encode()
-            planted = planted_fields(asked.wire.parameters(body))
+            planted = planted_fields(received.wire.parameters(body))
         except UNREADABLE as exc:
             raise UsageError("The body is not valid.") from exc
         effect = validated(PlantedEffect, planted, "the emulator") if planted else None
@@ -242,23 +238,24 @@ class Emulator:
         # A token is about four bytes.
         tokens_in, visible = len(prompt.encode()) // 4, len(text.encode()) // 4
         reasoning = 200 + draw_index(600, "reasoning", prompt)
-        # Only the same attempt at the same request gets the same id: the audit takes one that
-        # comes back for an answer that was given twice.
-        which = f"{asked.path} {asked.where} {attempt}".encode()
-        reply = hashlib.sha256(asked.raw + which).hexdigest()[:24]
-        told = asked.wire.answer(reply, model, text, tokens_in, visible + reasoning, reasoning)
-        request = {"body_sha256": asked.body_sha256, "slot": slot and slot.as_dict()}
-        return {**told, ANSWERED_FIELD: request, SCRIPTED_FIELD: True}
+        # Another attempt gets another id: the audit reports an id that occurs twice.
+        identity = f"{received.path} {received.where} {attempt}".encode()
+        reply = hashlib.sha256(received.raw + identity).hexdigest()[:24]
+        answered = received.wire.answer(
+            reply, model, text, tokens_in, visible + reasoning, reasoning
+        )
+        request = {"body_sha256": received.body_sha256, "slot": slot and slot.as_dict()}
+        return {**answered, ANSWERED_FIELD: request, SCRIPTED_FIELD: True}
 
 
 def as_response(body: bytes, status: int, headers: Mapping[str, str]) -> httpx.Response:
-    """Return a response that says that a mock model made it, even an error or what is no JSON."""
-    # The client reads a stream as it reads any other response.
+    """Return a response with the header that names a mock model as its source."""
+    # The client reads its responses as streams.
     stream = httpx.ByteStream(body)
     return httpx.Response(status, headers={**headers, SCRIPTED_HEADER: "true"}, stream=stream)
 
 
 def as_json(body: Body, status: int = 200) -> httpx.Response:
-    """Return a response of JSON."""
+    """Return a JSON response."""
     sent = json.dumps(body, ensure_ascii=False).encode()
     return as_response(sent, status, {"content-type": "application/json"})

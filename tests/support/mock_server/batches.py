@@ -19,7 +19,7 @@ from merge_runner.emulator.handler import (
     MESSAGES,
     RESPONSES,
     UNREADABLE,
-    Asked,
+    ReceivedRequest,
     as_json,
     as_response,
 )
@@ -44,7 +44,7 @@ class Line(NamedTuple):
     """A request within a batch, and when and how it ends: answered, failed or not asked."""
 
     custom_id: str
-    asked: Asked
+    asked: ReceivedRequest
     after_s: float
     kind: str
 
@@ -252,7 +252,7 @@ class BatchMode:
             slot, attempt = line.get(SLOT_HEADER), str(line.get(ATTEMPT_HEADER, ""))
             raw = canonical_json(line[self.body]).encode()
             where = None if slot is None else canonical_json(slot)
-            asked[line[self.key]] = Asked(wire, path, raw, model, where, attempt)
+            asked[line[self.key]] = ReceivedRequest(wire, path, raw, model, where, attempt)
         if len(asked) < max(len(lines), 1):
             raise ValueError("A batch needs lines, each of another id.")
         return asked

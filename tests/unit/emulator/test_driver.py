@@ -6,7 +6,7 @@ import pytest
 from merge_runner.chance import draw, draw_between, draw_index
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.language_model import LanguageModel
-from merge_runner.emulator.driver import NEEDED, Seen, answer, read_prompt
+from merge_runner.emulator.driver import NEEDED, Situation, answer, read_prompt
 from merge_runner.prompts.blocks import VARIANTS, Variant, prompt_of, render_prompt
 from merge_runner.prompts.parse import parse_reply
 from merge_runner.records import SIDES, ChatReply, Slot
@@ -211,7 +211,7 @@ def test_a_table_is_read_as_the_list_is(own_parts):
     for condition in CONDITIONS:
         listed, table = (first_prompt(condition, "left", name) for name in ("baseline", "tabled"))
         assert read_prompt(table) == read_prompt(listed)
-        assert isinstance(read_prompt(table), Seen)
+        assert isinstance(read_prompt(table), Situation)
     assert read_prompt(straight_prompt("tabled")) == read_prompt(straight_prompt())
 
 
