@@ -1,13 +1,13 @@
-"""What may vary, each kind in one table that packages from outside can add to.
+"""Tables of parts by kind (drivers, blocks, conditions, ...), which packages and studies add to.
 
-An installed package that names a module under the entry point group ``merge_runner`` has it
-imported before the first look into any table; what it registers is then as good as built in:
+An installed package names a module under the entry point group ``merge_runner``. It is imported
+before the first look-up in any table, and registers its parts:
 
     [project.entry-points.merge_runner]
     anything = "my_package.my_drivers"
 
-The tables are complete once that is done. What a study adds is in a ``Catalogue`` of its own, which
-the tables show where it is in use: in one thread, or one task of an event loop, and what it begins.
+After that the tables are complete. A study's own parts are in its ``Catalogue``, which the tables
+include where it is in use: in one thread, or in one task of an event loop and the tasks it starts.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 GROUP = "merge_runner"
-# What can stand in a trial's id, on the command line and in an address.
+# A name is a part of trial ids, of the command line and of addresses.
 NAME = re.compile(r"[A-Za-z0-9_.-]+")
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Catalogue:
-    """The parts that a study adds, by kind and name.
+    """Parts that a study adds, by kind and name.
 
     ``text`` is the study's file, ``plugins`` the sources of its plug-ins by file name.
     """
@@ -53,7 +53,7 @@ _installing: ContextVar[bool] = ContextVar("_installing", default=False)
 
 
 def require(things: Mapping[str, T], kind: str, name: str, hint: str = "") -> T:
-    """The thing of this name; raises UsageError."""
+    """Return the thing of this name; raise UsageError."""
     try:
         return things[name]
     except KeyError:
@@ -61,12 +61,12 @@ def require(things: Mapping[str, T], kind: str, name: str, hint: str = "") -> T:
 
 
 class Registry(Mapping[str, T]):
-    """The things of one kind by name, in the order in which they were registered."""
+    """Things of one kind by name, in the order of registration."""
 
     made: ClassVar[list[Registry[Any]]] = []
 
     def __init__(self, kind: str) -> None:
-        """``kind`` is what one of them is called in messages."""
+        """Make an empty table; messages call one of its things ``kind``."""
         self.kind = kind
         self._things: dict[str, T] = {}
         self._complete = False
@@ -75,8 +75,8 @@ class Registry(Mapping[str, T]):
     def register(self, name: str, thing: T) -> T:
         """Add a thing, and return it.
 
-        It belongs to the study whose plug-in registers it. Raises UsageError where the name is
-        taken or odd, and where it belongs neither to a study nor to an installed package.
+        It belongs to the study whose plug-in registers it. Raise UsageError if the name is taken or
+        invalid, or if neither a study nor an installed package registers it.
         """
         if not NAME.fullmatch(name):
             raise UsageError(f"the {self.kind} {name!r} needs a name of letters, digits, _ - and .")
@@ -95,16 +95,16 @@ class Registry(Mapping[str, T]):
         return thing
 
     def complete(self) -> None:
-        """Take nothing more but from installed packages."""
+        """Accept further things from installed packages alone."""
         self._complete = True
 
     def require(self, name: str, hint: str = "") -> T:
-        """See ``require``."""
+        """Return the thing of this name; raise UsageError with the valid names."""
         return require(self, self.kind, name, hint)
 
     @property
     def _all(self) -> ChainMap[str, T]:
-        """Those of the study, and before them those that are installed."""
+        """Installed things, then those of the study in use."""
         load_plugins()
         if not _installing.get():
             self.complete()
@@ -114,7 +114,7 @@ class Registry(Mapping[str, T]):
         return self._all[name]
 
     def items(self) -> ItemsView[str, T]:
-        """All names and things, looked up at once."""
+        """Return all names and things by one look-up."""
         return self._all.items()
 
     def __iter__(self) -> Iterator[str]:
@@ -125,14 +125,14 @@ class Registry(Mapping[str, T]):
 
 
 def in_use() -> Catalogue:
-    """Return the catalogue that the registries show here beside what is installed."""
+    """Return the catalogue of the study in use."""
     return _in_use.get()
 
 
 def use(catalogue: Catalogue) -> None:
-    """Show this catalogue in the registries from now on, in this thread and what it begins.
+    """Use this catalogue from now on, in this thread and what it starts.
 
-    That is for a process that serves one study, as a command or a worker does.
+    It is for a process that serves one study, such as a command or a worker.
     """
     _in_use.set(catalogue)
 
@@ -148,22 +148,22 @@ def _set(variable: ContextVar[T], value: T) -> Iterator[None]:
 
 @contextmanager
 def using(catalogue: Catalogue) -> Iterator[None]:
-    """Show this catalogue in the registries meanwhile, to what runs within."""
+    """Use this catalogue within a ``with`` block."""
     with _set(_in_use, catalogue):
         yield
 
 
 @contextmanager
 def collecting(catalogue: Catalogue) -> Iterator[Catalogue]:
-    """Put what is registered within into a catalogue, and show it meanwhile."""
-    load_plugins()  # first: a study may build on what is installed
+    """Register parts into a catalogue within a ``with`` block, and use it there."""
+    load_plugins()  # first: a study may build on installed parts
     with _set(_in_use, catalogue), _set(_collecting, True):
         yield catalogue
 
 
 @contextmanager
 def installing() -> Iterator[None]:
-    """Take what is registered within for a part of what is installed."""
+    """Register installed parts within a ``with`` block."""
     with _set(_installing, True), _set(_collecting, False):
         yield
 
@@ -172,43 +172,43 @@ _of_results: dict[Path, Catalogue] = {}
 
 
 def remember(db: Path, catalogue: Catalogue) -> None:
-    """Let the tables of a database show what the study adds that stores its trials there."""
+    """Keep the catalogue of the study that stores its trials in this database."""
     _of_results[db.absolute()] = catalogue
 
 
 def in_use_for(db: Path) -> Catalogue:
-    """Return the catalogue in use, or else that of the study that was last planned into ``db``."""
+    """Return the catalogue in use, or else that of the study last planned into ``db``."""
     return in_use() if in_use().text else _of_results.get(db.absolute(), in_use())
 
 
-# What the code of somebody else may raise while it is imported.
+# Errors of a foreign module during its import.
 FAULTS = (ArithmeticError, AttributeError, ImportError, LookupError, NameError, OSError,
           RuntimeError, SyntaxError, TypeError, ValueError)  # fmt: skip
 _loading = threading.RLock()
-_loaded: list[UsageError | None] = []  # what went wrong, once all are imported
+_loaded: list[UsageError | None] = []  # the error or None, once all are imported
 
 
 def plugins() -> list[EntryPoint]:
-    """What installed packages name, in the order in which it is imported."""
+    """Return the entry points of installed packages, in the order of their import."""
     from importlib.metadata import entry_points
 
     return sorted(entry_points(group=GROUP), key=lambda point: (point.value, point.name))
 
 
 def plugin_sources() -> Iterator[Path]:
-    """The folder of each package that a plug-in is a part of, or the file of its module."""
+    """Yield the folder of each plug-in's package, or the file of its module."""
     for name in dict.fromkeys(point.module.partition(".")[0] for point in plugins()):
-        found = find_spec(name)
-        if found is not None:
-            folders = found.submodule_search_locations or [found.origin or ""]
+        spec = find_spec(name)
+        if spec is not None:
+            folders = spec.submodule_search_locations or [spec.origin or ""]
             yield from (Path(folder) for folder in folders if folder)
 
 
 def load_plugins() -> None:
-    """Import what installed packages register, once; raises UsageError where that has failed."""
+    """Import all plug-ins of installed packages, once; raise UsageError if one fails."""
     with _loading:
         if not _loaded:
-            _loaded.append(None)  # before, since a plug-in may look into a table meanwhile
+            _loaded.append(None)  # before the import: a plug-in may look up a table
             with installing():
                 _loaded[0] = _import_all()
             for registry in Registry.made:

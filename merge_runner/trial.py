@@ -144,12 +144,12 @@ class _DriverState:
         self, driver: Driver | LlmDriver, side: Side, scenario: ScenarioConfig, world: World
     ) -> None:
         self.driver, self.side, self._world = driver, side, world
-        self._pace = driver.seat.pace
+        self._pace = driver.context.pace
         self._interval = self._pace.interval_steps
         perception, self._eyes = scenario.perception(side), None
         if perception != PERFECT:
             observe = partial(world.observe, side)
-            self._eyes = Eyes(perception, driver.seat.seed, scenario.step_s, observe)
+            self._eyes = Eyes(perception, driver.context.seed, scenario.step_s, observe)
         self.number = 0  # of its last instant: they count from the start of the trial
         self.told: Observation | None = None
         self._driven: list[float] | None = None  # by step since the decision

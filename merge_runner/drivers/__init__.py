@@ -1,6 +1,14 @@
-"""Whoever decides how a vehicle accelerates: a language model or a plain program."""
+"""Drivers of vehicles: the built-in programs, and language models."""
 
-# The built-in programs, each of which registers itself: the registry knows none of them.
-from merge_runner.drivers import constant, human_odds, idm, projected_order, quantal
+# The built-in programs, each of which registers itself.
+from merge_runner.drivers import (
+    cei,
+    constant,
+    human_odds,
+    human_replay,
+    idm,
+    projected_order,
+    quantal,
+)
 
-__all__ = ["constant", "human_odds", "idm", "projected_order", "quantal"]
+__all__ = ["cei", "constant", "human_odds", "human_replay", "idm", "projected_order", "quantal"]

@@ -1,47 +1,75 @@
-"""What every driver is to a trial, and what it is given."""
+"""The protocol of a driver, and the context that a driver gets for one side of one trial."""
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.pace import Pace
 from merge_runner.errors import UsageError
-from merge_runner.records import Decision, Observation, Side, TrialSpec
+from merge_runner.records import Decision, Observation, Side, TrialSpec, other_side
+from merge_runner.scenarios.merge.vehicle import net_acceleration
+
+Parameter = float | str
 
 
 @dataclass(frozen=True, slots=True)
-class Seat:
-    """What a driver is given for one side of one trial.
+class DriverContext:
+    """Context of a driver for one side of one trial.
 
-    ``seed`` is a whole number below 2**64 from which it draws whatever it leaves to chance.
+    ``seed`` is a whole number below 2**64: all random draws of the driver in this trial come from
+    it. ``other_seed`` is the other side's, so that both sides can share a draw. ``condition`` and
+    ``repetition`` (from 1) are those of the trial. ``parameters`` are those of a program, with the
+    values that a study sets.
     """
 
     scenario: ScenarioConfig
     side: Side
     pace: Pace
     seed: int
+    other_seed: int
+    condition: str
+    repetition: int
+    parameters: Mapping[str, Parameter]
+
+    @property
+    def interval_s(self) -> float:
+        """The time between two decisions."""
+        return self.pace.interval_steps * self.scenario.step_s
+
+    def number(self, name: str) -> float:
+        """Return the value of a parameter that is a number."""
+        value = self.parameters[name]
+        assert not isinstance(value, str), f"{name} is a text"
+        return value
 
     def held(self, action: float) -> Decision:
-        """The decision to hold one normalised acceleration over the whole horizon."""
+        """Return the decision to hold one normalised acceleration over the whole horizon."""
         if not -1 <= action <= 1:
             raise UsageError(f"the {self.side} driver decided {action}: -1 to 1 can be driven")
         pace = self.pace
         return Decision((action,) * pace.plan_actions, (action,) * pace.executed_actions)
 
+    def accelerating(self, net_mps2: float, speed_mps: float) -> Decision:
+        """Return the decision that gives this net acceleration at this speed, within the limits."""
+        resisted = net_acceleration(0.0, speed_mps, self.scenario.resistance)
+        action = (net_mps2 - resisted) / self.scenario.max_acceleration_mps2
+        return self.held(min(1.0, max(-1.0, action)))
+
 
 class Driver(Protocol):
-    """One vehicle's driver for one trial."""
+    """Driver of one vehicle in one trial."""
 
     @property
-    def seat(self) -> Seat:
-        """What it was given."""
+    def context(self) -> DriverContext:
+        """The context that it was made with."""
         ...
 
     async def decide(self, observation: Observation, number: int) -> Decision:
-        """Decide at the ``number``-th instant of its own pace; raises CallFailed.
+        """Return the decision at the ``number``-th instant of its pace; raise CallFailed.
 
         Instants count from 0, the start of control. With the control start ``own_exit`` that is
         the earlier exit, and the first number of the driver that exits later is above 0.
@@ -50,19 +78,37 @@ class Driver(Protocol):
 
 
 class MakeDriver(Protocol):
-    """Whatever makes the driver of a side of a trial: a program, or a language model."""
+    """Factory of the drivers of a side: a program, or a language model."""
 
     def make(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> Driver:
-        """A driver that has not decided yet."""
+        """Return a new driver for one side of a trial."""
         ...
 
 
-def take_seat(scenario: ScenarioConfig, spec: TrialSpec, side: Side, pace: Pace) -> Seat:
-    """The seat of a side of a trial.
+def make_context(
+    scenario: ScenarioConfig,
+    spec: TrialSpec,
+    side: Side,
+    pace: Pace,
+    parameters: Mapping[str, Parameter] | None = None,
+) -> DriverContext:
+    """Return the context of the driver of one side of a trial."""
+    return DriverContext(
+        scenario,
+        side,
+        pace,
+        seed=_seed(spec, side),
+        other_seed=_seed(spec, other_side(side)),
+        condition=spec.condition,
+        repetition=spec.repetition,
+        parameters=parameters or {},
+    )
 
-    Its seed is the first eight bytes of the SHA-256 of condition, repetition, side and sample set:
-    the same on every machine, whoever drives.
+
+def _seed(spec: TrialSpec, side: Side) -> int:
+    """Return the first eight bytes of the SHA-256 of condition, repetition, side and sample set.
+
+    It is the same on every machine, whoever drives.
     """
     slot = f"{spec.condition}/{spec.repetition}/{side}/{spec.sample_set}"
-    seed = int.from_bytes(hashlib.sha256(slot.encode()).digest()[:8])
-    return Seat(scenario, side, pace, seed)
+    return int.from_bytes(hashlib.sha256(slot.encode()).digest()[:8])

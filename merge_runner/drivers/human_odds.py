@@ -1,4 +1,4 @@
-"""A descriptive null: who goes first and the gap are drawn from regressions of the human data."""
+"""The program ``human-odds``, a descriptive null: order and gap by regressions of human data."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from math import exp
 from random import Random
 
-from merge_runner.drivers.program_seat import Parameter, ProgramSeat
+from merge_runner.drivers.base import DriverContext, Parameter
 from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError
 from merge_runner.records import Decision, Observation
@@ -30,33 +30,33 @@ CERTAIN = 700.0  # log odds beyond which exp has no number
 
 @dataclass(slots=True)
 class HumanOddsDriver:
-    """Draws who goes first and how large the gap will be once it sees the other, then never looks.
+    """Driver that draws the order and the gap when it sees the other, and does not look again.
 
-    Until then it keeps its speed. Whoever goes first goes on to keep it. The other one holds one
-    acceleration until the first is at the merge point, with which the gap is then open, and keeps
-    its speed from then on. Both sides draw from both seeds, and so agree where both are told the
-    truth. Under imperfect perception each has odds of its own: both may go first, or neither.
+    Before that it keeps its speed. The first vehicle keeps it. The second one holds one
+    acceleration that opens the gap until the first is at the merge point, and then keeps its speed.
+    Both sides draw from both seeds, and agree under perfect perception. Under imperfect perception
+    their odds differ: both may go first, or neither.
     """
 
-    seat: ProgramSeat
+    context: DriverContext
     _acceleration_mps2: float = 0.0
     _until: float | None = None
-    _chance: Random = field(init=False)
+    _random: Random = field(init=False)
 
     def __post_init__(self) -> None:
-        self._chance = Random(self.seat.seed)
+        self._random = Random(self.context.seed)
 
     async def decide(self, observation: Observation, number: int) -> Decision:
         """Hold the acceleration, or keep the speed."""
         if self._until is None and observation.other_seen:
-            self._until = number + self._choose(observation) / self.seat.interval_s
+            self._until = number + self._choose(observation) / self.context.interval_s
         holding = self._until is not None and number < self._until - 1e-9
-        return self.seat.accelerating(
+        return self.context.accelerating(
             self._acceleration_mps2 if holding else 0.0, observation.own_speed_mps
         )
 
     def _choose(self, seen: Observation) -> float:
-        """Choose the acceleration, and for how many seconds it is held."""
+        """Set the acceleration, and return for how many seconds it is held."""
         distance = seen.distance_to_merge_m
         other_distance = None if distance is None else distance - seen.relative_distance_m
         if distance is None or other_distance is None or min(distance, other_distance) <= 0:
@@ -68,28 +68,28 @@ class HumanOddsDriver:
         headway = velocity * first_s - seen.relative_distance_m
         if self._goes_first(headway, velocity):
             return 0.0
-        wanted = self._gap_m(headway, velocity) + self.seat.scenario.vehicle_length_m
+        distance_m = self._gap_m(headway, velocity) + self.context.scenario.vehicle_length_m
         spare = distance - seen.own_speed_mps * other_s
-        self._acceleration_mps2 = min(0.0, 2 * (spare - wanted) / other_s**2)
+        self._acceleration_mps2 = min(0.0, 2 * (spare - distance_m) / other_s**2)
         return other_s
 
     def _goes_first(self, headway_m: float, velocity_mps: float) -> bool:
-        """A race of two exponential times, which this side wins with the human odds."""
-        number, sign = self.seat.number, 1 if self.seat.side == "left" else -1
+        """Return True if this side wins a race of two exponential times: with the human odds."""
+        number, sign = self.context.number, 1 if self.context.side == "left" else -1
         log_odds = number("odds_intercept") * sign
         log_odds += number("odds_headway") * headway_m + number("odds_velocity") * velocity_mps
-        own, other = self._chance, Random(self.seat.other_seed)
+        own, other = self._random, Random(self.context.other_seed)
         return own.expovariate(1.0) < exp(min(log_odds, CERTAIN)) * other.expovariate(1.0)
 
     def _gap_m(self, headway_m: float, velocity_mps: float) -> float:
-        number = self.seat.number
+        number = self.context.number
         mean_m = (
             number("gap_intercept_m")
             + number("gap_abs_headway") * abs(headway_m)
             + number("gap_abs_velocity_s") * abs(velocity_mps)
             + number("gap_headway_x_velocity_s") * headway_m * velocity_mps
         )
-        return mean_m + number("gap_sd_m") * self._chance.gauss()
+        return mean_m + number("gap_sd_m") * self._random.gauss()
 
 
 def _check(parameters: Mapping[str, Parameter]) -> None:

@@ -1,4 +1,4 @@
-"""The intelligent driver model, behind a virtual leader while the lanes have not merged yet."""
+"""The program ``idm``: the intelligent driver model, with a virtual leader before the merge."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from math import sqrt
 
-from merge_runner.drivers.program_seat import Parameter, ProgramSeat
+from merge_runner.drivers.base import DriverContext, Parameter
 from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError
 from merge_runner.records import Decision, Observation
@@ -30,22 +30,22 @@ SETS = {
         "exponent": 4.0,
     },
 }
-# Of all parameters: within these no power of a speed's share or of a gap's is out of range.
+# Bounds of all parameters: within them no power overflows.
 LEAST, MOST, MOST_EXPONENT = 0.001, 1000, 40
-SHORTEST_GAP_M = 0.1  # a virtual leader may be beside its follower
+SHORTEST_GAP_M = 0.1  # a virtual leader may be level with its follower
 SLOWEST_MPS = 0.1
 TIE_S = 1e-6
 
 
 @dataclass(slots=True)
 class IdmDriver:
-    """Follows whoever would be at the merge point first at present speeds, as if it drove ahead.
+    """Driver that follows the projected earlier arrival at the merge point, as if it drove ahead.
 
-    On a tie the side with the higher seed goes first, so that exactly one of two yields. It wants
-    to drive ``desired_speed_factor`` times the speed at which it was first asked.
+    On a tie the side with the higher seed goes first, so that exactly one of two yields. The
+    desired speed is ``desired_speed_factor`` times the speed at the first decision.
     """
 
-    seat: ProgramSeat
+    context: DriverContext
     _desired_mps: float | None = None
 
     async def decide(self, observation: Observation, number: int) -> Decision:
@@ -53,25 +53,25 @@ class IdmDriver:
         seen = observation
         if self._desired_mps is None:
             first_mps = max(seen.own_speed_mps, SLOWEST_MPS)
-            self._desired_mps = self.seat.number("desired_speed_factor") * first_mps
+            self._desired_mps = self.context.number("desired_speed_factor") * first_mps
         acceleration = self._free(seen.own_speed_mps, self._desired_mps)
         if not self._leads(seen):
             acceleration -= self._interaction(seen)
-        return self.seat.accelerating(acceleration, seen.own_speed_mps)
+        return self.context.accelerating(acceleration, seen.own_speed_mps)
 
     def _free(self, speed_mps: float, desired_mps: float) -> float:
-        share: float = (speed_mps / desired_mps) ** self.seat.number("exponent")
-        return self.seat.number("max_acceleration_mps2") * (1 - share)
+        share: float = (speed_mps / desired_mps) ** self.context.number("exponent")
+        return self.context.number("max_acceleration_mps2") * (1 - share)
 
     def _interaction(self, seen: Observation) -> float:
-        """How much less it accelerates for the leader, a (s*/s)^2."""
-        most = self.seat.number("max_acceleration_mps2")
-        gap = max(seen.relative_distance_m - self.seat.scenario.vehicle_length_m, SHORTEST_GAP_M)
+        """Return the deceleration a (s*/s)^2 behind the leader."""
+        most = self.context.number("max_acceleration_mps2")
+        gap = max(seen.relative_distance_m - self.context.scenario.vehicle_length_m, SHORTEST_GAP_M)
         speed = seen.own_speed_mps
         closing = speed - seen.other_speed_mps
-        braking = 2 * sqrt(most * self.seat.number("comfortable_braking_mps2"))
-        dynamic = speed * self.seat.number("headway_s") + speed * closing / braking
-        wanted = self.seat.number("jam_distance_m") + max(0.0, dynamic)
+        braking = 2 * sqrt(most * self.context.number("comfortable_braking_mps2"))
+        dynamic = speed * self.context.number("headway_s") + speed * closing / braking
+        wanted = self.context.number("jam_distance_m") + max(0.0, dynamic)
         return most * (wanted / gap) ** 2
 
     def _leads(self, seen: Observation) -> bool:
@@ -82,7 +82,7 @@ class IdmDriver:
         own_s = distance / max(seen.own_speed_mps, SLOWEST_MPS)
         other_s = other_distance / max(seen.other_speed_mps, SLOWEST_MPS)
         if abs(own_s - other_s) <= TIE_S:
-            return self.seat.seed > self.seat.other_seed
+            return self.context.seed > self.context.other_seed
         return own_s < other_s
 
 

@@ -1,4 +1,4 @@
-"""When a driver decides, and in what steps it acts: each driver has a pace of its own."""
+"""Decision timing of a driver: control interval, duration of an action, planning horizon."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from merge_runner.errors import UsageError
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """Whole numbers of steps.
+    """Decision timing in whole steps of the world.
 
-    An action lasts ``action_steps`` steps of the world. Of the ``plan_actions`` of a plan
-    ``executed_actions`` are driven before the next decision.
+    An action lasts ``action_steps`` steps. ``executed_actions`` of the ``plan_actions`` of a plan
+    are driven before the next decision.
     """
 
     action_steps: int
@@ -24,19 +24,19 @@ class Pace:
 
     @property
     def interval_steps(self) -> int:
-        """How many steps of the world pass between two decisions."""
+        """Steps between two decisions."""
         return self.action_steps * self.executed_actions
 
 
 def model_pace(scenario: ScenarioConfig) -> Pace:
-    """That of a language model: its prompt rate, and the steps of its plan."""
+    """Return the pace of a language model, by its prompt rate and the steps of its plan."""
     return Pace(scenario.action_steps, scenario.executed_actions, scenario.plan_actions)
 
 
 def program_pace(scenario: ScenarioConfig, rate_hz: float | None) -> Pace:
-    """That of a program with a rate of its own, or at the prompt rate; it acts in every step.
+    """Return the pace of a program, by its rate or else the prompt rate; an action is one step.
 
-    Raises ValueError where the world's step is too long for the rate.
+    Raise ValueError if the world's step does not fit the rate.
     """
     interval_s = 1 / (scenario.prompt_rate_hz if rate_hz is None else rate_hz)
     executed = whole_steps("the time between two decisions", interval_s, scenario.step_s)
@@ -45,7 +45,7 @@ def program_pace(scenario: ScenarioConfig, rate_hz: float | None) -> Pace:
 
 
 def pace_of(scenario: ScenarioConfig, driver: Mapping[str, Any]) -> Pace:
-    """The pace of what a spec says of a driver; raises UsageError."""
+    """Return the pace of a driver in a spec; raise UsageError."""
     if "endpoint" in driver:
         return model_pace(scenario)
     rate_hz = driver.get("rate_hz")

@@ -1,10 +1,10 @@
-"""First come, first served: the projected earlier arrival keeps its speed, the later yields."""
+"""The program ``projected-order``: first come, first served, by projected arrival."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from merge_runner.drivers.base import Seat
+from merge_runner.drivers.base import DriverContext
 from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.records import Decision, Observation
 
@@ -16,18 +16,18 @@ TIE_S = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class ProjectedOrderDriver:
-    """Yields to whoever would arrive first at present speeds; on a tie the right one yields.
+    """Driver that yields to the projected earlier arrival; on a tie the right one yields.
 
-    The yielding vehicle brakes evenly so that the net gap is 3.85 m when the other reaches the
-    merge point, but never harder than 1.5 m/s^2, and then follows at that gap.
+    The yielding vehicle brakes evenly, at most 1.5 m/s^2, for a net gap of 3.85 m when the other
+    reaches the merge point, and then follows at that gap.
     """
 
-    seat: Seat
+    context: DriverContext
 
     async def decide(self, observation: Observation, number: int) -> Decision:
         """Keep speed, open a gap, or follow."""
-        action = self._acceleration(observation) / self.seat.scenario.max_acceleration_mps2
-        return self.seat.held(min(1.0, max(-1.0, action)))
+        action = self._acceleration(observation) / self.context.scenario.max_acceleration_mps2
+        return self.context.held(min(1.0, max(-1.0, action)))
 
     def _acceleration(self, seen: Observation) -> float:
         distance = seen.distance_to_merge_m
@@ -38,19 +38,19 @@ class ProjectedOrderDriver:
             return 0.0
         seconds = other_distance / max(seen.other_speed_mps, 0.1)
         spare = distance - seen.own_speed_mps * seconds
-        wanted = TARGET_GAP_M + self.seat.scenario.vehicle_length_m
-        return min(0.0, max(HARDEST_BRAKING_MPS2, 2 * (spare - wanted) / seconds**2))
+        distance_m = TARGET_GAP_M + self.context.scenario.vehicle_length_m
+        return min(0.0, max(HARDEST_BRAKING_MPS2, 2 * (spare - distance_m) / seconds**2))
 
     def _goes_first(self, seen: Observation, distance: float, other_distance: float) -> bool:
         own_s = distance / max(seen.own_speed_mps, 0.1)
         other_s = other_distance / max(seen.other_speed_mps, 0.1)
         return own_s < other_s - TIE_S or (
-            abs(own_s - other_s) <= TIE_S and self.seat.side == "left"
+            abs(own_s - other_s) <= TIE_S and self.context.side == "left"
         )
 
     def _follow(self, seen: Observation) -> float:
-        """Close the differences in speed and gap within a second and four seconds."""
-        gap = seen.relative_distance_m - self.seat.scenario.vehicle_length_m
+        """Return the acceleration that closes the speed difference in 1 s and the gap's in 4 s."""
+        gap = seen.relative_distance_m - self.context.scenario.vehicle_length_m
         closing = seen.own_speed_mps - seen.other_speed_mps
         return -closing + (min(gap, TARGET_GAP_M) - TARGET_GAP_M) / 4
 

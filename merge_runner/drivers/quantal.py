@@ -1,4 +1,4 @@
-"""A game-theoretic driver of our own: level-1 quantal response on a few actions."""
+"""The program ``quantal``: level-1 quantal response on four actions, a model of our own."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from math import exp
 from random import Random
 
-from merge_runner.drivers.program_seat import Parameter, ProgramSeat
+from merge_runner.drivers.base import DriverContext, Parameter
 from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError
 from merge_runner.records import Decision, Observation
@@ -21,32 +21,32 @@ SLOWEST_MPS = 0.5
 
 @dataclass(slots=True)
 class QuantalDriver:
-    """Thinks that the other keeps its speed, and draws an action by what each would come to.
+    """Driver that assumes a constant speed of the other, and draws an action by its cost.
 
-    An action is held until the next decision, and no acceleration is expected after it. Its cost
-    is the time that it loses, its squared acceleration, and a collision that it leads to within
-    the horizon. The probability of an action is proportional to exp(-precision * cost).
+    An action is held until the next decision, and both speeds are constant after it. Its cost is
+    the sum of lost time, squared acceleration, and a collision within the horizon, each weighted.
+    The probability of an action is proportional to exp(-precision * cost).
     """
 
-    seat: ProgramSeat
+    context: DriverContext
     _desired_mps: float | None = None
-    _chance: Random = field(init=False)
+    _random: Random = field(init=False)
 
     def __post_init__(self) -> None:
-        self._chance = Random(self.seat.seed)
+        self._random = Random(self.context.seed)
 
     async def decide(self, observation: Observation, number: int) -> Decision:
         """Draw an action."""
         if self._desired_mps is None:
             self._desired_mps = max(observation.own_speed_mps, SLOWEST_MPS)
         costs = {action: self._cost(observation, action) for action in self._actions()}
-        precision, least = self.seat.number("precision"), min(costs.values())
+        precision, least = self.context.number("precision"), min(costs.values())
         weights = [exp(-precision * (cost - least)) for cost in costs.values()]
-        (action,) = self._chance.choices(list(costs), weights)
-        return self.seat.accelerating(action, observation.own_speed_mps)
+        (action,) = self._random.choices(list(costs), weights)
+        return self.context.accelerating(action, observation.own_speed_mps)
 
     def _actions(self) -> tuple[float, ...]:
-        number = self.seat.number
+        number = self.context.number
         return (
             -number("hard_braking_mps2"),
             -number("braking_mps2"),
@@ -56,7 +56,7 @@ class QuantalDriver:
 
     def _cost(self, seen: Observation, action_mps2: float) -> float:
         assert self._desired_mps is not None
-        number, held_s = self.seat.number, self.seat.interval_s
+        number, held_s = self.context.number, self.context.interval_s
         ahead_m, speed_mps = advance(0.0, seen.own_speed_mps, action_mps2, held_s)
         rest_m = max(0.0, TRACK.end_m - seen.own_position_m - ahead_m)
         needed_s = held_s + rest_m / max(speed_mps, SLOWEST_MPS)
@@ -68,24 +68,25 @@ class QuantalDriver:
         )
 
     def _leads_to_a_collision(self, seen: Observation, action_mps2: float) -> bool:
-        """Whether there is one at any instant from the end of the action to the horizon."""
+        """Return True if both collide between the end of the action and the horizon."""
         own_m, speed_mps = advance(
-            seen.own_position_m, seen.own_speed_mps, action_mps2, self.seat.interval_s
+            seen.own_position_m, seen.own_speed_mps, action_mps2, self.context.interval_s
         )
         other_m = seen.own_position_m + seen.relative_distance_m
-        nodes = range(int((self.seat.number("horizon_s") - self.seat.interval_s) / NODE_S) + 1)
+        left_s = self.context.number("horizon_s") - self.context.interval_s
+        nodes = range(int(left_s / NODE_S) + 1)
         times_s = [NODE_S * node for node in nodes]
         return any(
             self._collided(
                 own_m + speed_mps * time_s,
-                other_m + seen.other_speed_mps * (self.seat.interval_s + time_s),
+                other_m + seen.other_speed_mps * (self.context.interval_s + time_s),
             )
             for time_s in times_s
         )
 
     def _collided(self, own_m: float, other_m: float) -> bool:
-        places = (own_m, other_m) if self.seat.side == "left" else (other_m, own_m)
-        return collided(self.seat.scenario, TRACK, *places)
+        places = (own_m, other_m) if self.context.side == "left" else (other_m, own_m)
+        return collided(self.context.scenario, TRACK, *places)
 
 
 def _check(parameters: Mapping[str, Parameter]) -> None:

@@ -1,4 +1,4 @@
-"""The programs that drive; one of another revision is another driver."""
+"""Table of the programs that drive; a program of another revision is another driver."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ from math import inf, isfinite
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.drivers.base import Driver, take_seat
+from merge_runner.drivers.base import Driver, DriverContext, Parameter, make_context
 from merge_runner.drivers.pace import program_pace
-from merge_runner.drivers.program_seat import Parameter, ProgramSeat
 from merge_runner.errors import UsageError
-from merge_runner.records import SIDES, Side, TrialSpec, other_side
+from merge_runner.records import Side, TrialSpec
 from merge_runner.registry import Registry, require
 
 if TYPE_CHECKING:
@@ -22,33 +21,36 @@ if TYPE_CHECKING:
 
 EMULATOR = "emulator"
 MOCKS = frozenset({EMULATOR, "random"})
-"""The models of our own, under whose names no other is expected to answer."""
+"""The mock models."""
 SET = "set"  # the parameter that names a set of others
 _making = threading.Lock()
 
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """A class whose instances drive, made with a ProgramSeat.
+    """Program: a class whose instances drive, each made with a DriverContext.
 
-    The class may name its ``revision``, a whole number, which is 1 where it does not: whoever
-    changes what it decides raises it, so that its trials are played anew.
-    ``meaning`` says in a few words what it does, and ``parameters`` are those of its rule. It
-    decides ``rate_hz`` times a second; None: at the prompt rate of the scenario. A ``settable``
-    program reads its parameters from its seat, so that a study can set them. ``sets`` are named
-    sets of further parameters, of which the parameter ``set`` chooses one. ``check`` raises
-    UsageError for parameters that cannot be, ``check_clock`` for a clock in s (the time between two
-    decisions) that cannot be beside them. ``data`` are imported human trials that it replays: an
-    object with their hash as ``digest``, whose ``read`` takes those of an open database (None:
-    there is none yet), whose ``keep`` takes the ``trials`` of another such object, and whose
-    ``check`` raises UsageError where a program has too few trials of a condition for a scenario and
-    so many repetitions. ``shared`` is the one object in which its class looks for them, where
-    ``data`` are the own ones of a plan (``replaying``). ``chance`` declares that it draws by the
-    seed of its seat: the analysis counts equal first decisions of others once. ``based_on``
-    names the program that a study has given other parameters or another clock.
+    The class may have a ``revision``, a whole number (default 1); a change of its decisions raises
+    it, so that its trials are played anew. ``meaning`` is a short description; ``rate_hz`` is the
+    number of decisions in a second (None: the prompt rate of the scenario).
+
+    ``parameters`` are those of its rule; a study can set them if the program is ``settable`` and
+    reads them from its context. ``sets`` are named sets of further parameters; the parameter
+    ``set`` chooses one. ``check`` raises UsageError for invalid parameters, ``check_clock`` for a
+    clock in s (the time between two decisions) that does not fit them.
+
+    ``chance`` declares random draws from the seed of the context; of other programs the analysis
+    counts equal first decisions once. ``based_on`` is the program that a study has given other
+    parameters or another clock.
+
+    ``data`` are imported human trials that the program replays: an object with their hash as
+    ``digest``. Its ``read`` takes the trials of an open database (None: there is none yet), its
+    ``keep`` takes the ``trials`` of another such object, its ``check`` raises UsageError if there
+    are too few for a condition. ``shared`` is the object that the class reads, if ``data`` is a
+    plan's own copy (``replaying``).
     """
 
-    driver: Callable[[ProgramSeat], Driver]
+    driver: Callable[[DriverContext], Driver]
     meaning: str
     parameters: Mapping[str, Parameter] = field(default_factory=dict)
     rate_hz: float | None = None
@@ -62,7 +64,7 @@ class Program:
     based_on: str = ""
 
     def __post_init__(self) -> None:
-        """Raises UsageError for what can be no driver, or could not be told apart from another."""
+        """Raise UsageError for invalid fields."""
         if not isinstance(self.driver, type):
             raise UsageError(f"the driver {self.driver!r} is no class")
         name = self.driver.__qualname__
@@ -81,19 +83,19 @@ class Program:
 
     @property
     def revision(self) -> int:
-        """Which revision of its rule the class is."""
+        """Revision of the class's rule."""
         revision: int = getattr(self.driver, "revision", 1)
         return revision
 
     @property
     def values(self) -> dict[str, Parameter]:
-        """All parameters: those of the set that is chosen, and over them those that are given."""
+        """All parameters: those of the chosen set, overridden by the given ones."""
         chosen = self.sets[str(self.parameters[SET])] if self.sets else {}
         return {**self.parameters, **chosen, **self.parameters}
 
     @property
     def described(self) -> str:
-        """What it does, how often it decides, and its parameters, the chosen set first."""
+        """Description with rate and parameters, the chosen set first."""
         rate = "" if self.rate_hz is None else f" ({self.rate_hz:g} Hz)"
         shown = dict(self.values)
         if self.sets:
@@ -105,14 +107,14 @@ class Program:
     def with_changes(
         self, name: str, changes: Mapping[str, object], clock_s: float | None
     ) -> Program:
-        """The same with other parameters, and holding each action for a clock; raises UsageError.
+        """Return this program, called ``name``, with other parameters or another clock.
 
-        ``name`` is that of this program.
+        Raise UsageError for an unknown or invalid parameter.
         """
         if changes and not self.settable:
             raise UsageError(f"the parameters of {name} stand in its source and cannot be set")
         values, given = self.values, dict(self.parameters)
-        # Which other parameters there are depends on the set, so that it comes first.
+        # The set comes first: the other parameters depend on it.
         for each in sorted(changes, key=lambda each: each != SET):
             hint = f"each {SET} has parameters of its own" if self.sets else ""
             value, default = changes[each], require(values, f"parameter of {name}", each, hint)
@@ -134,40 +136,30 @@ class Program:
 
     def make(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> Driver:
         """Return the driver of one side of a trial."""
-        seat = self.seat(scenario, spec, side)
+        context = self.context(scenario, spec, side)
         if self.shared is None:
-            return self.driver(seat)
-        with _making:  # the plan of another thread may have other human trials
+            return self.driver(context)
+        with _making:  # another thread may play a plan with other human trials
             if self.shared.digest != self.data.digest:
                 self.shared.keep(self.data.trials)
-            return self.driver(seat)
+            return self.driver(context)
 
     def replaying(self, connection: DuckDBPyConnection | None) -> Program:
-        """The same with the human trials of a database, if it replays some; None: it has none."""
+        """Return this program with a copy of its own of a database's trials, if it replays some."""
         if self.data is None:
             return self
         own = copy(self.data)
         own.read(connection)
         return replace(self, data=own, shared=self.shared or self.data)
 
-    def seat(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> ProgramSeat:
-        """Return what that driver is given."""
+    def context(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> DriverContext:
+        """Return the context of that driver."""
         pace = program_pace(scenario, self.rate_hz)
-        seeds = {each: take_seat(scenario, spec, each, pace).seed for each in SIDES}
-        return ProgramSeat(
-            scenario,
-            side,
-            pace,
-            seeds[side],
-            condition=spec.condition,
-            repetition=spec.repetition,
-            other_seed=seeds[other_side(side)],
-            parameters=self.values,
-        )
+        return make_context(scenario, spec, side, pace, self.values)
 
     def in_spec(self, name: str) -> dict[str, object]:
-        """What the spec of its trials says of it."""
-        said = {
+        """Return its entry in the spec of a trial."""
+        entry = {
             "program": name,
             "parameters": self.values,
             "revision": self.revision,
@@ -176,8 +168,8 @@ class Program:
             "data": self.data and self.data.digest,
             "based_on": self.based_on or None,
         }
-        # What there is not is left out, so that specs from before it keep their hashes.
-        return {key: value for key, value in said.items() if value is not None}
+        # None is left out: a new key must not change the hashes of older specs.
+        return {key: value for key, value in entry.items() if value is not None}
 
 
 def _is_number(value: object) -> TypeGuard[float]:

@@ -12,7 +12,7 @@ import pytest
 import typer.main
 
 from merge_runner import __version__
-from merge_runner_analysis.commands import app
+from merge_runner.cli import complete_app
 from tests.support.harness import PROGRAM, PROJECT, Run, environment
 
 MODULE = (sys.executable, "-m", "merge_runner")
@@ -34,7 +34,7 @@ def run(folder: Path, *command: object, **changes: str) -> Run:
 
 def test_python_m_merge_runner_has_every_command_and_the_version(tmp_path):
     listed = run(tmp_path, *MODULE, "--help").out
-    for name in typer.main.get_command(app).commands:
+    for name in typer.main.get_command(complete_app()).commands:
         assert re.search(rf"^ +{name} ", listed, re.MULTILINE)
     assert __version__ == metadata.version("merge-runner")
     assert f"\nversion: {__version__}\n" in (PROJECT / "CITATION.cff").read_text()
@@ -81,7 +81,7 @@ def checkout_in(folder: Path) -> Path:
     """A copy of what a build takes, which leaves its own files there."""
     checkout = folder / "checkout"
     checkout.mkdir()
-    listed = "merge_runner analysis plugins experiments cache docs pyproject.toml README.md LICENSE"
+    listed = "merge_runner analysis experiments cache docs pyproject.toml README.md LICENSE"
     tracked = run(PROJECT, "git", "ls-files", *listed.split()).out.split()
     run(PROJECT, "cp", "--parents", *tracked, checkout)
     return checkout
@@ -109,7 +109,6 @@ def test_the_wheel_holds_sweeps_registry_and_recordings_also_when_built_from_the
             "/py.typed",
             "_analysis/py.typed",
             "_analysis/web/glossary.md",
-            "_cei/driver.py",
         )
     }
     assert shipped <= from_checkout

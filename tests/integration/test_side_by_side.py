@@ -35,15 +35,15 @@ add = [{{ after = "C3.human", text = "{words}" }}]
 files = ["plugin.py", "gains.py"]
 """
 PLUGIN = """
-from merge_runner.drivers.registry import PROGRAMS, Program
+from merge_runner.plugin import PROGRAMS, Program
 
 class Braking:
-    def __init__(self, seat):
-        self.seat = seat
+    def __init__(self, context):
+        self.context = context
 
     async def decide(self, observation, number):
         from .gains import ACTION
-        return self.seat.held(ACTION)
+        return self.context.held(ACTION)
 
 PROGRAMS.register("mine", Program(Braking, "brakes"))
 """

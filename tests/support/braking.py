@@ -2,17 +2,17 @@
 
 HEAD = 'repetitions = 1\nconditions = ["N_0_0"]\n'
 BRAKING = """
-from merge_runner.drivers.registry import PROGRAMS, Program
+from merge_runner.plugin import PROGRAMS, Program
 
 class Braking:
-    def __init__(self, seat):
-        self.seat = seat
+    def __init__(self, context):
+        self.context = context
 
     async def decide(self, observation, number):
-        return self.seat.held(-self.seat.number("strength"))
+        return self.context.held(-self.context.number("strength"))
 
 def check(parameters):
-    from merge_runner.errors import UsageError
+    from merge_runner.plugin import UsageError
     if parameters["strength"] > 1:
         raise UsageError("strength is at most 1")
 

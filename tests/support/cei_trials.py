@@ -1,14 +1,14 @@
 """Trials of the model: played by the runner, and simulated."""
 
+from analysis.research.cei_calibration.simulation import Trial
 from merge_runner.config import ScenarioConfig
+from merge_runner.drivers.cei.agents import Model
+from merge_runner.drivers.cei.motion import task_of
+from merge_runner.drivers.cei.parameters import SETS, Habits, offsets_of
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
-from merge_runner_cei.agents import Model
-from merge_runner_cei.batch import Trial
-from merge_runner_cei.motion import task_of
-from merge_runner_cei.parameters import SETS, Habits, offsets_of
 from tests.support.driven_trials import both, play, spec
 
 
@@ -33,7 +33,7 @@ def played(condition, repetition, task, program):
 def simulated(condition, repetition, task):
     """The same trial for the batch: same seeds, same pair."""
     one = spec(condition, repetition)
-    left, right = (PROGRAMS["cei"].seat(task, one, side).seed for side in SIDES)
+    left, right = (PROGRAMS["cei"].context(task, one, side).seed for side in SIDES)
     offsets = offsets_of(0, repetition)
     drivers = SETS["K0"].base(offsets.left), SETS["K0"].base(offsets.right)
     return Trial(CONDITIONS[condition], drivers, (left, right))

@@ -23,13 +23,13 @@ files = ["mine.py"]
 """
 PLUGIN = """
 from merge_runner_analysis.metrics import Metric, register
-from merge_runner.drivers.registry import PROGRAMS, Program
+from merge_runner.plugin import PROGRAMS, Program
 
 class Sleepy:
-    def __init__(self, seat):
-        self.seat = seat
+    def __init__(self, context):
+        self.context = context
     async def decide(self, observation, number):
-        return self.seat.held(-0.1)
+        return self.context.held(-0.1)
 
 PROGRAMS.register("sleepy", Program(Sleepy, "brakes a little, always"))
 register(Metric(name="duration_s", label="duration", unit="s", meaning="time to the end",

@@ -26,8 +26,8 @@ def play(programs, condition, repetition=1, *, scenario, seeds=None):
     """A trial of these programs by side; ``seeds`` by side in place of the slot's."""
     trial, drivers = spec(condition, repetition), {}
     for side, program in programs.items():
-        seat = program.seat(scenario, trial, side)
+        context = program.context(scenario, trial, side)
         if seeds is not None:
-            seat = replace(seat, seed=seeds[side], other_seed=seeds[OTHER[side]])
-        drivers[side] = program.driver(seat)
+            context = replace(context, seed=seeds[side], other_seed=seeds[OTHER[side]])
+        drivers[side] = program.driver(context)
     return play_trial(Trial(trial, scenario, drivers), ask_nobody)

@@ -1,15 +1,18 @@
 """The command line: its menu, its help, and what becomes of its options."""
 
 import sys
+from importlib import invalidate_caches
 from importlib.metadata import entry_points
 from pathlib import Path
 
+import pytest
 import typer.main
 from typer.testing import CliRunner
 
 import merge_runner as package
 from merge_runner.cli import complete_app
 from merge_runner.cli.app import alone
+from merge_runner.cli.packages import GROUP, command_modules, load_commands
 from merge_runner.run.plan import Options
 
 COMMANDS = {
@@ -56,6 +59,20 @@ def test_a_command_has_its_options_where_those_of_the_others_are_left_out():
             shown, same = (CliRunner().invoke(each, words).output for each in (alone(name), whole))
             assert shown == same
             assert "Usage:" in shown
+
+
+def test_packages_name_their_commands_by_an_entry_point(tmp_path, monkeypatch):
+    (analysis,) = [point.module for point in entry_points(group=GROUP)]
+    (tmp_path / "mine-1.dist-info").mkdir()
+    named = f"[other]\na = other\n[{GROUP}]\nb = mine_b.commands\na=mine_a : x\n\n[z]\n"
+    (tmp_path / "mine-1.dist-info/entry_points.txt").write_text(named)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert command_modules() == [analysis, "mine_a", "mine_b.commands"]
+    load_commands()  # neither of the two packages is there
+    (tmp_path / "mine_a.py").write_text("import no_such_library")
+    invalidate_caches()
+    with pytest.raises(ModuleNotFoundError, match="no_such_library"):
+        load_commands()
 
 
 def every_command(command, path=()):

@@ -5,7 +5,9 @@ from pathlib import Path
 
 import typer.main
 
+from merge_runner import plugin
 from merge_runner.cli import complete_app
+from merge_runner.study.file import TEMPLATE
 from merge_runner_analysis.published import published
 from tests.support.harness import PROJECT
 
@@ -18,6 +20,7 @@ WRITTEN = [PROJECT / "README.md", *sorted({*DOCS.glob("*.md")} - GENERATED)]
 REFUSED = re.compile(
     r"\b(told|singly|set aside|(is|are) due|becomes? of|comes? to|stands? beside|heeds?|dearest)\b"
 )
+STABLE = {"merge_runner", "merge_runner.plugin"}
 LINKING = [*PAGES, *PROJECT.glob("*.md"), *PROJECT.glob("*/README.md")]
 
 
@@ -38,6 +41,14 @@ def test_what_a_person_reads_is_short_and_in_plain_words():
     assert len((PROJECT / "README.md").read_text().split()) <= 900
     for page in WRITTEN:
         assert not REFUSED.search(page.read_text()), (page.name, REFUSED.search(page.read_text()))
+
+
+def test_plug_ins_and_notebooks_of_the_docs_import_stable_names_of_the_runner_alone():
+    pages = [DOCS / "extend.md", TEMPLATE / "plugin.py", *DOCS.glob("notebooks/*.ipynb")]
+    text = "\n".join(page.read_text() for page in pages)
+    assert {*re.findall(r"from (merge_runner(?:\.[\w.]+)?) import", text)} == STABLE
+    used = text + (DOCS / "python.md").read_text()
+    assert not [name for name in plugin.__all__ if not re.search(rf"\b{name}\b", used)]
 
 
 def test_sentences_of_the_docs_are_short():

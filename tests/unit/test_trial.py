@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.drivers.base import Seat, take_seat
+from merge_runner.drivers.base import make_context
 from merge_runner.drivers.language_model import Question
 from merge_runner.drivers.pace import model_pace, program_pace
 from merge_runner.drivers.registry import PROGRAMS
@@ -26,12 +26,13 @@ REQUEST = ChatRequest("key", "test", "test", "model", "/", {}, "{}", Slot("N_0_0
 
 def begin(left, right, condition="N_0_0", **scenario):
     """A trial before its first decision; a driver with a ``rate_hz`` keeps it."""
-    drivers, task = {"left": left, "right": right}, ScenarioConfig(**scenario)
+    spec, task = spec_of(condition), ScenarioConfig(**scenario)
+    drivers = {"left": left, "right": right}
     for side, driver in drivers.items():
         rate_hz = getattr(driver, "rate_hz", None)
         pace = program_pace(task, rate_hz) if rate_hz else model_pace(task)
-        driver.seat = Seat(task, side, pace, 0)
-    return Trial(spec_of(condition), task, drivers)
+        driver.context = make_context(task, spec, side, pace)
+    return Trial(spec, task, drivers)
 
 
 def decide(question):
@@ -57,7 +58,7 @@ class Holding:
     async def decide(self, observation, number):
         assert number not in self.seen
         self.seen[number] = observation
-        return self.seat.held(self.action)
+        return self.context.held(self.action)
 
 
 class Asking(Holding):
@@ -65,11 +66,11 @@ class Asking(Holding):
 
     def decide(self, observation, number):
         self.seen[number] = observation
-        slot = Slot("N_0_0", 1, self.seat.side, number, 0)
+        slot = Slot("N_0_0", 1, self.context.side, number, 0)
         return Question("model", slot, "prompt", None, self.answered)
 
     def answered(self, prompt, reply):
-        return self.seat.held(self.action)
+        return self.context.held(self.action)
 
 
 class Failing(Asking):
@@ -292,10 +293,10 @@ def test_a_failed_call_has_the_number_of_its_own_driver(failing):
 
 def test_a_seed_is_that_of_the_slot_and_of_no_driver():
     spec, task = spec_of("N_0_0"), ScenarioConfig()
-    seed = take_seat(task, spec, "left", model_pace(task)).seed
+    seed = make_context(task, spec, "left", model_pace(task)).seed
     assert seed == 4387192367012543550
     others = {
-        take_seat(task, other, side, model_pace(task)).seed
+        make_context(task, other, side, model_pace(task)).seed
         for other, side in (
             (spec, "right"),
             (replace(spec, condition="L_4_0"), "left"),
@@ -305,7 +306,7 @@ def test_a_seed_is_that_of_the_slot_and_of_no_driver():
     }
     assert len({seed, *others}) == 5
     renamed = replace(spec, model_left="another", variant="A1", order=7)
-    assert take_seat(task, renamed, "left", model_pace(task)).seed == seed
+    assert make_context(task, renamed, "left", model_pace(task)).seed == seed
 
 
 class Short(Holding):

@@ -19,7 +19,7 @@ TUTORIAL = DOCS / "tutorial.md"
 # Its sweep would be the newest one of the pages that follow.
 LAST = DOCS / "models.md"
 # Pages of users, in the order in which their commands are run.
-PAGES = [PROJECT / "README.md", *sorted(PROJECT.glob("plugins/*/README.md"))]
+PAGES = [PROJECT / "README.md", *sorted(PROJECT.glob("analysis/research/*/README.md"))]
 PAGES += [PROJECT / "benchmarks/README.md"]
 PAGES += [*sorted(set(DOCS.rglob("*.md")) - {TUTORIAL, LAST}), LAST]
 PATH = f"{PROJECT}/.venv/bin:{os.environ['PATH']}"
@@ -29,7 +29,7 @@ INSTALLED = (
     '-o .venv-peer/installed ${RUN:+RUN="$RUN"} "$@"; }\n'
 )
 SERVES = re.compile(r" emulate |make view$| view$| view --port")
-LINKED = (".venv", "Makefile", "pyproject.toml", "requirements", "benchmarks", "tests")
+LINKED = (".venv", "Makefile", "pyproject.toml", "requirements", "analysis", "benchmarks", "tests")
 
 
 def lines_of(block: str) -> list[str]:

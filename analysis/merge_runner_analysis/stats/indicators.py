@@ -197,9 +197,9 @@ def ceiling(sizes: tuple[int, ...]) -> dict[str, dict[str, float]]:
     """Return by rule the shares of human data sets that pass each indicator, and ``I1-I4`` at once.
 
     It is that of the mean of ``sizes``, the trials in the conditions of the humans: of a shipped
-    curve, which ``benchmarks/ceiling.py`` computed once from the published counts and the published
-    regression of the gap with normal residuals; linear between its sizes, and constant beyond the
-    largest. Without a trial in some condition there is no share.
+    curve, which ``analysis/research/ceiling.py`` computed once from the published counts and the
+    published regression of the gap with normal residuals; linear between its sizes, and constant
+    beyond the largest. Without a trial in some condition there is no share.
     """
     shares: dict[str, dict[str, float]] = {"paper": {}, "robust": {}}
     if min(sizes):

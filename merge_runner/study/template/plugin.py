@@ -1,8 +1,6 @@
 """What this study adds. Raise a driver's revision when you edit its rule: it is played anew."""
 
-from merge_runner.drivers.program_seat import ProgramSeat
-from merge_runner.drivers.registry import PROGRAMS, Program
-from merge_runner.records import Decision, Observation
+from merge_runner.plugin import PROGRAMS, Decision, DriverContext, Observation, Program
 from merge_runner_analysis.metrics import Metric, register
 
 
@@ -11,12 +9,12 @@ class HesitantDriver:
 
     revision = 1
 
-    def __init__(self, seat: ProgramSeat) -> None:
-        self.seat = seat
+    def __init__(self, context: DriverContext) -> None:
+        self.context = context
 
     async def decide(self, observation: Observation, number: int) -> Decision:
         """Hold an acceleration, from -1 to 1, until the next decision."""
-        return self.seat.held(0.0 if observation.distance_to_merge_m is None else -0.1)
+        return self.context.held(0.0 if observation.distance_to_merge_m is None else -0.1)
 
 
 PROGRAMS.register("hesitant", Program(HesitantDriver, "brakes a little before the merge point"))

@@ -3,28 +3,26 @@
 from dataclasses import dataclass, field
 from random import Random
 
-from merge_runner.drivers.program_seat import ProgramSeat
-from merge_runner.drivers.registry import PROGRAMS, Program
-from merge_runner.records import Decision, Observation
+from merge_runner.plugin import PROGRAMS, Decision, DriverContext, Observation, Program
 
 
 @dataclass
 class ImpulsiveDriver:
     """Holds a random acceleration until its next decision."""
 
-    seat: ProgramSeat
+    context: DriverContext
     chance: Random = field(init=False)
 
     def __post_init__(self) -> None:
-        self.chance = Random(self.seat.seed)
+        self.chance = Random(self.context.seed)
 
     async def decide(self, observation: Observation, number: int) -> Decision:
         """Draw an acceleration, or keep the speed."""
         distance_m = observation.distance_to_merge_m
-        if distance_m is None or distance_m < self.seat.number("steady_from_m"):
-            return self.seat.held(0.0)
-        strength = self.seat.number("strength")
-        return self.seat.held(self.chance.uniform(-strength, strength))
+        if distance_m is None or distance_m < self.context.number("steady_from_m"):
+            return self.context.held(0.0)
+        strength = self.context.number("strength")
+        return self.context.held(self.chance.uniform(-strength, strength))
 
 
 for name, rate_hz in (("impulsive", 20.0), ("hesitant", 5.0)):

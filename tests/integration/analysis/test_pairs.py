@@ -20,13 +20,13 @@ from tests.support.studies import changed, write_study, yielding
 from tests.support.tables import made, notes_with
 
 DRIVERS = """
-from merge_runner.drivers.registry import PROGRAMS, Program
+from merge_runner.plugin import PROGRAMS, Program
 
 class Held:
-    def __init__(self, seat):
-        self.seat = seat
+    def __init__(self, context):
+        self.context = context
     async def decide(self, observation, number):
-        return self.seat.held(self.action)
+        return self.context.held(self.action)
 
 for name, action in (("brakes", -0.2), ("goes", 0.2), ("follows", -0.1)):
     PROGRAMS.register(name, Program(type(name, (Held,), {"action": action}), name))

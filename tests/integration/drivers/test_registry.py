@@ -69,4 +69,4 @@ def test_programs_are_listed_in_one_order_whichever_is_imported_first(first):
     listed = "from merge_runner.drivers.registry import PROGRAMS; print(*PROGRAMS)"
     listed = f"import merge_runner.drivers.{first}; {listed}"
     found = subprocess.check_output([sys.executable, "-c", listed], text=True)
-    assert found == "constant human-odds idm projected-order quantal cei human-replay\n"
+    assert found == "cei constant human-odds human-replay idm projected-order quantal\n"

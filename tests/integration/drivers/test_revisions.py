@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError
+from merge_runner.plugin import PROGRAMS, Program
 from merge_runner.results.store import query
 from merge_runner.run.plan import make_plan
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
@@ -24,16 +24,16 @@ conditions = ["L_4_0", "N_0_0"]
 files = ["mine.py"]
 """
 DRIVER = """
-from merge_runner.drivers.registry import PROGRAMS, Program
+from merge_runner.plugin import PROGRAMS, Program
 
 class Braking:
     revision = {revision}
 
-    def __init__(self, seat):
-        self.seat = seat
+    def __init__(self, context):
+        self.context = context
 
     async def decide(self, observation, number):
-        return self.seat.held({action})
+        return self.context.held({action})
 
 PROGRAMS.register("braking", Program(Braking, "brakes"))
 """

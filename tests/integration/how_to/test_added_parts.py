@@ -164,7 +164,7 @@ def test_an_audit_replays_all_where_the_study_is_named(run):
 
 
 MISPLACED = """
-from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Block, Variant
+from merge_runner.plugin import BLOCKS, VARIANTS, Block, Variant
 BLOCKS.register("C6", Block("x", "Text.", None, before="C9"))
 VARIANTS.register("A8", Variant(adds=frozenset({"C6"})))
 VARIANTS.register("A9", Variant(adds=frozenset({"C6"})))

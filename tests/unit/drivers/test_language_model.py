@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.drivers.base import Seat
+from merge_runner.drivers.base import make_context
 from merge_runner.drivers.language_model import LlmDriver
 from merge_runner.drivers.pace import model_pace
 from merge_runner.prompts.blocks import prompt_of
@@ -35,8 +35,9 @@ def chat_reply(text, outcome="ok"):
 def ask(*replies, seen=SEEN, variant="baseline", begins=0, **scenario):
     """One question and decision per reply, from number ``begins`` on."""
     scenario = ScenarioConfig(**scenario)
-    seat = Seat(scenario, "left", model_pace(scenario), 0)
-    driver = LlmDriver("model", spec("N_0_0"), seat, prompt_of(variant))
+    trial = spec("N_0_0")
+    context = make_context(scenario, trial, "left", model_pace(scenario))
+    driver = LlmDriver("model", trial, context, prompt_of(variant))
     for number, reply in enumerate(replies, begins):
         question = driver.decide(seen, number)
         assert (question.model, question.slot) == ("model", replace(SLOT, decision=number))

@@ -14,14 +14,14 @@ from merge_runner.scenarios.merge.world import World
 
 HEAD = 'repetitions = 1\nconditions = ["N_0_0"]\n'
 DRIVER = """
-from merge_runner.drivers.registry import PROGRAMS, Program
+from merge_runner.plugin import PROGRAMS, Program
 
 class Braking:
-    def __init__(self, seat):
-        self.seat = seat
+    def __init__(self, context):
+        self.context = context
 
     async def decide(self, observation, number):
-        return self.seat.held({action})
+        return self.context.held({action})
 
 PROGRAMS.register("braking", Program(Braking, "brakes"))
 """

@@ -23,6 +23,7 @@ OPTIONS = "-n0 -p no:cacheprovider -o faulthandler_timeout=400 -o faulthandler_e
 SECONDS, TOGETHER = 20, 300  # of the tests of a mutant; so many are collected together
 ROOT, RESULTS, PART, *LANES = sys.argv[1:]
 MONITORING, TOOL = sys.monitoring, sys.monitoring.COVERAGE_ID
+OURS = re.compile("merge_runner|analysis/research/")
 NOTES, COPY, RAN = [Path(f"{RESULTS}{end}").resolve() for end in ("", ".copy", ".ran")]
 
 
@@ -34,8 +35,8 @@ class Watch:
         if (child := os.fork()) == 0:
             os.setpgrp()
             os.chdir(COPY)
-            sys.path[:1] = [str(COPY), f"{COPY}/analysis", f"{COPY}/plugins"]
-            os.environ["PYTHONPATH"] = ":".join(sys.path[:3])
+            sys.path[:1] = [str(COPY), f"{COPY}/analysis"]
+            os.environ["PYTHONPATH"] = ":".join(sys.path[:2])
             os.dup2(os.open(f"{COPY}.out", os.O_CREAT | os.O_WRONLY | os.O_TRUNC), 1)
             if "-x" not in arguments:
                 MONITORING.use_tool_id(TOOL, "mutants")
@@ -72,7 +73,7 @@ class Watch:
         for fixture in chain(*item._fixtureinfo.name2fixturedefs.values()):
             self.codes |= self.of_fixture.get(fixture, {})
         found = {f"{code.co_filename}:{code.co_firstlineno}:" for code in [*self.codes.values()]}
-        calls = [name.removeprefix(f"{COPY}/") for name in sorted(found) if "merge_runner" in name]
+        calls = [name.removeprefix(f"{COPY}/") for name in sorted(found) if OURS.search(name)]
         passed = failed == item.session.testsfailed
         note(self.notes, test=item.nodeid, passed=passed, s=s, calls=calls)
         return done

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from benchmarks.ceiling import shares
+from analysis.research.ceiling import shares
 from merge_runner_analysis.published import published
 from merge_runner_analysis.stats.first_action import exchange_rate, mean, slope
 from merge_runner_analysis.stats.intervals import melded

@@ -5,12 +5,12 @@ from itertools import product
 import numpy as np
 import pytest
 
+from analysis.research.cei_calibration.outcomes import measured, summary
+from analysis.research.cei_calibration.simulation import simulate
 from merge_runner.config import Perception
 from merge_runner.records import SIDES, canonical_json
 from merge_runner.results.store import Store
 from merge_runner_analysis.frames import load
-from merge_runner_cei.batch import simulate
-from merge_runner_cei.calibration.outcomes import measured, summary
 from tests.support.cei_trials import cei, model, played, scenario, simulated
 
 # Among them are trials that collide.

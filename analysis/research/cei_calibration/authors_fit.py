@@ -17,15 +17,15 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from analysis.research.cei_calibration.design import experiment
+from analysis.research.cei_calibration.simulation import Trial, simulate
+from merge_runner.drivers.cei.agents import Model
+from merge_runner.drivers.cei.motion import task_of
+from merge_runner.drivers.cei.parameters import FITTING, TICK_S, Base, ThresholdSet
 from merge_runner.errors import UsageError
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS, Condition
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner_analysis.frames import load
-from merge_runner_cei.agents import Model
-from merge_runner_cei.batch import Trial, simulate
-from merge_runner_cei.calibration.design import experiment
-from merge_runner_cei.motion import task_of
-from merge_runner_cei.parameters import FITTING, TICK_S, Base, ThresholdSet
 
 Array = NDArray[np.float64]
 LOWER = np.linspace(0.01, 0.40, 25)

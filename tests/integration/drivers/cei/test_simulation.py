@@ -5,8 +5,8 @@ from functools import partial
 import numpy as np
 import pytest
 
+from analysis.research.cei_calibration.simulation import Trial, simulate
 from merge_runner.scenarios.merge.conditions import Condition
-from merge_runner_cei.batch import Trial, simulate
 from tests.support.cei_trials import cei, model, played, scenario, simulated
 
 near = partial(np.testing.assert_allclose, rtol=0, atol=1e-9)

@@ -8,12 +8,12 @@ from dataclasses import astuple, dataclass
 import numpy as np
 import pandas as pd
 
+from analysis.research.cei_calibration.design import TRIALS_OF_A_PAIR, design, model_of
+from analysis.research.cei_calibration.outcomes import measured, summary
+from analysis.research.cei_calibration.simulation import simulate
 from merge_runner.config import ScenarioConfig
+from merge_runner.drivers.cei.parameters import RISKS, ThresholdSet
 from merge_runner_analysis.published import published
-from merge_runner_cei.batch import simulate
-from merge_runner_cei.calibration.design import TRIALS_OF_A_PAIR, design, model_of
-from merge_runner_cei.calibration.outcomes import measured, summary
-from merge_runner_cei.parameters import RISKS, ThresholdSet
 
 # How far the first candidates are from the start: one standard deviation of each number.
 STEPS = ThresholdSet(
@@ -76,7 +76,7 @@ def numbers_of(
     *,
     tunnel: bool = False,
 ) -> Numbers:
-    """What the trials of a sample set come to; counts are scaled to 990."""
+    """Return the numbers of the targets for a sample set; counts are scaled to 990."""
     trials = design(thresholds, scenario, sample_set, trials_of_a_pair)
     model = model_of(thresholds, scenario)
     found = summary(measured(model.task, trials, simulate(model, trials, tunnel=tunnel)))

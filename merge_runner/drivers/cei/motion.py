@@ -1,4 +1,4 @@
-"""What a driver knows of vehicles: how they move under a constant input, for many at once."""
+"""Motion of vehicles under a constant input, as arrays."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_runner.config import ScenarioConfig
+from merge_runner.drivers.cei.collision_interval import CollisionInterval, collision_interval
+from merge_runner.drivers.cei.parameters import NODE_S, NODES
 from merge_runner.scenarios.merge.geometry import Track
 from merge_runner.scenarios.merge.vehicle import net_acceleration
-from merge_runner_cei.collision_interval import CollisionInterval, collision_interval
-from merge_runner_cei.parameters import NODE_S, NODES
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -20,22 +20,22 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """The vehicles' strength and resistance, and where they collide."""
+    """Acceleration and resistance of the vehicles, and the interval in which they collide."""
 
     scenario: ScenarioConfig
     track: Track
     interval: CollisionInterval
 
     def net_mps2(self, inputs: Array, speeds_mps: Array) -> Array:
-        """The acceleration that an input in [-1, 1] leads to."""
-        # The world's own rule, which is of numbers: numpy's arrays obey it element by element.
+        """Return the net accelerations under inputs in [-1, 1]."""
+        # The world's rule is typed for numbers; numpy applies it element by element.
         commanded: Any = inputs * self.scenario.max_acceleration_mps2
         speeds: Any = speeds_mps
         return np.asarray(net_acceleration(commanded, speeds, self.scenario.resistance))
 
 
 def task_of(scenario: ScenarioConfig, track: Track) -> Task:
-    """What there is to know of a scenario."""
+    """Return the task of a scenario."""
     boxes = scenario.vehicle_length_m, scenario.vehicle_width_m
     return Task(scenario, track, collision_interval(track, *boxes))
 
@@ -43,7 +43,7 @@ def task_of(scenario: ScenarioConfig, track: Track) -> Task:
 def move(
     positions_m: Array, speeds_mps: Array, accelerations_mps2: Array, step_s: float
 ) -> tuple[Array, Array]:
-    """Positions and speeds one step later, as ``scenarios.merge.vehicle.advance`` of each."""
+    """Return positions and speeds after a step, as ``scenarios.merge.vehicle.advance`` does."""
     after = speeds_mps + accelerations_mps2 * step_s
     driven = speeds_mps * step_s + accelerations_mps2 * step_s**2 / 2
     stops = after < 0
@@ -55,20 +55,20 @@ def move(
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """What constant inputs lead to: arrays of the shape (nodes from now on, ...)."""
+    """Predicted motion under constant inputs: arrays of the shape (nodes from now on, ...)."""
 
     positions_m: Array
     speeds_mps: Array
     accelerations_mps2: Array
 
     def cost(self, desired_mps: Array) -> Array:
-        """How far off the desired speed, and how hard to drive, over all nodes."""
-        off = self.speeds_mps - desired_mps
-        return np.asarray((off**2 + self.accelerations_mps2**2).sum(axis=0))
+        """Return the sum of squared speed errors and accelerations over all nodes."""
+        error_mps = self.speeds_mps - desired_mps
+        return np.asarray((error_mps**2 + self.accelerations_mps2**2).sum(axis=0))
 
 
 def course(task: Task, positions_m: Array, speeds_mps: Array, inputs: Array) -> Course:
-    """The way ahead, the present first and then every 0.25 s, under inputs that are held."""
+    """Return the motion under held inputs, now and then every 0.25 s."""
     shape = (NODES + 1, *np.broadcast_shapes(positions_m.shape, inputs.shape))
     position, speed, acceleration = np.empty(shape), np.empty(shape), np.empty(shape)
     position[0], speed[0] = positions_m, speeds_mps

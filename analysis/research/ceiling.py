@@ -1,6 +1,6 @@
 """Compute the human ceiling, ``human_ceiling.csv`` of the analysis: about ten minutes.
 
-``python -m benchmarks.ceiling`` writes it anew, with equal seeds an equal file.
+``python -m analysis.research.ceiling`` writes it anew, with equal seeds an equal file.
 """
 
 from __future__ import annotations

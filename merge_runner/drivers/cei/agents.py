@@ -1,7 +1,7 @@
-"""The drivers of the model, many at once: each array has an element for every one of them.
+"""Agents of the model as arrays, with one element for each agent.
 
-One object with a single element drives a vehicle of a trial, one with thousands simulates a study:
-what they decide is the same (Siebinga, Zgonnikov and Abbink 2024).
+An object with one element drives a vehicle of a trial; one with thousands simulates a study. Both
+decide the same (Siebinga, Zgonnikov and Abbink 2024).
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from merge_runner_cei.motion import Array, Mask, Task, course
-from merge_runner_cei.parameters import (
+from merge_runner.drivers.cei.motion import Array, Mask, Task, course
+from merge_runner.drivers.cei.parameters import (
     BROADER,
     CRUISE_GAIN,
     HIGHEST_THRESHOLD,
@@ -43,7 +43,7 @@ SLOWEST_MPS = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """What all agents of a simulation share."""
+    """Task, thresholds and habits that all agents of a simulation share."""
 
     task: Task
     thresholds: ThresholdSet
@@ -52,7 +52,7 @@ class Model:
 
 @dataclass(frozen=True, slots=True)
 class Vehicles:
-    """Positions in m and speeds in m/s, one of each agent."""
+    """Positions in m and speeds in m/s, one for each agent."""
 
     positions_m: Array
     speeds_mps: Array
@@ -60,24 +60,24 @@ class Vehicles:
 
 @dataclass(frozen=True, slots=True)
 class Belief:
-    """Where the other will be: normal distributions of the shape (nodes, agents), in m."""
+    """Predicted positions of the other: normal distributions of the shape (nodes, agents), in m."""
 
     mean_m: Array
     spread_m: Array
 
     def of(self, nodes: slice, agents: NDArray[np.int64]) -> Belief:
-        """That of some agents, who may be there several times, at some nodes."""
+        """Return the belief of these agents, repeats included, at these nodes."""
         return Belief(self.mean_m[nodes][:, agents], self.spread_m[nodes][:, agents])
 
 
 @dataclass(slots=True)
 class Agents:
-    """What drivers have in mind between two ticks.
+    """State of the agents between two ticks.
 
-    ``lower`` and ``upper`` are their base thresholds, ``desired_mps`` is the speed that they would
-    drive alone. ``perceived_mps`` is the other's speed as they see it, ``memory_mps2`` holds the
-    other's last 40 accelerations, ``waited_ticks`` is how long the risk has been low, OFF where it
-    is not. ``unsolved``: no plan was safe enough. They drive ``inputs`` in [-1, 1].
+    ``lower`` and ``upper`` are base thresholds, ``desired_mps`` is the speed of an agent alone.
+    ``perceived_mps`` is the perceived speed of the other, ``memory_mps2`` holds the other's last 40
+    accelerations. ``waited_ticks`` counts the ticks of low risk (OFF: the risk is not low).
+    ``unsolved``: no plan was safe enough. ``inputs`` in [-1, 1] are driven.
     """
 
     lower: Array
@@ -91,7 +91,7 @@ class Agents:
     inputs: Array
 
     def perceive(self, model: Model, other: Vehicles, other_mps2: Array, noise: Array) -> None:
-        """See the other for one tick; ``noise`` is standard normal, one number an agent."""
+        """Perceive the other for one tick; ``noise`` is standard normal, one number an agent."""
         remaining, wander = model.habits.remaining, model.habits.wander_mps
         self.perceived_mps = (
             other.speeds_mps + remaining * (self.perceived_mps - other.speeds_mps) + wander * noise
@@ -107,10 +107,10 @@ class Agents:
         controls: Mask,
         ticks: int = 1,
     ) -> None:
-        """Judge the risk, and plan anew where there is a reason.
+        """Compute the risk, and replan where there is a reason.
 
-        ``noise`` is standard normal, one number an agent, and ``ticks`` have passed since the last
-        time. Without ``controls`` a vehicle cruises by itself.
+        ``noise`` is standard normal, one number an agent; ``ticks`` have passed since the last
+        call. Agents without ``controls`` are driven by their cruise control.
         """
         last_mps, self.last_mps = self.last_mps, own.speeds_mps
         if not controls.any():
@@ -121,12 +121,12 @@ class Agents:
         crossed = (last_mps - self.desired_mps) * (own.speeds_mps - self.desired_mps) < 0
         thresholds = self._thresholds(model.thresholds, own, other)
         bound = self._bound(model.habits, risk, thresholds, crossed, controls, ticks)
-        anew = np.isfinite(bound)
-        if anew.any():
-            self._plan(model, own, other, belief, bound, noise, anew)
+        replans = np.isfinite(bound)
+        if replans.any():
+            self._plan(model, own, other, belief, bound, noise, replans)
 
     def keep(self, chosen: Mask) -> Agents:
-        """Some of them."""
+        """Return the chosen agents."""
         kept = {field.name: getattr(self, field.name)[..., chosen] for field in fields(self)}
         return replace(self, **kept)
 
@@ -159,10 +159,10 @@ class Agents:
         controls: Mask,
         ticks: int,
     ) -> Array:
-        """How much a new plan may risk, infinite where there is no reason for one.
+        """Return the highest risk of a new plan, infinite where there is no reason to replan.
 
-        The first reason counts: no safe plan before, a low risk for long, a high risk, or the
-        desired speed.
+        The first reason counts: no safe plan before, a low risk for long, a high risk, the desired
+        speed crossed.
         """
         lower, upper = thresholds
         low, waiting = risk < lower, self.waited_ticks != OFF
@@ -185,10 +185,10 @@ class Agents:
         belief: Belief,
         bound: Array,
         noise: Array,
-        anew: Mask,
+        replans: Mask,
     ) -> None:
-        """The cheapest input with at most this risk, or else full power ahead, or full brakes."""
-        agents = np.flatnonzero(anew)
+        """Set the cheapest input within the bound; if none is, full power if ahead, else brakes."""
+        agents = np.flatnonzero(replans)
         plans = course(model.task, own.positions_m[agents], own.speeds_mps[agents], INPUTS[:, None])
         best = cheapest_safe(
             model.task,
@@ -215,11 +215,11 @@ def start(
     ticks: Array,
     noise: Array,
 ) -> Agents:
-    """Agents that have cruised in the tunnel for some ticks, each beside the other.
+    """Return agents that have cruised in the tunnel for ``ticks``.
 
-    They have planned to hold the speeds that they desire. They have seen the other since the start
-    of the run, when they took its speed to be their own, so that what they perceive now is normally
-    distributed. ``noise`` is standard normal, of the shape (agents, 2): of perception and of plan.
+    Their plan is to hold the speeds that they desire. They have perceived the other since the start
+    of the run, when they assumed their own speed for it, so that the perceived speed is normally
+    distributed. ``noise`` is standard normal, of the shape (agents, 2): for perception and plan.
     """
     habits = model.habits
     remaining = habits.remaining**ticks
@@ -242,7 +242,7 @@ def start(
 
 
 def set_speeds(task: Task, speeds_mps: Array) -> Array:
-    """The speeds in m/s that cruise controls are set to which hold these against the resistance."""
+    """Return the set speeds in m/s of cruise controls that hold these speeds under resistance."""
     resisted = task.net_mps2(np.zeros_like(speeds_mps), speeds_mps)
     return speeds_mps - resisted / (CRUISE_GAIN * task.scenario.max_acceleration_mps2)
 
@@ -250,10 +250,10 @@ def set_speeds(task: Task, speeds_mps: Array) -> Array:
 def cheapest_safe(
     task: Task, positions_m: Array, cost: Array, belief: Belief, bound: Array
 ) -> NDArray[np.int64]:
-    """For each agent the number of its cheapest input that never risks more than its bound.
+    """Return the index of each agent's cheapest input whose risk stays within its bound.
 
-    ``positions_m`` has the shape (nodes, inputs, agents), ``cost`` (inputs, agents). UNSOLVED where
-    there is none. The cheap inputs are tried first, and most agents need no others.
+    It is UNSOLVED where there is none. ``positions_m`` has the shape (nodes, inputs, agents),
+    ``cost`` (inputs, agents). Cheap inputs are tried first; most agents need no others.
     """
     best = np.full(bound.size, UNSOLVED)
     ranks = cost.argsort(axis=0, kind="stable")
@@ -266,18 +266,18 @@ def cheapest_safe(
             ahead = positions_m[nodes][:, inputs[rows, agents], agents]
             risk = risks(task, ahead, belief.of(nodes, agents))
             safe[rows, columns] = (risk <= bound[agents]).all(axis=0)
-        found = safe.any(axis=0)
-        best[left[found]] = inputs[safe.argmax(axis=0)[found], left[found]]
-        left = left[~found]
+        solved = safe.any(axis=0)
+        best[left[solved]] = inputs[safe.argmax(axis=0)[solved], left[solved]]
+        left = left[~solved]
         if not left.size:
             break
     return best
 
 
 def tunnel_ticks(own: Vehicles, other: Vehicles) -> Array:
-    """How many ticks ago the run started, when the one farther back was at 0, at these speeds.
+    """Return the ticks since the vehicle farther back was at position 0, at present speeds.
 
-    A vehicle that seems to stand, as it may where speeds are told with errors, crawls.
+    A perceived speed may be 0 by an error: SLOWEST_MPS then takes its place.
     """
     return np.asarray(np.minimum(_since_start_s(own), _since_start_s(other)) / TICK_S)
 
@@ -287,9 +287,9 @@ def _since_start_s(vehicles: Vehicles) -> Array:
 
 
 def risks(task: Task, positions_m: Array, belief: Belief) -> Array:
-    """The risk of being at positions at the nodes of a belief, both of the shape (nodes, n).
+    """Return the risk of positions at the nodes of a belief, both of the shape (nodes, n).
 
-    It is half that of a collision and half that of being too close.
+    It is the mean of the probabilities of a collision and of being too close.
     """
     risk = np.zeros(positions_m.shape)
     near = positions_m >= task.interval.contact_m
@@ -306,6 +306,6 @@ def _clipped(threshold: Array) -> Array:
 
 
 def _driven(model: Model, inputs: Array, noise: Array) -> Array:
-    """A plan as it is driven: never with less than planned."""
+    """Return plans with motor noise, which never lowers an input."""
     more = PLAN_NOISE * np.abs(noise) if model.habits.noise else 0.0
     return np.minimum(inputs + more, 1.0)

@@ -1,37 +1,37 @@
-"""What one driver of the model has in mind during a trial: agents of which there is one."""
+"""One driver of the model in a trial: agents of which there is one."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from merge_runner.drivers.program_seat import ProgramSeat
+from merge_runner.drivers.base import DriverContext
+from merge_runner.drivers.cei.agents import Model, Vehicles, set_speeds, start, tunnel_ticks
+from merge_runner.drivers.cei.motion import Array, task_of
+from merge_runner.drivers.cei.parameters import TICK_S, Habits, ThresholdSet, offsets_of
 from merge_runner.records import SIDES, Observation
 from merge_runner.scenarios.merge.geometry import TRACK
-from merge_runner_cei.agents import Model, Vehicles, set_speeds, start, tunnel_ticks
-from merge_runner_cei.motion import Array, task_of
-from merge_runner_cei.parameters import TICK_S, Habits, ThresholdSet, offsets_of
 
 
-class Seated:
-    """The driver of a seat, from its first observation on.
+class Agent:
+    """Driver of one side of a trial, from its first observation on.
 
-    A car out of sight poses no risk, FAR_BEHIND_M behind. Until it is in sight, the driver takes
-    its speed to be the own one, as at the start of a run.
+    A vehicle out of sight poses no risk, FAR_BEHIND_M behind. Until it is in sight, the driver
+    assumes its own speed for it, as at the start of a trial.
     """
 
-    def __init__(self, seat: ProgramSeat, thresholds: ThresholdSet, seen: Observation) -> None:
-        self._model = Model(task_of(seat.scenario, TRACK), thresholds, Habits())
-        self._random = np.random.default_rng(seat.seed)
+    def __init__(self, context: DriverContext, thresholds: ThresholdSet, seen: Observation) -> None:
+        self._model = Model(task_of(context.scenario, TRACK), thresholds, Habits())
+        self._random = np.random.default_rng(context.seed)
         own, other = _vehicles(seen)
-        offsets = offsets_of(int(seat.number("pair")), seat.repetition)
-        base = thresholds.base(offsets[SIDES.index(seat.side)])
+        offsets = offsets_of(int(context.number("pair")), context.repetition)
+        base = thresholds.base(offsets[SIDES.index(context.side)])
         desired = set_speeds(self._model.task, own.speeds_mps)
         ticks = tunnel_ticks(own, other) if seen.other_seen else np.zeros(1)
         self._agents = start(self._model, [base], own, other, desired, ticks, self._noise())
         self._last = seen
 
     def decide(self, seen: Observation, ticks: int) -> float:
-        """The input in [-1, 1] to hold, where ``ticks`` have passed since the last decision."""
+        """Return the input in [-1, 1] to hold; ``ticks`` have passed since the last decision."""
         own, other = _vehicles(seen)
         accelerated = np.array([self._acceleration_mps2(seen, ticks)])
         noises = [self._noise() for _ in range(ticks)]
@@ -45,10 +45,10 @@ class Seated:
         return float(self._agents.inputs[0])
 
     def _acceleration_mps2(self, seen: Observation, ticks: int) -> float:
-        """That of the other in each of these ticks."""
+        """Return the other's acceleration in each of these ticks."""
         if ticks == 1 or not (seen.other_seen and self._last.other_seen):
             return seen.other_acceleration_mps2
-        # Between two decisions that are more than a tick apart it saw a steady change of speed.
+        # Between decisions that are several ticks apart its speed is taken to change steadily.
         return (seen.other_speed_mps - self._last.other_speed_mps) / (ticks * TICK_S)
 
     def _noise(self) -> Array:
@@ -56,7 +56,7 @@ class Seated:
 
 
 def _vehicles(seen: Observation) -> tuple[Vehicles, Vehicles]:
-    """The own one and the other."""
+    """Return the own vehicle and the other one."""
     own_m, other_m = seen.own_position_m, seen.own_position_m + seen.relative_distance_m
     return (
         Vehicles(np.array([own_m]), np.array([seen.own_speed_mps])),

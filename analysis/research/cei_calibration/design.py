@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from analysis.research.cei_calibration.simulation import Trial
 from merge_runner.config import Resistance, ScenarioConfig
+from merge_runner.drivers.cei.agents import Model
+from merge_runner.drivers.cei.motion import task_of
+from merge_runner.drivers.cei.parameters import OFFSETS, TICK_S, Habits, ThresholdSet, offsets_of
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.records import Side, TrialSpec
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
-from merge_runner_cei.agents import Model
-from merge_runner_cei.batch import Trial
-from merge_runner_cei.motion import task_of
-from merge_runner_cei.parameters import OFFSETS, TICK_S, Habits, ThresholdSet, offsets_of
 
 # As often as each human pair drove each condition.
 TRIALS_OF_A_PAIR = 10
@@ -64,4 +64,4 @@ def _seed(
         order=0,
         kinematics=HUMAN_CONDITIONS[condition],
     )
-    return PROGRAMS["cei"].seat(scenario, spec, side).seed
+    return PROGRAMS["cei"].context(scenario, spec, side).seed

@@ -1,4 +1,4 @@
-"""What simulated trials come to: their measures, and the numbers that are published of these.
+"""Measures of simulated trials, and the published numbers of these measures.
 
 The measures are those of ``trial_metrics`` (measures.sql), computed from arrays, since a search
 needs them a thousand times; a test plays trials with the runner and compares.
@@ -12,12 +12,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from analysis.research.cei_calibration.simulation import Traces, Trial
+from merge_runner.drivers.cei.collision_interval import exact_bounds
+from merge_runner.drivers.cei.motion import Task
+from merge_runner.drivers.cei.parameters import TICK_S
 from merge_runner.records import SIDES
 from merge_runner_analysis.stats.regressions import gap_ols, who_first_logit
-from merge_runner_cei.batch import Traces, Trial
-from merge_runner_cei.collision_interval import exact_bounds
-from merge_runner_cei.motion import Task
-from merge_runner_cei.parameters import TICK_S
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -126,7 +126,7 @@ def _resolutions(task: Task, traces: Traces) -> Array:
 
 
 def _on_course(traces: Traces, own: int, at_m: float, low_m: float, high_m: float) -> Mask:
-    """Whether one car, at the point at present speeds, would find the other within the bounds."""
+    """Return True where the other will be within the bounds when one vehicle is at the point."""
     position, speed = traces.positions_m[:, own], traces.speeds_mps[:, own]
     moving = (position < at_m) & (speed > 0)
     seconds = np.where(moving, at_m - position, 0.0) / np.where(moving, speed, 1.0)

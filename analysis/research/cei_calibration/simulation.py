@@ -1,4 +1,4 @@
-"""Many trials of the model at once, with a world of their own: cars as arrays.
+"""Simulation of many trials of the model at once: vehicles as arrays.
 
 A trial that starts at the tunnels' exits is, sample by sample, the one that the runner plays with
 two of the model's drivers at 20 Hz (to 1e-9). One that starts in the tunnels is the published
@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from merge_runner.drivers.cei.agents import Model, Vehicles, set_speeds, start, tunnel_ticks
+from merge_runner.drivers.cei.motion import Array, Mask, Task, move
+from merge_runner.drivers.cei.parameters import CRUISE_DAMPING, CRUISE_GAIN, TICK_S, Base
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.conditions import Condition
-from merge_runner_cei.agents import Model, Vehicles, set_speeds, start, tunnel_ticks
-from merge_runner_cei.motion import Array, Mask, Task, move
-from merge_runner_cei.parameters import CRUISE_DAMPING, CRUISE_GAIN, TICK_S, Base
 
 RUNNING = ""
 NOBODY = Base(1.0, 1.0)
@@ -25,9 +25,9 @@ NOBODY = Base(1.0, 1.0)
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """What is simulated: where two vehicles start, and of both, left first, driver and seed.
+    """Trial to simulate: its condition, and drivers and seeds of both vehicles, left first.
 
-    None in the place of a driver: the vehicle keeps its speed by its cruise control.
+    Without a driver (None) a vehicle keeps its speed by its cruise control.
     """
 
     condition: Condition
@@ -37,7 +37,7 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class Traces:
-    """What became of n trials.
+    """Traces and outcomes of n trials.
 
     ``positions_m`` and ``speeds_mps`` have the shape (samples, 2, n), left first; samples are 50 ms
     apart, and those after a trial's end repeat its last. ``control_at`` and ``ended_at`` are the
@@ -155,7 +155,7 @@ class _World:
 
 
 def _noise(seed: int, seconds: float) -> Array:
-    """What a driver of the runner draws with its seed, of the shape (draws, 2)."""
+    """Return the random draws of the runner's driver with this seed, of the shape (draws, 2)."""
     return np.random.default_rng(seed).standard_normal((round(seconds / TICK_S) + 1, 2))
 
 

@@ -8,20 +8,20 @@ from dataclasses import asdict, replace
 import pytest
 from scipy.stats import spearmanr
 
+from analysis.research.cei_calibration import __main__ as calibration
+from analysis.research.cei_calibration.authors_fit import REACTIONS, estimated
+from analysis.research.cei_calibration.design import design, experiment, model_of
+from analysis.research.cei_calibration.search import MISSING, cost, search, targets
+from analysis.research.cei_calibration.searches import SEARCHES
+from analysis.research.cei_calibration.simulation import simulate
+from merge_runner.drivers.cei.driver import check
+from merge_runner.drivers.cei.parameters import OFFSETS, SETS, TICK_S
 from merge_runner.errors import UsageError
 from merge_runner.records import SIDES
 from merge_runner.results.store import Store
 from merge_runner_analysis.frames import load
 from merge_runner_analysis.humans.record import SPEC, SPEC_HASH, Trace, trial_record
 from merge_runner_analysis.published import PAIRS
-from merge_runner_cei.batch import simulate
-from merge_runner_cei.calibration import __main__ as calibration
-from merge_runner_cei.calibration.authors_fit import REACTIONS, estimated
-from merge_runner_cei.calibration.design import design, experiment, model_of
-from merge_runner_cei.calibration.search import MISSING, cost, search, targets
-from merge_runner_cei.calibration.searches import SEARCHES
-from merge_runner_cei.driver import check
-from merge_runner_cei.parameters import OFFSETS, SETS, TICK_S
 from tests.support.cei_trials import scenario, simulated
 from tests.support.harness import PROJECT, environment
 
@@ -124,11 +124,11 @@ SHOWN = [(3, ["K0"]), (4, ["F1"]), (5, ["drag-free"]), (6, ["K0", "--tunnel"])]
 
 @pytest.mark.parametrize(("column", "command"), SHOWN)
 def test_the_readme_prints_the_results_of_the_driver_cei(column, command):
-    program = [sys.executable, "-m", "merge_runner_cei.calibration", "check", *command]
+    program = [sys.executable, "-m", "analysis.research.cei_calibration", "check", *command]
     out = subprocess.check_output(program, cwd=PROJECT, env=environment(), text=True)
     # Each line ends with the mean, its spread, the tolerance and by how many of these it is off.
     found = [tuple(map(float, line.split()[-4:-2])) for line in out.splitlines()[1:]]
-    readme = PROJECT / "plugins/merge_runner_cei/README.md"
+    readme = PROJECT / "analysis/research/cei_calibration/README.md"
     text = readme.read_text("utf-8").replace("\N{MINUS SIGN}", "-")
     rows = re.findall(r"^\| (?:collisions|time-outs|who|gap|largest|conflict|first).*", text, re.M)
     cells = [re.split(r"(?<!\\)\|", row)[column].replace("*", "") for row in rows]

@@ -1,4 +1,4 @@
-"""Find thresholds, and show what they come to: ``python -m merge_runner_cei.calibration``."""
+"""Find thresholds, and print their results: ``python -m analysis.research.cei_calibration``."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ import typer
 
 from merge_runner.cli.options import DbOption, print_out
 from merge_runner.config import Resistance
+from merge_runner.drivers.cei.parameters import SETS, ThresholdSet
 from merge_runner.errors import MergeRunnerError
 from merge_runner.paths import DEFAULT_DB
 from merge_runner.registry import require
 from merge_runner.text_safety import say
-from merge_runner_cei.parameters import SETS, ThresholdSet
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from merge_runner_cei.calibration.authors_fit import Fit
+    from analysis.research.cei_calibration.authors_fit import Fit
 
 app = typer.Typer(help="Thresholds of the driver cei.", no_args_is_help=True)
 SetArgument = Annotated[str, typer.Argument(metavar="SET", help=f"{', '.join(SETS)}.")]
@@ -40,9 +40,9 @@ def check(
     ] = False,
 ) -> None:
     """Simulate 990 trials of each sample set from 0 on, and compare with what is published."""
-    from merge_runner_cei.calibration.design import experiment
-    from merge_runner_cei.calibration.search import compared, numbers_of
-    from merge_runner_cei.calibration.searches import SEARCHES
+    from analysis.research.cei_calibration.design import experiment
+    from analysis.research.cei_calibration.search import compared, numbers_of
+    from analysis.research.cei_calibration.searches import SEARCHES
 
     thresholds = require(SETS, "set", name)
     scenario = experiment(resistance or SEARCHES[name].resistance)
@@ -62,7 +62,7 @@ def search(
     seed: int | None = None,
 ) -> None:
     """Search for a set anew, from where its search began; with other numbers, for a better one."""
-    from merge_runner_cei.calibration.searches import SEARCHES
+    from analysis.research.cei_calibration.searches import SEARCHES
 
     changes = {
         "generations": generations,
@@ -79,7 +79,7 @@ def search(
 @app.command()
 def fit(db: DbOption = DEFAULT_DB) -> None:
     """Fit thresholds to the imported humans, as the model's authors did."""
-    from merge_runner_cei.calibration.authors_fit import fit_thresholds, threshold_set
+    from analysis.research.cei_calibration.authors_fit import fit_thresholds, threshold_set
 
     fits = fit_thresholds(Path(db))
     for name, one in zip(("lower", "upper"), fits, strict=True):

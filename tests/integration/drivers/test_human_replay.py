@@ -9,6 +9,7 @@ import duckdb
 import pytest
 from starlette.testclient import TestClient
 
+from merge_runner.drivers.human_replay import HUMAN_REPLAY, SAMPLE_S
 from merge_runner.errors import UsageError
 from merge_runner.records import SIDES
 from merge_runner.results.store import Store, query
@@ -18,7 +19,6 @@ from merge_runner.trial import Trial, play_trial
 from merge_runner_analysis.humans.load import import_trials, sort_files
 from merge_runner_analysis.web.app import explorer
 from merge_runner_analysis.web.site import Site
-from merge_runner_cei.human_replay import HUMAN_REPLAY, SAMPLE_S
 from tests.support.driven_trials import ask_nobody
 from tests.support.recordings import drive, file
 

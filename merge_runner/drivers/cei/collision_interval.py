@@ -1,4 +1,4 @@
-"""Where the other vehicle would collide, as the model sees it: between two straight lines.
+"""Interval of the other's positions that collide, as in the model: between two straight lines.
 
 The published model replaces the exact table of overlapping boxes by linear regressions over it;
 these are made anew here, from the same boxes that the rule ``rectangle`` compares.
@@ -23,9 +23,9 @@ PRECISION_M = 1e-7
 
 @dataclass(frozen=True, slots=True)
 class CollisionInterval:
-    """For a vehicle at p from ``contact_m`` on: the other's positions at which both overlap.
+    """Positions of the other that overlap a vehicle at a position from ``contact_m`` on.
 
-    Both bounds are lines, slope and intercept in m; the lower one is never before the contact.
+    Both bounds are lines, slope and intercept in m; the lower one is at least ``contact_m``.
     """
 
     contact_m: float
@@ -33,14 +33,14 @@ class CollisionInterval:
     upper: tuple[float, float]
 
     def at(self, position_m: Array) -> tuple[Array, Array]:
-        """The lower and the upper bound in m."""
+        """Return the lower and the upper bound in m."""
         (low, low_m), (high, high_m) = self.lower, self.upper
         return np.maximum(self.contact_m, low * position_m + low_m), high * position_m + high_m
 
 
 @cache
 def collision_interval(track: Track, length_m: float, width_m: float) -> CollisionInterval:
-    """The lines through the exact bounds, from the first possible contact to the track's end."""
+    """Return the regression lines of the exact bounds, from first contact to the track's end."""
     contact = first_contact(track, length_m, width_m)
     positions = np.arange(contact + PRECISION_M, track.end_m, TABLE_STEP_M)
     bounds = [exact_bounds(track, length_m, width_m, float(p)) for p in positions]
@@ -55,7 +55,7 @@ def collision_interval(track: Track, length_m: float, width_m: float) -> Collisi
 
 
 def first_contact(track: Track, length_m: float, width_m: float) -> float:
-    """The position in m before which no vehicle can touch the other."""
+    """Return the position in m before which no vehicle can touch the other."""
     # Level vehicles are the first that can.
     return _edge(
         lambda p: rectangles_overlap(track, p, p, length_m, width_m),
@@ -67,7 +67,7 @@ def first_contact(track: Track, length_m: float, width_m: float) -> float:
 def exact_bounds(
     track: Track, length_m: float, width_m: float, position_m: float
 ) -> tuple[float, float]:
-    """Between which positions of the other it overlaps a vehicle that is past the contact."""
+    """Return the bounds of the other's positions that overlap a vehicle past the contact."""
     reach = 2 * (length_m + width_m)
     low, high = (
         _edge(
@@ -81,7 +81,7 @@ def exact_bounds(
 
 
 def _edge(inside: Callable[[float], bool], within: float, beyond: float) -> float:
-    """Where a condition that holds at ``within`` ends on the way to ``beyond``, by bisection."""
+    """Return by bisection the edge of a condition that holds at ``within``, not at ``beyond``."""
     while abs(beyond - within) > PRECISION_M:
         middle = (within + beyond) / 2
         within, beyond = (middle, beyond) if inside(middle) else (within, middle)

@@ -1,4 +1,4 @@
-"""One driver of the model at the wheel of a trial."""
+"""The program ``cei`` and its parameters."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from dataclasses import asdict, fields
 from typing import TYPE_CHECKING
 
 from merge_runner.config import Resistance, whole_steps
-from merge_runner.drivers.program_seat import Parameter, ProgramSeat
+from merge_runner.drivers.base import DriverContext, Parameter
+from merge_runner.drivers.cei.parameters import OFFSETS, RISKS, SETS, TICK_S, ThresholdSet
 from merge_runner.drivers.registry import PROGRAMS, SET, Program
 from merge_runner.errors import UsageError
 from merge_runner.records import Decision, Observation
-from merge_runner_cei.parameters import OFFSETS, RISKS, SETS, TICK_S, ThresholdSet
 
 if TYPE_CHECKING:
-    from merge_runner_cei.seated import Seated
+    from merge_runner.drivers.cei.agent import Agent
 
 BY_RESISTANCE = "by-resistance"
 USUAL_SETS: dict[Resistance, str] = {"human": "K0", "none": "drag-free"}
@@ -22,32 +22,32 @@ PAIR = "pair"
 
 
 class CeiDriver:
-    """See Driver; it loads numpy and scipy with its first decision."""
+    """Driver by the model; numpy and scipy are imported at its first decision."""
 
-    def __init__(self, seat: ProgramSeat) -> None:
-        self.seat = seat
-        self.ticks = round(seat.interval_s / TICK_S)
-        self._seated: Seated | None = None
+    def __init__(self, context: DriverContext) -> None:
+        self.context = context
+        self.ticks = round(context.interval_s / TICK_S)
+        self._agent: Agent | None = None
 
     async def decide(self, observation: Observation, number: int) -> Decision:
-        """Hold the input of the present plan, which stays until there is a reason for another."""
-        from merge_runner_cei.seated import Seated
+        """Hold the input of the current plan, which stays until there is a reason to replan."""
+        from merge_runner.drivers.cei.agent import Agent
 
-        if self._seated is None:
-            self._seated = Seated(self.seat, thresholds_of(self.seat), observation)
-            return self.seat.held(self._seated.decide(observation, 1))
-        return self.seat.held(self._seated.decide(observation, self.ticks))
+        if self._agent is None:
+            self._agent = Agent(self.context, thresholds_of(self.context), observation)
+            return self.context.held(self._agent.decide(observation, 1))
+        return self.context.held(self._agent.decide(observation, self.ticks))
 
 
-def thresholds_of(seat: ProgramSeat) -> ThresholdSet:
-    """Those that a study gives, or those that suit its resistance."""
-    if seat.parameters[SET] == BY_RESISTANCE:
-        return SETS[USUAL_SETS[seat.scenario.resistance]]
-    return ThresholdSet(**{each.name: seat.number(each.name) for each in fields(ThresholdSet)})
+def thresholds_of(context: DriverContext) -> ThresholdSet:
+    """Return the thresholds that a study sets, or those calibrated for its resistance."""
+    if context.parameters[SET] == BY_RESISTANCE:
+        return SETS[USUAL_SETS[context.scenario.resistance]]
+    return ThresholdSet(**{each.name: context.number(each.name) for each in fields(ThresholdSet)})
 
 
 def check(parameters: Mapping[str, Parameter]) -> None:
-    """Raises UsageError for a pair that there is not, and for thresholds that are no risks."""
+    """Raise UsageError for an unknown pair, and for a threshold that is no risk."""
     if parameters[PAIR] not in range(len(OFFSETS) + 1):
         raise UsageError(
             f"the driver cei has no pair {parameters[PAIR]}: 1 to {len(OFFSETS)} can be chosen, "
@@ -59,7 +59,7 @@ def check(parameters: Mapping[str, Parameter]) -> None:
 
 
 def check_clock(_: Mapping[str, Parameter], clock_s: float) -> None:
-    """Raises UsageError for a clock that is no whole number of ticks."""
+    """Raise UsageError for a clock that is no whole number of ticks."""
     try:
         whole_steps("clock", clock_s, TICK_S)
     except ValueError as exc:

@@ -1,4 +1,4 @@
-"""One side of an imported human trial, driven again as it was: this human does not react."""
+"""The program ``human-replay``: one side of an imported human trial, without reactions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from itertools import islice, pairwise
 from typing import TYPE_CHECKING
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.drivers.program_seat import ProgramSeat
+from merge_runner.drivers.base import DriverContext
 from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError, unknown_name
 from merge_runner.records import SIDES, Decision, Observation, Side
@@ -38,10 +38,10 @@ NOT_IMPORTED = (
 
 @dataclass(frozen=True, slots=True)
 class HumanTrial:
-    """A human trial from the start of control on, with a sample every 0.05 s.
+    """Human trial from the start of control on, with a sample every 0.05 s.
 
-    ``number`` is its place among the trials of its ``pair``. Positions are travelled distances in
-    m, speeds in m/s, both by side.
+    ``number`` counts the trials of a ``pair``. Positions are travelled distances in m, speeds in
+    m/s, both by side.
     """
 
     pair: str
@@ -56,28 +56,28 @@ class HumanTrial:
         return {side: (self.positions_m[side][0], self.speeds_mps[side][0]) for side in SIDES}
 
     def net_mps2(self, side: Side) -> list[float]:
-        """What a side executed from each sample to the next."""
+        """Return the net accelerations of a side from each sample to the next."""
         return [(after - before) / SAMPLE_S for before, after in pairwise(self.speeds_mps[side])]
 
 
 class ImportedHumans:
-    """The finished human trials of the database that was read last, and their hash ``digest``."""
+    """Finished human trials of the database that was read last, and their hash ``digest``."""
 
     def __init__(self) -> None:
         self.keep(())
 
     def keep(self, trials: tuple[HumanTrial, ...]) -> None:
-        """Replay these trials in place of those that were there."""
+        """Replace the trials."""
         self.trials = trials
         self.digest = hashlib.sha256(repr(trials).encode()).hexdigest()
         self._usable: dict[tuple[object, ...], list[HumanTrial]] = {}
 
     def read(self, connection: DuckDBPyConnection | None) -> None:
-        """Replay the trials of a database; None: there is no database yet."""
+        """Replace the trials by those of a database; None: there is no database yet."""
         self.keep(() if connection is None else imported_trials(connection))
 
     def usable(self, config: ScenarioConfig, condition: str, pair: str) -> list[HumanTrial]:
-        """Return those of a condition that the scenario's vehicles can drive, pairs in turn."""
+        """Return the trials of a condition that these vehicles can drive, pairs in turn."""
         key = (condition, pair, config.resistance, config.max_acceleration_mps2)
         if key not in self._usable:
             chosen = [
@@ -124,9 +124,9 @@ HUMANS = ImportedHumans()
 
 
 def imported_trials(connection: DuckDBPyConnection) -> tuple[HumanTrial, ...]:
-    """Return the finished human trials of a database, each once however often it was imported.
+    """Return the finished human trials of a database, each once even if imported twice.
 
-    One of another clock than the recorder's is left out.
+    Trials of another clock than the recorder's are left out.
     """
     ways: dict[tuple[str, int, str], dict[str, _Samples]] = {}
     for row in connection.execute(TRACES).fetchall():
@@ -145,7 +145,7 @@ def imported_trials(connection: DuckDBPyConnection) -> tuple[HumanTrial, ...]:
 
 
 def _can_be_driven(config: ScenarioConfig, trial: HumanTrial) -> bool:
-    """Whether no acceleration of the trial is beyond what the scenario's vehicles have."""
+    """Return True if the scenario's vehicles reach every acceleration of the trial."""
     limit = config.max_acceleration_mps2 * (1 + ROUNDING)
     return all(
         abs(net - net_acceleration(0.0, speed, config.resistance)) <= limit
@@ -156,32 +156,32 @@ def _can_be_driven(config: ScenarioConfig, trial: HumanTrial) -> bool:
 
 @dataclass(slots=True)
 class HumanReplayDriver:
-    """Executes what a human executed, whatever the other does; after that it keeps its speed."""
+    """Driver that executes a human's accelerations, and then keeps its speed."""
 
-    seat: ProgramSeat
+    context: DriverContext
     trial: HumanTrial = field(init=False)
     _net_mps2: list[float] = field(init=False)
 
     def __post_init__(self) -> None:
-        """Raises UsageError where there is no such trial."""
-        seat = self.seat
-        usable = HUMANS.usable(seat.scenario, seat.condition, str(seat.parameters["pair"]))
-        if len(usable) < seat.repetition:
+        """Raise UsageError if there is no such trial."""
+        context = self.context
+        usable = HUMANS.usable(context.scenario, context.condition, str(context.parameters["pair"]))
+        if len(usable) < context.repetition:
             raise UsageError(NOT_IMPORTED)
-        self.trial = usable[seat.repetition - 1]
-        self._net_mps2 = self.trial.net_mps2(seat.side)
+        self.trial = usable[context.repetition - 1]
+        self._net_mps2 = self.trial.net_mps2(context.side)
 
     @property
     def starts(self) -> Mapping[Side, tuple[float, float]]:
-        """Where both sides started in the human trial."""
+        """Position and speed of both sides at the start of the human trial."""
         return self.trial.starts
 
     async def decide(self, observation: Observation, number: int) -> Decision:
-        """What the human did from this sample to the next, whatever it is told of its speed."""
+        """Return the human's acceleration to the next sample, whatever speed is perceived."""
         if number < len(self._net_mps2):
-            own_mps = self.trial.speeds_mps[self.seat.side][number]
-            return self.seat.accelerating(self._net_mps2[number], own_mps)
-        return self.seat.accelerating(0.0, observation.own_speed_mps)
+            own_mps = self.trial.speeds_mps[self.context.side][number]
+            return self.context.accelerating(self._net_mps2[number], own_mps)
+        return self.context.accelerating(0.0, observation.own_speed_mps)
 
 
 PROGRAMS.register(

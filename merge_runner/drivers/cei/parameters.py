@@ -1,8 +1,8 @@
-"""The model's constants, the thresholds of its drivers, and its nine synthetic pairs.
+"""Constants of the model, thresholds of its drivers, and its nine synthetic pairs.
 
 Equations and constants: Siebinga, Zgonnikov and Abbink, PNAS Nexus 3(10), pgae420 (2024), arXiv
-2312.09776. The fitted thresholds of that paper are not public: each set here is ours, calibrated to
-the outcomes that the paper published (README.md says which it meets).
+2312.09776. The fitted thresholds of that paper are not public: the sets here are calibrated to its
+published outcomes (docs/reference-drivers.md).
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from math import sqrt
 from typing import NamedTuple
 
 TICK_S = 0.05
-# The times that a belief and a plan are about: 24 nodes, up to 6 s ahead.
+# Nodes of a belief and of a plan: 24, up to 6 s ahead.
 NODE_S, NODES = 0.25, 24
 MEMORY_TICKS = 40
-# A plan is one of so many constant inputs in [-1, 1].
+# Number of constant inputs in [-1, 1] that a plan is chosen from.
 PLANS = 81
 PLAN_NOISE = 0.025
 # The perceived speed follows the other's with a time constant of 2 s, and wanders by 0.6 m/s.
@@ -24,21 +24,21 @@ PERCEPTION_NOISE = 0.6  # m/s per square root of a second
 # The cruise control of the human simulator: input by error of speed, in s/m, and by its change. At
 # 10 m/s it leaves an error of 0.08 m/s, by which drivers start below the speed that they desire.
 CRUISE_GAIN, CRUISE_DAMPING = 5.0, 0.05
-# The second, broader part of the risk: being too close.
+# Factor of the spread in the second part of the risk, being too close.
 BROADER = 3.0
 LOWEST_BASE, NARROWEST_BAND = 0.02, 0.05
 LOWEST_THRESHOLD, HIGHEST_THRESHOLD = 0.05, 1.0
-# What a solved plan may risk, as a share of the lower and of the upper threshold.
+# Highest risk of a new plan, as a share of the lower and of the upper threshold.
 TO_LOWER, TO_UPPER = 0.8, 0.6
 
 
 @dataclass(frozen=True, slots=True)
 class Habits:
-    """What all drivers have in common.
+    """Constants that all drivers share.
 
-    ``comfortable_mps2`` is how strongly the other is expected to accelerate, ``saturation_s`` how
-    long a low risk is borne before the driver returns to its own speed. Without ``noise`` a driver
-    sees speeds as they are and drives as it planned.
+    ``comfortable_mps2`` is the expected acceleration of the other; after ``saturation_s`` of low
+    risk the driver returns to its desired speed. Without ``noise``, perception and control are
+    exact.
     """
 
     comfortable_mps2: float = 1.0
@@ -47,26 +47,26 @@ class Habits:
 
     @property
     def saturation_ticks(self) -> int:
-        """The same in ticks."""
+        """Saturation time in ticks."""
         return round(self.saturation_s / TICK_S)
 
     @property
     def remaining(self) -> float:
-        """How much of a wrong idea of the other's speed is left a tick later."""
+        """Share of an error of the perceived speed that is left after a tick."""
         return 1 - PERCEPTION_RATE_HZ * TICK_S if self.noise else 0.0
 
     @property
     def wander_mps(self) -> float:
-        """The standard deviation of what a tick adds to the perceived speed."""
+        """Standard deviation of the noise that a tick adds to the perceived speed."""
         return PERCEPTION_NOISE * sqrt(TICK_S) if self.noise else 0.0
 
 
 FITTING = Habits(comfortable_mps2=1.6, saturation_s=2.0, noise=False)
-"""Those of the agents to which the authors fitted the thresholds of their human drivers."""
+"""Habits of the agents that the authors fitted to their human drivers."""
 
 
 class Base(NamedTuple):
-    """What a driver accepts to risk, and from what risk on it acts, but for its incentives."""
+    """Base thresholds of a driver, before its incentives."""
 
     lower: float
     upper: float
@@ -93,7 +93,7 @@ class ThresholdSet:
     upper_product: float
 
     def base(self, offset: float) -> Base:
-        """The thresholds of a driver without headway and relative speed."""
+        """Return the base thresholds of a driver."""
         lower = max(self.lower_mean - self.lower_spread * offset, LOWEST_BASE)
         upper = self.upper_mean - self.upper_spread * offset
         return Base(lower, max(upper, lower + NARROWEST_BAND))
@@ -102,7 +102,7 @@ class ThresholdSet:
 RISKS = ("lower_mean", "upper_mean", "lower_spread", "upper_spread")
 """The first numbers of a set: each is a risk, from 0 to 1."""
 
-# `python -m merge_runner_cei.calibration search` finds them again: K0 and drag-free for the
+# `python -m analysis.research.cei_calibration search` finds them again: K0 and drag-free for the
 # published outcomes and the humans' first action, F1 for the outcomes alone.
 SETS: dict[str, ThresholdSet] = {
     "K0": ThresholdSet(
@@ -136,9 +136,9 @@ _INTERCEPTS = (
 )
 _SPREAD_MPS = 0.589  # of the 18 values
 OFFSETS = tuple(Pair(pair.left / _SPREAD_MPS, pair.right / _SPREAD_MPS) for pair in _INTERCEPTS)
-"""Of the drivers of the nine synthetic pairs, in standard deviations."""
+"""Offsets z of the drivers of the nine synthetic pairs, in standard deviations."""
 
 
 def offsets_of(pair: int, repetition: int) -> Pair:
-    """Those of a pair from 1 to 9; pair 0 takes turns by the repetition, which counts from 1."""
+    """Return the offsets of a pair from 1 to 9; pair 0 takes turns by the repetition (from 1)."""
     return OFFSETS[(pair or repetition) % len(OFFSETS) - 1]

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from merge_runner.config import Perception
+from merge_runner.drivers.cei.agents import Vehicles, set_speeds, start, tunnel_ticks
+from merge_runner.drivers.cei.collision_interval import collision_interval, exact_bounds
+from merge_runner.drivers.cei.driver import USUAL_SETS, thresholds_of
+from merge_runner.drivers.cei.motion import course
+from merge_runner.drivers.cei.parameters import OFFSETS, SETS, Base, offsets_of
 from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.vehicle import advance, net_acceleration
-from merge_runner_cei.agents import Vehicles, set_speeds, start, tunnel_ticks
-from merge_runner_cei.collision_interval import collision_interval, exact_bounds
-from merge_runner_cei.driver import USUAL_SETS, thresholds_of
-from merge_runner_cei.motion import course
-from merge_runner_cei.parameters import OFFSETS, SETS, Base, offsets_of
 from tests.support.cei_trials import cei, model, played, scenario
 from tests.support.driven_trials import spec
 
@@ -106,7 +106,7 @@ def test_the_nine_pairs_take_turns_by_the_repetition():
 def test_the_usual_set_suits_the_resistance_unless_one_is_chosen(resistance):
     task = scenario(resistance=resistance)
     for program, name in ((cei(), USUAL_SETS[resistance]), (cei(set="F1"), "F1")):
-        assert thresholds_of(program.seat(task, spec("N_0_0"), "left")) == SETS[name]
+        assert thresholds_of(program.context(task, spec("N_0_0"), "left")) == SETS[name]
     assert USUAL_SETS["human"] != USUAL_SETS["none"]
 
 

@@ -1,4 +1,4 @@
-"""A study run from Python, as in a notebook: ``Study("study.toml").run()``, and its results.
+"""Study for Python and notebooks: ``Study("study.toml").run()``, and its results.
 
 >>> from merge_runner import Study
 >>> outcome = await Study("study.toml").arun()
@@ -14,8 +14,7 @@ from functools import partialmethod, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
-from merge_runner.drivers.base import Driver
-from merge_runner.drivers.program_seat import ProgramSeat
+from merge_runner.drivers.base import Driver, DriverContext
 from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, home_of
@@ -38,7 +37,7 @@ PARTS = ("repetitions", "conditions", "variants")
 
 
 def sync(method: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, T]:
-    """Return the method as one that blocks; it raises UsageError where an event loop is running."""
+    """Return a blocking version of a method; it raises UsageError if an event loop is running."""
 
     @wraps(method)
     def blocking(*args: P.args, **kwargs: P.kwargs) -> T:
@@ -54,10 +53,10 @@ def sync(method: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, T]:
 
 @dataclass(repr=False)
 class StudyOutcome:
-    """What a run did, and its trials as data frames, those that were stored before among them.
+    """Outcome of a run, with its trials as data frames, including those stored before.
 
-    ``exit_code`` is that of the command line: 0 where all trials ended; ``messages`` say what went
-    wrong. ``facts`` is the summary that ``merge-runner sweep --json`` prints.
+    ``exit_code`` is that of the command line: 0 if all trials ended; ``messages`` are its errors.
+    ``facts`` is the summary that ``merge-runner sweep --json`` prints.
     """
 
     facts: dict[str, Any]
@@ -70,50 +69,50 @@ class StudyOutcome:
         self.sweep_id: str = self.facts["sweep_id"]
 
     def __repr__(self) -> str:
-        """The summary, and what went wrong, for a reader."""
+        """Return the summary and the errors as text."""
         errors = (f"error: {message}" for message in self.messages)
         return "\n".join([*as_lines(self.facts), *errors])
 
     def trials(self) -> pd.DataFrame:
-        """One row a trial, with its measures in SI units and a column for each factor.
+        """Return one row per trial, with measures in SI units and a column for each factor.
 
-        A factor is of numbers where all its levels are numbers, of truth values likewise.
+        The column of a factor is numeric if all its levels are numbers, boolean likewise.
         """
         from merge_runner.results.frames import load_trials
 
         return load_trials(self.db, self.sweep_id)
 
     def rows(self, table: str) -> pd.DataFrame:
-        """The rows of one of the tables that hold its trials."""
+        """Return the rows of its trials in one table of the database."""
         from merge_runner.results.frames import load_of_sweep
 
         return load_of_sweep(self.db, self.sweep_id, table)
 
-    # One row a decision, an attempt at a call, a vehicle and step.
+    # One row per decision; per attempt at a call; per vehicle and step.
     decisions = partialmethod(rows, "decisions")
     calls, states = partialmethod(rows, "calls"), partialmethod(rows, "states")
 
     def sql(self, query: str) -> pd.DataFrame:
-        """The rows of one read-only query over the whole database; raises UsageError."""
+        """Return the rows of a read-only query over the whole database; raise UsageError."""
         from merge_runner.results.frames import load
 
         return load(self.db, query)
 
 
 class Study:
-    """A study that can be run: a sweep of ``experiments``, or a file, and what of it is wanted.
+    """Study to run: a sweep of ``experiments`` by name, or a file.
 
-    ``models``, ``repetitions``, ``conditions`` and ``prompts`` take the place of what the file
-    says; ``only`` names a level, or a list of levels, by factor; ``mirror`` plays two different
-    drivers both ways round; ``db`` and ``cache`` lie beside the file; ``trust`` agrees to the code
-    of the study, and to where its models.toml sends keys. ``arun``, ``areplay`` and ``adry_run``
-    are awaited, as in a notebook; ``run``, ``replay`` and ``dry_run`` are for scripts. How a run
-    goes on is said by the fields of ``Options``, as ``in_flight=50, max_cost_usd=20``.
+    ``models``, ``repetitions``, ``conditions`` and ``prompts`` override the file; ``only`` selects
+    a level, or a list of levels, by factor; ``mirror`` counterbalances the sides of two different
+    drivers; ``db`` and ``cache`` are beside the file by default; ``trust`` agrees to run the code
+    of the study, and to send keys where its models.toml says. ``arun``, ``areplay`` and
+    ``adry_run`` are awaited, as in a notebook; ``run``, ``replay`` and ``dry_run`` are for scripts.
+    Fields of ``Options`` configure a run, as ``in_flight=50, max_cost_usd=20``.
 
     Studies run side by side, in one event loop or in threads, each with its own parts.
 
-    All of them raise UsageError for what cannot be run as it is asked for. What goes wrong on the
-    way is in the outcome, beside the trials that ended: the same call goes on from there.
+    All methods raise UsageError for an invalid study or option. Errors of trials and calls are in
+    the outcome, beside the trials that ended; the same call continues from there.
     """
 
     def __init__(
@@ -137,11 +136,10 @@ class Study:
         self._wanted: dict[str, Any] = {"only": levels, "variants": prompts, **wanted}
 
     def register(self, registry: Registry[T], name: str, thing: T) -> T:
-        """Add a prompt, a condition, a metric, ... of this study, and return it.
+        """Add a prompt, a condition, a metric, ... to this study, and return it.
 
-        It takes the place of what was so added by this name, so that a cell can be run again; a run
-        that is under way goes on with what it began with. Raises UsageError where the name is that
-        of something else.
+        It replaces an earlier one of this name, so that a cell can be run again; a run under way
+        keeps the one that it started with. Raise UsageError if the name is taken elsewhere.
         """
         self._own.parts.get(registry.kind, {}).pop(name, None)
         with collecting(self._own):
@@ -154,15 +152,15 @@ class Study:
     def register_driver(
         self,
         name: str,
-        driver: Callable[[ProgramSeat], Driver],
+        driver: Callable[[DriverContext], Driver],
         meaning: str,
         **more: Any,  # noqa: ANN401 # fields of Program
     ) -> None:
-        """Add a driver, with fields of ``Program``. Another ``revision`` is another one."""
+        """Add a driver, with fields of ``Program``; another ``revision`` is another driver."""
         self.register(PROGRAMS, name, Program(driver, meaning, **more))
 
     def plan(self, *, first: bool = False, grid: str | None = None) -> Plan:
-        """What would be played: all, or only the first decisions; raises UsageError."""
+        """Return the plan of a run, or of its first decisions only; raise UsageError."""
         wanted = {"db": self.db, "first": first, "grid": grid, **self._wanted}
         plan = make_plan(self.file, own=self._own, **wanted)
         self._planned = plan.parts.catalogue
@@ -170,7 +168,7 @@ class Study:
         return plan
 
     async def adry_run(self) -> Estimate:
-        """The trials, calls, tokens, cost and time of a run; nothing is sent."""
+        """Estimate trials, calls, tokens, cost and time of a run; nothing is sent."""
         return await unsent(self.plan(), Options(self.db, self.cache), say=say)
 
     async def arun(
@@ -182,13 +180,11 @@ class Study:
         stop: asyncio.Event | None = None,
         **how: Any,  # noqa: ANN401 # fields of Options
     ) -> StudyOutcome:
-        """Play all trials that are not stored yet; ``yes`` lets it spend money.
+        """Play all trials that are not stored yet; ``yes`` agrees to spend money.
 
-        Where ``stop`` is set, no more is asked, and what is paid for is saved; so it is where the
-        task is cancelled.
-
-        ``first`` asks only what drivers do first, in the study's conditions or on a ``grid``, as
-        ``sweep --first`` and its ``--grid``.
+        Once ``stop`` is set, or the task is cancelled, no new call is sent, and paid replies are
+        saved. ``first`` asks only for first decisions, in the study's conditions or on a ``grid``,
+        as ``sweep --first`` and its ``--grid``.
         """
 
         def agree(expected: Estimate) -> None:
@@ -205,7 +201,7 @@ class Study:
         )
 
     async def areplay(self, *recordings: Path | str) -> StudyOutcome:
-        """Play all trials from recorded replies alone, those of the files first; sends nothing."""
+        """Play all trials from recorded replies alone, those of the files first; send nothing."""
         return await self.arun(replay=True, recordings=tuple(map(Path, recordings)))
 
     dry_run, run, replay = sync(adry_run), sync(arun), sync(areplay)

@@ -1,14 +1,14 @@
-"""How each set of thresholds was found: where its search began, and what it looked for."""
+"""The search for each set of thresholds: start, seed and targets."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from analysis.research.cei_calibration.design import experiment
+from analysis.research.cei_calibration.search import Generation, search, targets
 from merge_runner.config import Resistance
-from merge_runner_cei.calibration.design import experiment
-from merge_runner_cei.calibration.search import Generation, search, targets
-from merge_runner_cei.parameters import ThresholdSet
+from merge_runner.drivers.cei.parameters import ThresholdSet
 
 
 @dataclass(frozen=True, slots=True)
