@@ -33,11 +33,11 @@ def command_modules() -> list[str]:
 def load_commands() -> None:
     """Import these modules, each of which adds its commands to ``merge_runner.cli.app``.
 
-    A module is left out where its whole package is missing, as that of the analysis may be.
+    One that is missing is left out: the analysis need not be installed.
     """
     for module in command_modules():
         try:
             import_module(module)
         except ModuleNotFoundError as exc:
-            if exc.name != module.partition(".")[0]:
+            if not f"{module}.".startswith(f"{exc.name}."):
                 raise

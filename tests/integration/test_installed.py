@@ -4,6 +4,7 @@ import re
 import shutil
 import subprocess
 import sys
+import sysconfig
 import zipfile
 from importlib import metadata
 from pathlib import Path
@@ -40,6 +41,15 @@ def test_python_m_merge_runner_has_every_command_and_the_version(tmp_path):
     assert f"\nversion: {__version__}\n" in (PROJECT / "CITATION.cff").read_text()
     for program in (MODULE, [PROGRAM]):
         assert run(tmp_path, *program, "--version").out == f"merge-runner {__version__}\n"
+
+
+def test_without_the_analysis_the_program_has_the_commands_of_the_runner(tmp_path):
+    (tmp_path / "merge_runner").symlink_to(PROJECT / "merge_runner")
+    path = f"{tmp_path}:{sysconfig.get_path('purelib')}"
+    # Without the module site no .pth file leads to the checkout.
+    alone = run(tmp_path, sys.executable, "-S", "-m", "merge_runner", "-h", PYTHONPATH=path)
+    assert re.search(r"^ +sweep ", alone.out, re.MULTILINE)
+    assert not re.search(r"^ +tables ", alone.out, re.MULTILINE)
 
 
 def test_no_command_imports_from_the_folder_it_is_called_in(tmp_path):
