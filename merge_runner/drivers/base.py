@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.pace import Pace
@@ -23,7 +23,7 @@ class DriverContext:
     ``seed`` is a whole number below 2**64: all random draws of the driver in this trial come from
     it. ``other_seed`` is the other side's, so that both sides can share a draw. ``condition`` and
     ``repetition`` (from 1) are those of the trial. ``parameters`` are those of a program, with the
-    values that a study sets.
+    values that a study sets; ``data`` are the human trials that it replays.
     """
 
     scenario: ScenarioConfig
@@ -34,6 +34,7 @@ class DriverContext:
     condition: str
     repetition: int
     parameters: Mapping[str, Parameter]
+    data: Any = None
 
     @property
     def interval_s(self) -> float:
@@ -91,6 +92,7 @@ def make_context(
     side: Side,
     pace: Pace,
     parameters: Mapping[str, Parameter] | None = None,
+    data: Any = None,  # noqa: ANN401 # as of Program
 ) -> DriverContext:
     """Return the context of the driver of one side of a trial."""
     return DriverContext(
@@ -102,6 +104,7 @@ def make_context(
         condition=spec.condition,
         repetition=spec.repetition,
         parameters=parameters or {},
+        data=data,
     )
 
 

@@ -61,20 +61,16 @@ class HumanTrial:
 
 
 class ImportedHumans:
-    """Finished human trials of the database that was read last, and their hash ``digest``."""
+    """Finished human trials of a database, and their hash ``digest``."""
 
-    def __init__(self) -> None:
-        self.keep(())
-
-    def keep(self, trials: tuple[HumanTrial, ...]) -> None:
-        """Replace the trials."""
+    def __init__(self, trials: tuple[HumanTrial, ...] = ()) -> None:
         self.trials = trials
         self.digest = hashlib.sha256(repr(trials).encode()).hexdigest()
         self._usable: dict[tuple[object, ...], list[HumanTrial]] = {}
 
-    def read(self, connection: DuckDBPyConnection | None) -> None:
-        """Replace the trials by those of a database; None: there is no database yet."""
-        self.keep(() if connection is None else imported_trials(connection))
+    def read(self, connection: DuckDBPyConnection | None) -> ImportedHumans:
+        """Return the trials of a database; None: there is no database yet."""
+        return ImportedHumans(() if connection is None else imported_trials(connection))
 
     def usable(self, config: ScenarioConfig, condition: str, pair: str) -> list[HumanTrial]:
         """Return the trials of a condition that these vehicles can drive, pairs in turn."""
@@ -120,9 +116,6 @@ class ImportedHumans:
             )
 
 
-HUMANS = ImportedHumans()
-
-
 def imported_trials(connection: DuckDBPyConnection) -> tuple[HumanTrial, ...]:
     """Return the finished human trials of a database, each once even if imported twice.
 
@@ -165,7 +158,8 @@ class HumanReplayDriver:
     def __post_init__(self) -> None:
         """Raise UsageError if there is no such trial."""
         context = self.context
-        usable = HUMANS.usable(context.scenario, context.condition, str(context.parameters["pair"]))
+        pair = str(context.parameters["pair"])
+        usable = context.data.usable(context.scenario, context.condition, pair)
         if len(usable) < context.repetition:
             raise UsageError(NOT_IMPORTED)
         self.trial = usable[context.repetition - 1]
@@ -192,6 +186,6 @@ PROGRAMS.register(
         {"pair": EVERY_PAIR},
         1 / SAMPLE_S,
         settable=True,
-        data=HUMANS,
+        data=ImportedHumans(),
     ),
 )

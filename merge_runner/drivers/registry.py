@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Mapping
-from copy import copy
 from dataclasses import dataclass, field, replace
 from math import inf, isfinite
 from typing import TYPE_CHECKING, Any, TypeGuard
@@ -23,7 +21,6 @@ EMULATOR = "emulator"
 MOCKS = frozenset({EMULATOR, "random"})
 """The mock models."""
 SET = "set"  # the parameter that names a set of others
-_making = threading.Lock()
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,10 +41,8 @@ class Program:
     parameters or another clock.
 
     ``data`` are imported human trials that the program replays: an object with their hash as
-    ``digest``. Its ``read`` takes the trials of an open database (None: there is none yet), its
-    ``keep`` takes the ``trials`` of another such object, its ``check`` raises UsageError if there
-    are too few for a condition. ``shared`` is the object that the class reads, if ``data`` is a
-    plan's own copy (``replaying``).
+    ``digest``. Its ``read`` returns another one with the trials of an open database (None: there is
+    none yet), its ``check`` raises UsageError if there are too few trials of a condition.
     """
 
     driver: Callable[[DriverContext], Driver]
@@ -59,7 +54,6 @@ class Program:
     check: Callable[[Mapping[str, Parameter]], None] | None = None
     check_clock: Callable[[Mapping[str, Parameter], float], None] | None = None
     data: Any = None
-    shared: Any = None
     chance: bool = False
     based_on: str = ""
 
@@ -136,26 +130,16 @@ class Program:
 
     def make(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> Driver:
         """Return the driver of one side of a trial."""
-        context = self.context(scenario, spec, side)
-        if self.shared is None:
-            return self.driver(context)
-        with _making:  # another thread may play a plan with other human trials
-            if self.shared.digest != self.data.digest:
-                self.shared.keep(self.data.trials)
-            return self.driver(context)
+        return self.driver(self.context(scenario, spec, side))
 
     def replaying(self, connection: DuckDBPyConnection | None) -> Program:
-        """Return this program with a copy of its own of a database's trials, if it replays some."""
-        if self.data is None:
-            return self
-        own = copy(self.data)
-        own.read(connection)
-        return replace(self, data=own, shared=self.shared or self.data)
+        """Return this program with the human trials of a database, if it replays some."""
+        return self if self.data is None else replace(self, data=self.data.read(connection))
 
     def context(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> DriverContext:
         """Return the context of that driver."""
         pace = program_pace(scenario, self.rate_hz)
-        return make_context(scenario, spec, side, pace, self.values)
+        return make_context(scenario, spec, side, pace, self.values, self.data)
 
     def in_spec(self, name: str) -> dict[str, object]:
         """Return its entry in the spec of a trial."""
