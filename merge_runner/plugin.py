@@ -1,6 +1,6 @@
-"""The stable names for plug-ins: what docs/extend.md uses, wherever it is defined.
+"""Stable names for plug-ins: those that docs/extend.md uses, imported from where they are defined.
 
-A metric is registered with ``merge_runner_analysis.metrics``.
+Metrics are registered by ``merge_runner_analysis.metrics``.
 """
 
 from merge_runner.config import PROVIDERS, ModelEntry, Provider

@@ -55,7 +55,7 @@ for _panel, _commands in {
     for _command in _commands:
         app.command(rich_help_panel=_panel)(_command)
 app.add_typer(commands.recording_app, name="recording", rich_help_panel=KEEP)
-# No other command needs to be looked up to run one of these.
+# To run one of these, the commands of other packages are not looked up.
 OWN = {info.callback.__name__ for info in app.registered_commands if info.callback}
 OWN |= {str(info.name) for info in app.registered_groups}
 

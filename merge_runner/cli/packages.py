@@ -1,9 +1,9 @@
-"""Commands of installed packages, which name their modules as entry points of GROUP.
+"""Commands of installed packages, which name their modules under the entry point group GROUP.
 
     [project.entry-points."merge_runner.commands"]
     anything = "my_package.my_commands"
 
-``importlib.metadata`` would list them too; importing it takes a third of the time of ``--help``.
+``importlib.metadata`` lists them too, but would add a fifth to the time of ``--help``.
 """
 
 from __future__ import annotations

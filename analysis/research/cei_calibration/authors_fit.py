@@ -86,7 +86,7 @@ def fit_thresholds(db: Path) -> tuple[Fit, Fit]:
 
 
 def estimated(reactions: pd.DataFrame) -> pd.DataFrame:
-    """The reactions with the columns ``lower`` and ``upper``, missing where nothing is known."""
+    """Return the reactions with the columns ``lower`` and ``upper``; NaN is unknown."""
     speeds = grid_speeds()
     found = [
         _thresholds(speeds[row.condition, row.side], row.exit_mps, row.later_mps, row.reacted)
@@ -137,7 +137,7 @@ def _thresholds(
 
 
 def mixed(estimates: pd.DataFrame, threshold: str) -> Fit:
-    """The threshold on exit headway, relative velocity and their product, by driver."""
+    """Return the mixed model of a threshold on headway, relative velocity and their product."""
     from statsmodels.regression.mixed_linear_model import MixedLM
     from statsmodels.tools.sm_exceptions import ConvergenceWarning, SingularMatrixWarning
 

@@ -1,4 +1,4 @@
-"""The trials that thresholds are calibrated with: those that the runner would play."""
+"""Trials for the calibration of thresholds: those that the runner would play."""
 
 from __future__ import annotations
 

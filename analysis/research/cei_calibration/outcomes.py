@@ -52,7 +52,7 @@ def measured(task: Task, trials: Sequence[Trial], traces: Traces) -> pd.DataFram
 
 
 def summary(trials: pd.DataFrame) -> dict[tuple[str, str], float]:
-    """The numbers of the targets, by measure and term; a fit that fails leaves its own out."""
+    """Return the numbers of the targets by measure and term; a failed fit has none."""
     found = {
         ("collisions", "count"): float((trials["status"] == "collided").sum()),
         ("timeouts", "count"): float((trials["status"] == "timeout").sum()),

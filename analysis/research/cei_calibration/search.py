@@ -54,7 +54,7 @@ class Generation:
 
 
 def targets() -> list[Target]:
-    """The published numbers of the model, and the humans' first action."""
+    """Return the published numbers of the model, and those of the humans' first action."""
     return [
         Target(
             row.measure,
@@ -110,7 +110,7 @@ def compared(found: Sequence[Numbers]) -> pd.DataFrame:
 
 
 def cost(numbers: Numbers, wanted: list[Target]) -> float:
-    """The sum of the squared misses, in tolerances."""
+    """Return the sum of squared misses, in tolerances."""
     return sum(
         ((numbers[key] - target.value) / target.tolerance) ** 2
         if (key := (target.measure, target.term)) in numbers
@@ -129,7 +129,7 @@ def search(
     seed: int,
     trials_of_a_pair: int = TRIALS_OF_A_PAIR,
 ) -> Iterator[Generation]:
-    """The cross-entropy method (Rubinstein 1999) with independent normal candidates.
+    """Search by the cross-entropy method (Rubinstein 1999) with independent normal candidates.
 
     All candidates of a generation play the same trials; the best third makes the next one.
     """
