@@ -15,6 +15,7 @@ from merge_runner_analysis.frames import KEYS
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.provenance import call_counts
 from merge_runner_analysis.published import HUMAN, citation
+from merge_runner_analysis.stats.levels import distinct
 from merge_runner_analysis.stats.verdicts import went_so
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.formats import shown_value
@@ -77,7 +78,7 @@ def explain(study: Study, table: Table, cell: str) -> Explanation:
     row = require(rows, f"row of {table.name}", row_id or cell, hint)
     columns = {c.name: c for c in table.columns if name or row.values.get(c.name) is not None}
     column = require(columns, f"column of {table.name}", name) if name else None
-    texts = {name: shown_value(c, row.values.get(name)) for name, c in columns.items()}
+    texts = {name: shown_value(c, row) for name, c in columns.items()}
     return Explanation(
         cell=f"{table.name} {cell}",
         value=texts[name] if name else ", ".join(f"{name} {text}" for name, text in texts.items()),
@@ -103,7 +104,8 @@ def sources_of(
     known = (*study.groups, *study.asked, *study.unjudged, *study.unjudged_asked)
     groups = [group for group in known if group.id in row.groups]
     if column is not None and column.counts == COUNTED and row.values.get(column.name):
-        return tuple(_counted(group, str(row.values["measure"])) for group in groups)
+        once = (distinct(study, group) for group in groups)
+        return tuple(_counted(group, str(row.values["measure"])) for group in once)
     rests_on = (column.rests_on if column else "") or row.rests_on
     counts = column.counts if column else ""
     sources = []

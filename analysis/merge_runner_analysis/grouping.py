@@ -257,8 +257,9 @@ def groups_of(
     specs: Mapping[str, Mapping[str, Any]],
     decisions: pd.DataFrame,
     levels: pd.DataFrame,
+    order: Order,
 ) -> list[Group]:
-    """Return groups by driver and variant, scripted stand-ins last; the frames are a study's.
+    """Return groups by driver and levels, scripted stand-ins last; the frames are a study's.
 
     Where a driver was run under several settings of the task, all but the most frequent carry a
     mark, the same for a baseline and its variants; likewise where a prompt was changed, and where
@@ -289,7 +290,12 @@ def groups_of(
         programs = all(map(programs_alone, own)) and not only_asked
         group = _distinct(group, programs=programs, scripted=group.scripted and not only_asked)
         groups.append(replace(group, levels=levels_of_group(levels, group)))
-    return sorted(groups, key=lambda g: (g.scripted, g.driver, g.setting != BASELINE, g.setting))
+
+    def place(group: Group) -> tuple[bool, str, list[tuple[int, bool, float, str]], str]:
+        levels = [_place(level, order.get(name, ())) for name, level in group.levels.items()]
+        return group.scripted, group.driver, levels, group.setting
+
+    return sorted(groups, key=place)
 
 
 def _model_group(rows: pd.DataFrame, first: pd.Series, unjudged: Reason) -> Group:

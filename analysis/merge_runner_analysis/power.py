@@ -419,7 +419,8 @@ def power_table(title: str, rows: Sequence[Row]) -> Table:
         "anything of the measure, a level goes first in 15 points more, leaves 1 m more, or "
         "collides twice as often. What words plant in the emulator is never assumed",
         "effects: a row for each level in the study's primary measure; nothing is assumed of "
-        "interactions",
+        "interactions. n counts all trials; the table effects pools sample sets, and counts once "
+        "the trials of a scripted stand-in that differ in words that it does not read",
     )
     return Table("power", COLUMNS, rows, notes, title=title)
 

@@ -94,7 +94,7 @@ class Study:
         frames = self.frames
         if self.file:
             trials = trials[frames.studies.holds(self.file, trials)]
-        groups = groups_of(trials, frames.specs, frames.decisions, frames.levels)
+        groups = groups_of(trials, frames.specs, frames.decisions, frames.levels, self.order)
         if not self.selection.without_fallbacks:
             return groups
         fallen = _keys(frames.calls[frames.calls["fallback"] > 0])

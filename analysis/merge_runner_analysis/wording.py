@@ -6,9 +6,10 @@ report and a terminal say the same. pandas is not needed to read them.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
+from math import floor, log10
 from typing import Any, NamedTuple
 
 from merge_runner.prompts.blocks import BASELINE
@@ -33,6 +34,27 @@ DIFFERS = frozenset({WEAKER, STRONGER, UNLIKE})
 ENOUGH = 20  # trials with an outcome; with fewer of them a headline says nothing of likeness
 TOO_FEW = f"Too few trials finished to say ({ENOUGH}, and half of all, are needed)"
 ALPHA = 0.05  # that of all tests: to import it would take pandas, which no page needs
+# So far from people, in points and in m, a driver still is like them.
+MARGINS = {"collisions": 5.0, "gap": 1.0}
+# States in words, on every page and in every table for people; of MARGINS with a direction.
+VERDICTS = {
+    SHOWN: "like people",
+    WEAKER: "less than with people",
+    STRONGER: "more than with people",
+    UNLIKE: "not as with people",
+    OPEN: "cannot tell yet",
+}
+DIRECTIONS = {
+    "collisions": {WEAKER: "fewer than people", STRONGER: "more than people"},
+    "gap": {WEAKER: "smaller than people's", STRONGER: "larger than people's"},
+}
+VERDICT_RULE = (
+    "like people: a pattern of theirs passes its own test, or the difference from them is surely "
+    "less than 5 points (crashes), 1 m (gap, and how far relative velocity moves it) or half a "
+    "standard deviation (accelerations held). More, less, not as with people: a difference is "
+    "shown, with a p below .05 that is corrected for the number of the driver's measures (Holm). "
+    "Cannot tell yet: neither of the two; that is not “alike”"
+)
 # What metrics are called in sentences and pages; others keep the label of the table.
 METRIC_NAMES = {
     LEFT_FIRST.name: "goes first",
@@ -40,8 +62,19 @@ METRIC_NAMES = {
     GAP.name: "gap at the merge point",
     RMSE.name: "deviation from the initial speed",
     BOXES.name: "crashes by people's rule",
-    JOINT.name: "both adapt their speed",
+    JOINT.name: "both change their speed by 0.5 m/s or more",
     COST.name: "cost of a trial",
+}
+# A change of the measure, as a claim names it; others are called as above.
+CHANGED = {
+    LEFT_FIRST.name: "who goes first",
+    COLLISIONS.name: "how many trials end in a crash",
+    GAP.name: "the gap at the merge point",
+    RMSE.name: "the deviation from the initial speed",
+    BOXES.name: "how many trials end in a crash by people's rule",
+    JOINT.name: "how often both change their speed",
+    VALID.name: "how many replies are valid",
+    COST.name: "the cost of a trial",
 }
 # What is said of a driver that has more or less than another, and what no difference is shown in.
 COMPARED = {
@@ -49,9 +82,9 @@ COMPARED = {
     GAP.name: ("leaves a larger gap", "leaves a smaller gap", "the gap"),
     RMSE.name: ("departs more from its speed", "keeps closer to its speed", "speed"),
     JOINT.name: (
-        "has both adapt their speed more often",
-        "has both adapt their speed less often",
-        "how often both adapt their speed",
+        "has both drivers change their speed more often",
+        "has both drivers change their speed less often",
+        "how often both change their speed",
     ),
     VALID.name: ("replies more reliably", "replies less reliably", "valid replies"),
     COST.name: ("costs more", "costs less", "cost"),
@@ -62,6 +95,12 @@ PLAYED_RULES = {
     "rectangle": "people's rule, looked for at each step",
     "shared_lane": "the rule of its scenario",
 }
+# Where an interval leaves out 0 and the corrected p shows no difference.
+UNCORRECTED = (
+    "An interval may leave out 0 where no difference is shown: it is that of one test, and the "
+    "corrected p allows for all of them."
+)
+UNREADABLE = "the stored study cannot be read by this version"
 # Of levels that nobody reads.
 SAME_TRIALS = "not tested: the same trials at both levels, as the drivers do not read what differs"
 MISSING, MINUS = "–", "−"
@@ -77,11 +116,12 @@ class Why(Enum):
     NO_FIRST = "no finished trial with a first merger"
     NO_GAP = "no finished trial with a gap"
     FEW_FIRST = (
-        "{} finished trial{s} with a first merger, too few or in too few conditions to tell the "
-        "terms apart"
+        "{} finished trial{s} with a first merger, too few or in too few conditions to tell what "
+        "headway and speed do"
     )
     FEW_GAPS = (
-        "{} finished trial{s} with a gap, too few or in too few conditions to tell the terms apart"
+        "{} finished trial{s} with a gap, too few or in too few conditions to tell what headway "
+        "and speed do"
     )
     SAME_FIRST = "who merged first is the same in all {} trials: nothing to explain"
     SEPARATION = "separation: no finite estimate of {}; see Firth's fit"
@@ -123,8 +163,8 @@ class Why(Enum):
     ONE_GAP = "a single trial has no error"
     NO_GAP_THERE = "humans: no gap in {} of its conditions"
     NOBODY_THERE = "no human drove its conditions"
-    NONE_ACTED = "I5 is not compared: no trial acted"
-    FEW_HUMANS = "I5 is not compared: too few human recordings are imported"
+    NONE_ACTED = "accelerations held (I5) are not compared: no trial acted"
+    FEW_HUMANS = "accelerations held (I5) are not compared: too few human recordings are imported"
 
 
 class Fact(NamedTuple):
@@ -218,7 +258,7 @@ MEASURES = {
             "crashes",
             "% of trials",
             BOXES.column,
-            "corrected p below .05",
+            "difference within 5 points by its interval; else corrected p below .05",
             "{it} crashed in {own} trials, people in {people}",
             (0.0, 30.0),
         ),
@@ -228,10 +268,14 @@ MEASURES = {
             "mean gap",
             "m",
             GAP.column,
-            "corrected p below .05",
+            "difference within 1 m by its interval; else corrected p below .05",
             "{it} left {own} m at the merge point, people {people} m",
             (0.0, 8.0),
-            {UNLIKE: "leaves {of} m at the merge point, {more} than people ({humans} m)"},
+            {
+                SHOWN: "leaves {of} m at the merge point, like people ({humans} m)",
+                WEAKER: "leaves {of} m at the merge point, less than people ({humans} m)",
+                STRONGER: "leaves {of} m at the merge point, more than people ({humans} m)",
+            },
         ),
         Measure(
             "gap-headway",
@@ -255,7 +299,7 @@ MEASURES = {
             "m at most",
             GAP.column,
             "HC3 errors: largest difference of predicted gaps within 1 m, two one-sided tests at "
-            "5 %; unlike: corrected p of being within below .05",
+            "5 %; not as with people: corrected p of being within below .05",
             "with {it} who is faster moves the gap by up to {own} m, with people by {people} m",
             (0.0, 3.0),
             {UNLIKE: "who is faster moves its gap by {of} m"},
@@ -267,8 +311,8 @@ MEASURES = {
             "accelerations held",
             "SD from humans",
             "finished",
-            "within 0.5 SD, two one-sided tests at 5 %; unlike: corrected p of being within below "
-            ".05",
+            "within 0.5 SD, two one-sided tests at 5 %; not as with people: corrected p of being "
+            "within below .05",
             "{it} holds its accelerations otherwise than people do, by {own} of their SD",
             (-2.0, 3.0),
             {UNLIKE: "holds accelerations {more} than people"},
@@ -358,7 +402,7 @@ def crashes(values: Values) -> str:
         rule = values.get("counted_by") or PLAYED_RULES["shared_lane"]
         text += f" by {rule}; by people's rule {k} are certain, {undecided} cannot be told"
     people = values.get("human_counted")
-    if differs(values):
+    if shown_state(values) in DIFFERS:
         than = f" ({people})" if people else ""
         return f"{text}, {_more(values)} often than people{than}"
     return f"{text}; people in {people}" if people else text
@@ -389,7 +433,9 @@ def apart(one: str, other: str, rows: Mapping[str, Values]) -> tuple[str, str]:
         return f"{claim}.", _others(one, rows)
     if p >= ALPHA:
         said = f"no difference is shown, {number(difference)} points {brackets(ci)}"
-        return f"{claim}: {said}; corrected p {equal_p(p)}.", _others(one, rows)
+        also = UNCORRECTED if ci and ci[0] * ci[1] > 0 else ""
+        claim = f"{claim}: {said}; corrected p {equal_p(p)}."
+        return claim, " ".join(filter(None, (also, _others(one, rows))))
     # Of fewer, the ends change their signs and their places.
     ends = ci and sorted(end if difference > 0 else -end for end in ci)
     more = "more" if difference > 0 else "fewer"
@@ -421,14 +467,29 @@ def share(collisions: Values) -> str:
 
 
 def shown_state(values: Values) -> str:
-    """A state as sentences and marks show it: of fewer than ENOUGH trials it cannot be told."""
+    """A state as sentences and marks show it: of fewer than ENOUGH trials it cannot be told.
+
+    One of MARGINS within which a difference surely lies is like people's, else it has a direction.
+    """
     state = str(values.get("state") or "")
-    return OPEN if state and (values.get("n") or 0) < ENOUGH else state
+    if state and (values.get("n") or 0) < ENOUGH:
+        return OPEN
+    if _is_within(values):
+        return SHOWN
+    if state == UNLIKE and values["measure"] in MARGINS:
+        return STRONGER if _more(values) == "more" else WEAKER
+    return state
+
+
+def _is_within(values: Values) -> bool:
+    """Whether crashes or a gap differ from people's by no more than MARGINS, by the interval."""
+    margin, ci = MARGINS.get(str(values.get("measure"))), values.get("difference_ci")
+    return margin is not None and ci is not None and max(-ci[0], ci[1]) <= margin
 
 
 def differs(values: Values) -> bool:
-    """Whether the driver is shown to differ from the humans in a measure."""
-    return values.get("state") in DIFFERS
+    """Whether the driver is shown to differ from the humans in a measure, beyond its margin."""
+    return values.get("state") in DIFFERS and not _is_within(values)
 
 
 def headline(
@@ -543,8 +604,8 @@ def _count(drivers: Mapping[str, Mapping[str, Values]]) -> str:
     every = [values for of in drivers.values() for values in of.values()]
     tested = sum(values.get("p_holm") is not None for values in every)
     return (
-        f"{sum(map(differs, every))} of {tested} comparisons with people show a difference at 5 %, "
-        f"corrected by Holm within each of {len(drivers)} models."
+        f"{sum(map(differs, every))} of {tested} comparisons with people show a difference, with p "
+        "below 0.05 after correction for the number of comparisons of each model (Holm)."
     )
 
 
@@ -573,14 +634,21 @@ def with_interval(value: float | None, ci: Sequence[float] | None) -> str:
     return number(value) if value is None else f"{number(value)} {brackets(ci)}".rstrip()
 
 
-def brackets(ci: Sequence[float] | None) -> str:
-    """``[47.32, 83.64]``, or nothing."""
-    return "" if ci is None else f"[{', '.join(map(number, ci))}]"
-
-
 def number(value: float | None, decimals: int = DECIMALS, unit: str = "") -> str:
     """A number as pages and sentences print it: with a true minus sign, and never minus zero."""
     return MISSING if value is None else f"{value:z.{decimals}f}{unit}".replace("-", MINUS)
+
+
+def brackets(ci: Sequence[float] | None, form: Callable[[float], str] = number) -> str:
+    """``[47.32, 83.64]``, or nothing."""
+    return "" if ci is None else f"[{', '.join(map(form, ci))}]"
+
+
+def money(value: float | None, unit: str = "") -> str:
+    """A price with two decimals, and of a small one two digits that are not 0: ``0.0012``."""
+    if value is None or not 0 < abs(value) < 1:
+        return number(value, unit=unit)
+    return number(value, max(DECIMALS, 1 - floor(log10(abs(value)))), unit)
 
 
 def p_value(p: float | None) -> str:
@@ -596,14 +664,8 @@ def equal_p(p: float) -> str:
 
 def verdict_word(values: Values) -> str:
     """A state in words, as it stands in a list of verdicts."""
-    state, name = shown_state(values), str(values["measure"])
-    if not state:
-        return "not judged"
-    if name in {"collisions", "gap"} and state != OPEN:
-        more = _more(values)
-        return f"{'fewer' if (more, name) == ('less', 'collisions') else more} than people"
-    words = {SHOWN: "as in people", UNLIKE: "unlike people", OPEN: "cannot tell yet"}
-    return words.get(state, state)
+    words = VERDICTS | DIRECTIONS.get(str(values.get("measure")), {})
+    return words.get(shown_state(values), "not compared")
 
 
 def joined(items: Sequence[str]) -> str:

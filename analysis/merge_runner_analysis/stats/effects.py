@@ -13,9 +13,11 @@ from itertools import chain, combinations, product
 
 import pandas as pd
 
+from merge_runner.errors import UsageError
 from merge_runner.registry import in_use, require
 from merge_runner.study.crossing import MODEL
-from merge_runner.study.file import StudySource
+from merge_runner.study.file import StudyFile, StudySource
+from merge_runner.text_safety import first_line
 from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.frames import KEYS
 from merge_runner_analysis.grouping import Group, levels_of
@@ -27,7 +29,7 @@ from merge_runner_analysis.stats.levels import DRIVER, Level, copied_cells, leve
 from merge_runner_analysis.stats.measures import linear, undecided
 from merge_runner_analysis.stats.sides import from_both_sides, one_sided
 from merge_runner_analysis.study import Study, in_one_study
-from merge_runner_analysis.wording import TIMES
+from merge_runner_analysis.wording import TIMES, UNREADABLE
 
 PRIMARY = "goes_first"  # in a study's file, and where none is named
 
@@ -152,18 +154,38 @@ def _named(study: Study) -> str:
     The file is that of the chosen study, else the one whose parts are in use, else the only one
     that was played, whose own measures are missing where its plug-ins are not in use.
     """
-    played = study.frames.studies
-    text = study.source.text if study.source else in_use().text
-    stored = next((played.texts.get(name, "") for name in played.orders), "")
-    if not text and len(played.orders) == 1:
-        text = stored
-    file = StudySource(name="", text=text, plugins={}).file if text else None
+    file, _ = _file(study)
     if file is None or "primary" not in file.model_fields_set:
         return ""
-    if file.primary not in _measures() and not (study.source or in_use().text):
+    if file.primary not in _measures() and not _text_at_hand(study):
         return ""
     require(_measures(), "measure", file.primary, "as the study's primary one")
     return file.primary
+
+
+def unreadable(study: Study) -> str:
+    """Say that the stored study that was played cannot be read, and why; empty where it can."""
+    return _file(study)[1]
+
+
+def _text_at_hand(study: Study) -> str:
+    return study.source.text if study.source else in_use().text
+
+
+@remembered
+def _file(study: Study) -> tuple[StudyFile | None, str]:
+    """Return the study's file, if there is one, or why the stored one cannot be read.
+
+    A text at hand is the user's to mend: raises UsageError.
+    """
+    if text := _text_at_hand(study):
+        return StudySource(name="", text=text, plugins={}).file, ""
+    played = study.frames.studies
+    text = played.texts.get(next(iter(played.orders)), "") if len(played.orders) == 1 else ""
+    try:
+        return StudySource(name="", text=text, plugins={}).file if text else None, ""
+    except UsageError as exc:
+        return None, f"{UNREADABLE}, which takes who goes first as its measure: {first_line(exc)}"
 
 
 @remembered

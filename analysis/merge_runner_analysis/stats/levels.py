@@ -191,6 +191,14 @@ def _with_copies(study: Study, group: Group) -> Iterator[Iterable[Cell]]:
             yield from (((name, *own), (name, *its)) for name in one.keys() | other.keys())
 
 
+@remembered
+def distinct(study: Study, group: Group) -> Group:
+    """A group with each of its trials once, as a level has it; ``whole`` has the copies, too."""
+    every = Level(DRIVER, group.id, (group.id,), _with_cells([group], set()))
+    (level,) = _distinct(study, [every])
+    return level.pooled if level.copies else group
+
+
 def _without_copies(level: Level, first: Callable[[tuple[str, ...]], tuple[str, ...]]) -> Level:
     """The level with each trial once.
 

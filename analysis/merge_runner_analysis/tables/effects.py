@@ -22,6 +22,7 @@ from merge_runner_analysis.stats.effects import (
     driver_effects,
     effects,
     primary,
+    unreadable,
 )
 from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.levels import DRIVER, Level, copied_of_shared, levels_by_factor
@@ -29,7 +30,7 @@ from merge_runner_analysis.stats.measures import undecided_note
 from merge_runner_analysis.stats.sides import cells_seen, level_estimate
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Value, interval
-from merge_runner_analysis.wording import SAME_TRIALS, note_of
+from merge_runner_analysis.wording import SAME_TRIALS, TIMES, note_of
 
 TEST = "of the test of Mantel and Haenszel, or of Welch's"
 UNTESTED = (
@@ -110,12 +111,15 @@ def _is_shown(one: Effect) -> bool:
 def _row(study: Study, one: Effect, others: dict[str, Value] | None = None) -> Row:
     """Return the row of an effect, with ``others`` beside or instead of its values."""
     difference = one.difference
+    level, reference = one.level.name, one.reference.name
+    if one.across and not study.selection.by:
+        level, reference = (TIMES.join(pair) for pair in _crossed(one.level, one.across[1]))
     values: dict[str, Value] = {
         "at": _place(one.level, one.across),
         "factor": one.factor,
         "drivers": "scripted" if one.level.posing else None,
-        "level": f"{one.level.name}{one.level.mark}",
-        "reference": one.reference.name,
+        "level": f"{level}{one.level.mark}",
+        "reference": reference,
         "measure": one.metric.heading,
         "estimate": one.at_level.value,
         "estimate_reference": one.at_reference.value,
@@ -135,7 +139,19 @@ def _row(study: Study, one: Effect, others: dict[str, Value] | None = None) -> R
         problem(study, one),
         one.metric.column,
         copies=one.left_out,
+        untested=others is None and one.at_level.value is None and _is_copied(study, one),
     )
+
+
+def _crossed(*levels: Level) -> Iterator[tuple[str, str]]:
+    """Each level with that of the other factor at which it is."""
+    return ((level.name, level.at.partition("=")[2]) for level in levels)
+
+
+def _is_copied(study: Study, one: Effect) -> bool:
+    """Return whether in all shared cells a level has the trials of another one."""
+    copies, shared = copied_of_shared(study, *one.levels)
+    return 0 < copies == shared
 
 
 def _place(level: Level, across: tuple[Level, Level] | None) -> str:
@@ -151,7 +167,7 @@ def problem(study: Study, one: Effect) -> str:
     column = one.metric.column
     if not one.across and any(level.pooled.trials[column].isna().all() for level in one.levels):
         remarks.append(f"{one.metric.heading}: a level has no trial with this measure")
-    elif copies and copies == shared:
+    elif _is_copied(study, one):
         remarks.append(SAME_TRIALS)
     elif one.difference.value is None:
         remarks.append(f"{one.metric.heading}: {UNTESTED}")
@@ -183,6 +199,8 @@ def _left_out(level: Level, metric: Metric) -> str:
 def _notes(study: Study, by: str) -> Iterator[str]:
     tested = any(one.difference.p is not None for one in effects(study, by))
     every = levels_by_factor(study)
+    if said := unreadable(study):
+        yield said
     if not tested and not every:
         yield "the trials of judged drivers differ in no factor"
         return

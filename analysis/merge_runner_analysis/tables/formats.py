@@ -14,9 +14,10 @@ from itertools import takewhile
 
 from merge_runner.prompts.blocks import title_of
 from merge_runner.text_safety import csv_writer, in_spreadsheet
+from merge_runner_analysis.metrics import COST
 from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables.model import Column, Row, Table, Value
-from merge_runner_analysis.wording import MISSING, p_value
+from merge_runner_analysis.wording import MINUS, MISSING, money, p_value, verdict_word
 
 BETWEEN = "   "
 # A narrow terminal shows these columns last, and those that say what is found first.
@@ -66,7 +67,7 @@ def render(tables: Sequence[Table], form: TableFormat, width: int | None = None)
 
 def _grid(table: Table) -> tuple[list[Column], list[list[str]]]:
     columns = shown_columns(table)
-    rows = [[shown_value(c, row.values.get(c.name)) for c in columns] for row in table.rows]
+    rows = [[shown_value(c, row) for c in columns] for row in shown_rows(table)]
     return columns, [[column.heading for column in columns], *rows]
 
 
@@ -216,7 +217,7 @@ def as_latex(table: Table) -> str:
 
 def printed(table: Table, row: Row) -> dict[str, str]:
     """A row's values as a reader sees them, by column."""
-    return {c.name: shown_value(c, row.values.get(c.name)) for c in table.columns}
+    return {c.name: shown_value(c, row) for c in table.columns}
 
 
 def shown_columns(table: Table) -> list[Column]:
@@ -224,7 +225,8 @@ def shown_columns(table: Table) -> list[Column]:
     return [
         column
         for column in table.columns
-        if not column.noted and any(row.values.get(column.name) is not None for row in table.rows)
+        if not column.noted
+        and any(row.values.get(column.name) is not None for row in shown_rows(table))
     ]
 
 
@@ -241,19 +243,33 @@ def notes_of(table: Table) -> list[str]:
     return [*(f"{', '.join(names)}: {note}" for note, names in owners.items()), *table.notes]
 
 
-def shown_value(column: Column, value: Value) -> str:
-    """One value as a reader sees it."""
+def shown_rows(table: Table) -> list[Row]:
+    """The rows of a table but those that are untested: of these the notes say why."""
+    return [row for row in table.rows if not row.untested]
+
+
+def shown_value(column: Column, row: Row) -> str:
+    """One value of a row as a reader sees it."""
+    value = row.values.get(column.name)
     if value is None:
         return "" if column.kind == "text" else MISSING
     if isinstance(value, tuple):
-        return f"[{', '.join(f'{end:z.{column.digits}f}' for end in value)}]"
+        return f"[{', '.join(_rounded(end, column, row) for end in value)}]"
     if isinstance(value, bool):
         return "✓" if value else "✗"
     if column.name == "setting":
         return title_of(str(value))
+    if column.name == "state":
+        return verdict_word(row.values)
     if column.kind == "p" and isinstance(value, float):
         return p_value(value)
-    return f"{value:z.{column.digits}f}" if isinstance(value, float) else str(value)
+    return _rounded(value, column, row) if isinstance(value, float) else str(value)
+
+
+def _rounded(value: float, column: Column, row: Row) -> str:
+    if row.id.rpartition("/")[2] == COST.name:
+        return money(value).replace(MINUS, "-")
+    return f"{value:z.{column.digits}f}"
 
 
 def table_view(table: Table, link: Callable[[Table, Row, Column], object]) -> dict[str, object]:
@@ -265,14 +281,14 @@ def table_view(table: Table, link: Callable[[Table, Row, Column], object]) -> di
     columns = shown_columns(table)
     headers = [*takewhile(lambda column: column.kind == "text", columns)]
     rows = []
-    for row in table.rows:
+    for row in shown_rows(table):
         cells = []
         for column in columns:
             value, left = row.values.get(column.name), column.kind == "text"
             linked = row.rests_on and not left and (value if column.counts else value is not None)
             cells.append(
                 {
-                    "text": shown_value(column, value),
+                    "text": shown_value(column, row),
                     "left": left,
                     "header": column in headers,
                     "link": link(table, row, column) if linked else None,

@@ -62,7 +62,8 @@ class Row:
 
     ``rests_on`` says which of these: STORED, ENDED, FINISHED, or the column in which they have a
     value; empty where it rests on none. They are in these ``conditions``, if there are any, and
-    not among the ``copies`` of others (trial_id, spec_hash).
+    not among the ``copies`` of others (trial_id, spec_hash). An ``untested`` one has no value, and
+    its note says why: a reader sees the note alone.
     """
 
     id: str
@@ -72,6 +73,7 @@ class Row:
     rests_on: str = FINISHED
     conditions: tuple[str, ...] = ()
     copies: tuple[tuple[str, str], ...] = ()
+    untested: bool = False
 
 
 GROUP_COLUMNS = (Column("driver", "driver"), Column("setting", "setting"))

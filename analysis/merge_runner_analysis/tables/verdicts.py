@@ -6,16 +6,19 @@ Headlines, sentences, the report and the pages read this table and nothing else.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner_analysis.drivers import language_models
+from merge_runner_analysis.frames import KEYS
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.metrics import BOXES
 from merge_runner_analysis.published import HUMAN, HUMAN_TRIALS
 from merge_runner_analysis.stats.estimate import Estimate
+from merge_runner_analysis.stats.levels import distinct
 from merge_runner_analysis.stats.verdicts import Comparison, compared, of_humans
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.model import (
@@ -35,6 +38,7 @@ from merge_runner_analysis.wording import (
     PLAYED_RULES,
     PROGRAM,
     TABLE,
+    VERDICT_RULE,
     note_of,
     sentences,
 )
@@ -87,16 +91,20 @@ def verdicts(study: Study) -> Table:
                 f"{one.name}: {one.trait}, {one.unit}; verdict: {one.rule}"
                 for one in MEASURES.values()
             ),
-            "shown: as in humans; weaker, stronger: shown, and the p that is corrected over the "
-            "driver's measures (Holm) is below .05; unlike: not shown, and it is below .05; "
-            "inconclusive: neither. The interval of the difference has the level at which Holm "
-            "tests it, so that it leaves 0 out where the verdict says so",
+            f"{VERDICT_RULE}. The interval of the difference has the level at which Holm tests it, "
+            "so that it leaves 0 out where the verdict says so",
             "collisions: by the rule of the human experiment, outlines that overlap, looked for at "
             "20 Hz; Fisher's exact test within conditions, and the melded interval that agrees "
             "with it; without p where trials are undecided. The humans' share weighs conditions as "
             "the driver's trials do, and so does their mean gap as its trials with a gap do",
             f"intervals take trials as independent. The {HUMAN_TRIALS} human trials are of nine "
             "pairs who differ, which only the mean gap and imported gaps allow for",
+            *(
+                f"{group.id}: {len(copies)} of {len(group.trials)} trials went as another one to "
+                "the last state, with words that its drivers do not read: each counts once"
+                for group in study.models
+                if (copies := _copies(study, group))
+            ),
             *(
                 f"{group.id}: {group.caution}: it is not judged, nor compared with the humans"
                 for group in study.baselines
@@ -124,8 +132,19 @@ def _driver_rows(study: Study, group: Group) -> Iterator[Row]:
         yield Row(group.id, (group.id,), driver, group.unjudged)
         return
     rule = ScenarioConfig.model_validate(spec.get("scenario", {})).collision_rule
-    for comparison in compared(study, group):
-        yield _compared(group, driver, comparison, PLAYED_RULES[rule])
+    copies = _copies(study, group)
+    for comparison in compared(study, distinct(study, group)):
+        row = _compared(group, driver, comparison, PLAYED_RULES[rule])
+        yield replace(row, copies=copies)
+
+
+def _copies(study: Study, group: Group) -> tuple[tuple[str, str], ...]:
+    """The trials of a stand-in that went as another one, with words that it does not read."""
+    once = distinct(study, group).trials
+    if len(once) == len(group.trials):
+        return ()
+    kept, every = (frame[KEYS].itertuples(index=False, name=None) for frame in (once, group.trials))
+    return tuple(sorted({*every} - {*kept}))
 
 
 def _compared(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +11,10 @@ from merge_runner_analysis.tables.model import Row, Table, from_text
 from merge_runner_analysis.web.computed import computed
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.effect_rows import (
+    amount,
     difference_mark,
+    interval_text,
+    is_uncorrected,
     metric_of,
     name_of,
     unbroken,
@@ -19,9 +22,10 @@ from merge_runner_analysis.web.effect_rows import (
 )
 from merge_runner_analysis.web.judged import Driver
 from merge_runner_analysis.web.marks import Mark
+from merge_runner_analysis.web.names import short_names
 from merge_runner_analysis.web.scope import Scope
 from merge_runner_analysis.web.site import Site
-from merge_runner_analysis.wording import apart, brackets, capital, number, p_value
+from merge_runner_analysis.wording import UNCORRECTED, apart, capital, number, p_value
 
 # The trials behind a count, as a filter of their list; None where no filter keeps just these.
 Filter = dict[str, Any] | None
@@ -63,11 +67,11 @@ class Comparison:
     claim: str
     rest: str
     rows: list[Difference]
-    tested: int
+    corrected: str
     could: str
 
 
-def set_apart(
+def compared(
     site: Site, own: Driver, other: Driver, scope: Scope
 ) -> tuple[Job, bool, Comparison | None]:
     """One driver less another, each with its prompt: the computation, if it is awaited, the result.
@@ -75,12 +79,13 @@ def set_apart(
     The computation may end meanwhile: whether it is awaited is what was found.
     """
     groups = (f"{one.name}/{one.prompt}" for one in (own, other))
+    named = short_names([own.name, other.name])
     job = computed(site, ("comparison", *groups, scope.sweep, scope.condition))
     if (content := job.content) is None:
         return job, True, None
     trials = trials_of(own, scope), trials_of(other, scope)
     table = from_text(content["table"])
-    return job, False, comparison_of(table, (own.name, other.name), trials)
+    return job, False, comparison_of(table, (named[own.name], named[other.name]), trials)
 
 
 def comparison_of(
@@ -102,9 +107,18 @@ def comparison_of(
         unbroken(claim),
         unbroken(rest),
         [_difference(row, trials) for row in rows],
-        sum(row.values["p_corrected"] is not None for row in rows),
+        _corrected(rows),
         unbroken("; ".join(seen)),
     )
+
+
+def _corrected(rows: Sequence[Row]) -> str:
+    """How the p of these rows are corrected."""
+    tested = [row for row in rows if row.values["p_corrected"] is not None]
+    own = [name_of(row) for row in tested if row.values["primary"]]
+    others = f"for the number of {'other ' * bool(own)}comparisons, {len(tested) - len(own)} (Holm)"
+    alone = f"; {own[0]}, the primary measure, is tested by itself" if own else ""
+    return f"{others}{alone}. {UNCORRECTED * any(map(is_uncorrected, tested))}".rstrip()
 
 
 def trials_of(own: Driver, scope: Scope) -> TrialsOf:
@@ -144,9 +158,9 @@ def _difference(row: Row, trials: tuple[TrialsOf, TrialsOf]) -> Difference:
         capital(name_of(row)),
         (one, other),
         unbroken(_with_unit(row, "difference", sign="+")) if is_tested else "–",
-        unbroken(brackets(ci)),
+        unbroken(interval_text(row)),
         difference_mark(row, end) if is_tested and values["p_corrected"] is not None else None,
-        unbroken(f"{number(end)} {unit_of(row)}"),
+        unbroken(f"{amount(row, end)} {unit_of(row)}"),
         p_value(values["p"]),
         p_value(values["p_corrected"]),
         row.note,
@@ -157,7 +171,8 @@ def _side(row: Row, of: str, behind: TrialsOf) -> Side:
     values: Any = row.values
     metric, k, n = metric_of(row), values[f"k{of}"], values[f"n{of}"]
     unit = unit_of(row).replace("points", "%")
-    text = unbroken(number(values[f"value{of}"], unit=f" {unit}"))
+    value = values[f"value{of}"]
+    text = number(None) if value is None else unbroken(f"{amount(row, value)} {unit}")
     k_trials = None if k is None else behind(f"k {metric}", k)
     return Side(text, k, n, k_trials, behind(metric, n))
 
@@ -165,4 +180,4 @@ def _side(row: Row, of: str, behind: TrialsOf) -> Side:
 def _with_unit(row: Row, name: str, sign: str = "") -> str:
     values: Any = row.values
     plus = sign if values[name] > 0 else ""
-    return f"{plus}{number(values[name])} {unit_of(row)}"
+    return f"{plus}{amount(row, values[name])} {unit_of(row)}"

@@ -10,10 +10,10 @@ from merge_runner_analysis.web.marks import Mark
 from merge_runner_analysis.wording import (
     ALPHA,
     METRIC_NAMES,
-    SAME_TRIALS,
     TIMES,
     brackets,
     equal_p,
+    money,
     number,
 )
 
@@ -60,19 +60,29 @@ def unit_of(row: Row) -> str:
 
 def estimate_text(row: Row, name: str) -> str:
     """``63.00 %``: the value of a level."""
-    return f"{number(value_of(row, name))} {unit_of(row).replace('points', '%')}"
+    return f"{amount(row, value_of(row, name))} {unit_of(row).replace('points', '%')}"
+
+
+def amount(row: Row, value: float) -> str:
+    """A value of an effect's measure, without the unit."""
+    return money(value) if unit_of(row) == "USD" else number(value)
+
+
+def interval_text(row: Row) -> str:
+    """``[6.06, 19.60]``, or nothing."""
+    return brackets(interval_of(row), money if unit_of(row) == "USD" else number)
 
 
 def test_text(row: Row) -> str:
     """``+12.84 points [6.06, 19.60], corrected p = 0.012``."""
-    apart = f"{difference_text(row)} {unit_of(row)} {brackets(interval_of(row))}".rstrip()
+    apart = f"{difference_text(row)} {unit_of(row)} {interval_text(row)}".rstrip()
     return f"{apart}, corrected p {equal_p(value_of(row, 'p_corrected'))}"
 
 
 def difference_text(row: Row) -> str:
     """``+12.84``."""
     value = value_of(row, "difference")
-    return f"{'+' if value > 0 else ''}{number(value)}"
+    return f"{'+' if value > 0 else ''}{amount(row, value)}"
 
 
 def level_text(row: Row) -> str:
@@ -87,7 +97,7 @@ def is_interaction(row: Row) -> bool:
 
 def is_copied(row: Row) -> bool:
     """Whether it is a test of the study's own that could not be made, of equal trials."""
-    return bool(row.values.get("primary")) and row.note == SAME_TRIALS
+    return bool(row.values.get("primary")) and row.untested
 
 
 def is_tested(row: Row) -> bool:
@@ -98,6 +108,12 @@ def is_tested(row: Row) -> bool:
 def is_shown(row: Row) -> bool:
     """Whether its corrected p is below 5 %."""
     return is_tested(row) and value_of(row, "p_corrected") < ALPHA
+
+
+def is_uncorrected(row: Row) -> bool:
+    """Whether its interval leaves out 0, and its corrected p shows no difference."""
+    ends = interval_of(row)
+    return is_tested(row) and not is_shown(row) and ends is not None and ends[0] * ends[1] > 0
 
 
 def factors_of(row: Row) -> set[str]:

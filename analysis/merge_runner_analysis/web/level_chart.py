@@ -72,7 +72,10 @@ def level_chart(
     ends = [end for row in drawn for end in (interval_of(row) or (value_of(row, "value"),))]
     low, high, step = _axis(min(ends), max(ends))
 
-    levels = dict.fromkeys((str(row.values["factor"]), str(row.values["level"])) for row in drawn)
+    levels: dict[tuple[str, str], list[Row]] = {}
+    for row in drawn:
+        level = str(row.values["factor"]), str(row.values["level"])
+        levels.setdefault(level, []).append(row)
     names = {(f, name): title_of(name) if f == PROMPT else name for f, name in levels}
     indent = 0.0 if TIMES in next(iter(levels))[0] else INDENT
     left = min(WIDTH / 2, indent + max(LEFT, LETTER * max(map(len, names.values()))))
@@ -82,12 +85,10 @@ def level_chart(
 
     lines: list[Line] = []
     y, heads = float(HEAD), set[str]()
-    for factor, name in levels:
+    for (factor, name), of_level in levels.items():
         points: list[Point] = []
         y += ROW if factor in heads or not lines else 1.5 * ROW
-        for row in drawn:
-            if (row.values["factor"], row.values["level"]) != (factor, name):
-                continue
+        for row in of_level:
             ci = interval_of(row)
             driver, value = row.values["driver"] or "all drivers", number(value_of(row, "value"))
             k, n = (row.values.get(name) for name in ("k", "n"))

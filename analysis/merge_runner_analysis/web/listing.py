@@ -15,7 +15,7 @@ import duckdb
 from pydantic import ValidationError
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.records import NO_DECISION, SIDES
+from merge_runner.records import ANSWERS, NO_DECISION, SIDES
 from merge_runner.results.database import SETTINGS, in_memory
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.served_model import Pair, other_models, sql_of
@@ -153,7 +153,7 @@ UNION ALL SELECT number, 'cause', if(failure = '{NO_DECISION}', '{MISSING}', 'pl
     count(*)
 FROM decisions JOIN numbers USING (trial_id, spec_hash) WHERE failure IS NOT NULL GROUP BY ALL
 UNION ALL SELECT number, 'cause', 'attempt: ' || outcome, count(*)
-FROM calls JOIN numbers USING (trial_id, spec_hash) WHERE outcome <> 'ok' GROUP BY ALL
+FROM calls JOIN numbers USING (trial_id, spec_hash) WHERE outcome NOT IN {ANSWERS} GROUP BY ALL
 UNION ALL SELECT number, 'cause', 'model: ' || model_requested || ' → ' || model_served, count(*)
 FROM calls JOIN numbers USING (trial_id, spec_hash) WHERE http_status = 200 AND {{others}}
 GROUP BY ALL;

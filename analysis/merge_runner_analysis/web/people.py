@@ -17,10 +17,10 @@ from merge_runner_analysis.wording import (
     STRONGER,
     UNLIKE,
     WEAKER,
-    Values,
     brackets,
     number,
     shown_state,
+    verdict_word,
 )
 
 HEADINGS = {
@@ -29,19 +29,7 @@ HEADINGS = {
     "velocity": "Side by side, the slower goes first",
     "gap": "Gap at the merge point",
 }
-# So far from people, in points and in m, a driver still is like them.
-MARGINS = {"collisions": 5.0, "gap": 1.0}
-LIKE, MORE, LESS, CANNOT_TELL = "●", "▲", "▼", "○"
-WORDS = {
-    "collisions": {MORE: "crashes more", LESS: "crashes less"},
-    "gap": {MORE: "larger", LESS: "smaller"},
-}
-STATES = {
-    SHOWN: (LIKE, "like people"),
-    STRONGER: (MORE, "more than with people"),
-    WEAKER: (LESS, "less than with people"),
-    UNLIKE: (LESS, "not as with people"),
-}
+MARKS = {SHOWN: "●", STRONGER: "▲", WEAKER: "▼", UNLIKE: "✕", OPEN: "○"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +54,7 @@ def likeness_of(driver: Driver) -> dict[str, Likeness]:
 
 def _likeness(cell: Cell) -> Likeness:
     values = cell.values
-    mark, word = _mark(cell.measure.name, values)
+    mark, word = MARKS.get(shown_state(values), MARKS[OPEN]), verdict_word(values)
     row, counted = str(values["row"]), values.get("counted")
     if counted:
         k, n = map(int, str(counted).split(" of "))
@@ -75,22 +63,6 @@ def _likeness(cell: Cell) -> Likeness:
     known = cell.measure.name == "gap" and estimate is not None
     text = f"{number(estimate)} m {brackets(values.get('ci'))}".rstrip() if known else ""
     return Likeness(mark, word, None, None, unbroken(text), row)
-
-
-def _mark(name: str, values: Values) -> tuple[str, str]:
-    """What a verdict says: alike, different and in which direction, or that it cannot be told.
-
-    The interval of a difference has the level that the verdict rests on, of 95 % or more.
-    """
-    state, ci = shown_state(values), values.get("difference_ci")
-    if name not in MARGINS:
-        return STATES.get(state, (CANNOT_TELL, "cannot tell yet"))
-    if ci is not None and max(-ci[0], ci[1]) <= MARGINS[name]:
-        return LIKE, "like people"
-    if state in ("", OPEN):
-        return CANNOT_TELL, "cannot tell yet"
-    mark = MORE if values["difference"] > 0 else LESS
-    return mark, WORDS[name][mark]
 
 
 def people_of(conditions: Mapping[str, Any], human: Mapping[str, Any]) -> dict[str, str]:

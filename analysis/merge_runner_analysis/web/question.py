@@ -10,22 +10,24 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.prompts.blocks import title_of
-from merge_runner.study.crossing import MODEL, OPPONENT, PROMPT
+from merge_runner.study.crossing import MODEL, OPPONENT, PROMPT, SELF
 from merge_runner_analysis.metrics import COLLISIONS, GAP, LEFT_FIRST, RMSE
 from merge_runner_analysis.tables.model import Row, Table
 from merge_runner_analysis.web.effect_rows import (
+    amount,
     count_of,
     difference_mark,
     difference_text,
     estimate_text,
     factors_of,
     interval_of,
+    interval_text,
     is_copied,
     is_interaction,
     is_shown,
     is_tested,
+    is_uncorrected,
     level_text,
     metric_of,
     name_of,
@@ -36,22 +38,28 @@ from merge_runner_analysis.web.effect_rows import (
 )
 from merge_runner_analysis.web.level_chart import SHAPES, Chart, level_chart
 from merge_runner_analysis.web.marks import Mark
+from merge_runner_analysis.web.names import short_names
 from merge_runner_analysis.wording import (
+    CHANGED,
     ENOUGH,
     METRIC_NAMES,
     SAME_TRIALS,
     TIMES,
-    brackets,
+    UNCORRECTED,
+    UNREADABLE,
     capital,
     joined,
-    number,
     p_value,
 )
 
-# A change of the measure, as a claim names it.
-CHANGED = {LEFT_FIRST.name: "who goes first", RMSE.name: "the deviation from the initial speed"}
 # Of a scripted stand-in, why both levels have the same trials.
 UNREAD = "not tested: the scripted stand-in does not read it, and no effect is planted for it"
+# The trials that a measure counts; those of equal drivers, words and course are one.
+COUNTED = {
+    LEFT_FIRST.name: "trials without a crash, equal ones once",
+    COLLISIONS.name: "trials that ended, equal ones once",
+    GAP.name: "trials that count, equal ones once",
+}
 # More levels that show nothing are counted, not listed.
 FEW = 3
 
@@ -90,7 +98,9 @@ class Answer:
     """The claim, what else there is to say, charts, and the effects behind them.
 
     ``asked`` is the question in words, for a study that has none of its own; ``crossed`` a factor
-    at whose levels another one may be shown. ``programs`` are opponents with what they do.
+    at whose levels another one may be shown, ``has_self`` whether drivers meet a copy of their own.
+    ``uncorrected`` says why an interval may leave out 0
+    where no difference is shown, and ``problem`` what is wrong with the stored study.
     """
 
     asked: str
@@ -99,14 +109,17 @@ class Answer:
     measure: str
     drivers: list[tuple[str, str]]
     trials: int
+    counted: str
     halves: bool
     charts: list[Chart]
     crossed: str
-    programs: list[tuple[str, str]]
     crossings: str
     changes: list[Change]
     others: list[Change]
     could: str
+    has_self: bool
+    uncorrected: str
+    problem: str
 
 
 def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
@@ -133,6 +146,7 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
     drivers = list(
         dict.fromkeys(str(row.values["driver"]) for row in known if row.values["driver"])
     )
+    short = short_names(drivers)
     drawn = drivers if len(drivers) <= len(SHAPES) else []
     shapes = dict(zip(drawn, SHAPES, strict=False))
     shown = [row for row in known if not _untested(effects.rows) & factors_of(row)]
@@ -149,16 +163,19 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
         unbroken(claim),
         unbroken(rest),
         capital(name_of(primary)),
-        [*shapes.items()],
+        [(short[driver], shape) for driver, shape in shapes.items()],
         sum(count_of(row, "n") for row in _of_one_factor(shown, drawn)),
+        COUNTED.get(metric, COUNTED[GAP.name]),
         any(row.values["k"] is None for row in known) and metric == LEFT_FIRST.name,
         [chart for chart in charts if chart],
-        names[-1] if len(names) > 1 else "",
-        _programs(known),
+        OPPONENT if OPPONENT in names[1:] else names[-1] if len(names) > 1 else "",
         unbroken(_interactions(tested, {str(row.values["factor"]) for row in known})),
         _changes(tested, sides, metric),
         _changes(others, sides, metric),
         unbroken(_could(tested)),
+        any((row.values["factor"], row.values["level"]) == (OPPONENT, SELF) for row in known),
+        UNCORRECTED * (UNCORRECTED not in rest and any(map(is_uncorrected, (*tested, *others)))),
+        next((note for note in effects.notes if note.startswith(UNREADABLE)), ""),
     )
 
 
@@ -199,7 +216,9 @@ def answered(rows: Sequence[Row]) -> tuple[str, str]:
     else:
         claim = f"{rehearsed}no change of {what} is shown by {joined(_factors(primary))}."
     rest += [f"{capital(level_text(row))} changes it, too: {test_text(row)}." for row in sure[1:]]
-    rest += _not_shown([row for row in primary if row not in sure])
+    unshown = [row for row in primary if row not in sure]
+    rest += _not_shown(unshown)
+    rest += [UNCORRECTED] * any(map(is_uncorrected, unshown[:FEW]))
     rest += [f"{capital(said)}." for said in copied]
     if not sure:
         rest.append(_seen(primary))
@@ -212,9 +231,15 @@ def answered(rows: Sequence[Row]) -> tuple[str, str]:
     ]
     also = [row for row in also if row.values["factor"] != MODEL and metric_of(row) in METRIC_NAMES]
     if not sure and also:
-        row = min(also, key=lambda row: value_of(row, "p"))
+        row = min(also, key=lambda row: (_seen_first(row), value_of(row, "p")))
         rest.append(f"{capital(str(row.values['factor']))} changes {_changed(row)}: {_both(row)}.")
     return capital(claim), " ".join(filter(None, rest))
+
+
+def _seen_first(row: Row) -> int:
+    """The place of an effect's measure: what a person sees at once comes first."""
+    seen = (COLLISIONS.name, GAP.name, RMSE.name)
+    return seen.index(metric_of(row)) if metric_of(row) in seen else len(seen)
 
 
 def _not_shown(rows: Sequence[Row]) -> Iterator[str]:
@@ -259,11 +284,10 @@ def _seen(rows: Sequence[Row], what: str = "A change") -> str:
     for row in known:
         factor = str(row.values["factor"])
         least[factor] = max(least.get(factor, 0.0), value_of(row, "detectable"))
-    size = f"{number(max(least.values()))} {unit_of(known[0])}"
+    sizes = {name: f"{amount(known[0], size)} {unit_of(known[0])}" for name, size in least.items()}
+    size = sizes[max(least, key=lambda name: least[name])]
     if 1 < len(least) <= FEW:
-        size = ", ".join(
-            f"{number(of)} {unit_of(known[0])} by {name}" for name, of in least.items()
-        )
+        size = ", ".join(f"{of} by {name}" for name, of in sizes.items())
     return f"{what} of {size} or more would have been seen in four of five studies."
 
 
@@ -278,10 +302,16 @@ def _both(row: Row) -> str:
     if metric_of(row) == LEFT_FIRST.name:
         return (
             f"in the same situations, the driver goes first in {of} with {factor}={level} and in "
-            f"{reference} with {factor}={base}"
+            f"{reference} with {factor}={_called(factor, base)}"
         )
-    name = f"{name_of(row)} " if unit_of(row) == "points" else ""
-    return f"{name}{of} with {factor}={level}, {reference} with {factor}={base}"
+    return f"{of} with {factor}={level}, {reference} with {factor}={_called(factor, base)}"
+
+
+def _called(factor: object, level: object) -> str:
+    """A level as a reader knows it: ``self`` is another copy of the same driver."""
+    if factor == OPPONENT and level == SELF:
+        return f"{SELF} (another copy of the same driver)"
+    return title_of(str(level)) if factor == PROMPT else str(level)
 
 
 def _changed(row: Row) -> str:
@@ -304,15 +334,17 @@ def _changes(rows: Sequence[Row], sides: dict[str, Row], primary: str) -> list[C
 
 def _change(row: Row, sides: dict[str, Row], end: float, primary: str) -> Change:
     of, base, metric = row.values["level"], row.values["reference"], metric_of(row)
-    named = title_of if row.values["factor"] == PROMPT else str
+    factor = str(row.values["factor"])
     mark = " [scripted]" if str(of).endswith(" [scripted]") else ""
     is_own = metric == primary
     reference, level = (
         None
         if is_interaction(row)
         else _side(
-            Side(unbroken(estimate_text(row, name)), named(str(side))),
-            sides.get(f"{row.values['factor']}={side}"),
+            Side(
+                unbroken(estimate_text(row, name)), _called(factor, side) if is_own else str(side)
+            ),
+            sides.get(f"{factor}={side}"),
             is_own,
             metric,
         )
@@ -320,22 +352,23 @@ def _change(row: Row, sides: dict[str, Row], end: float, primary: str) -> Change
     )
     said = ""
     if is_interaction(row):  # whose id has the level of the other factor, too
-        named_level = f"{str(row.values['factor']).partition(TIMES)[0]}={of}"
-        at = row.id.partition("/interaction/")[0].removesuffix(f"/{named_level}")
-        said = f"effect of {named_level} with {at}, less its effect otherwise"
-    said = said or (named(str(of)) if is_own else f"{row.values['factor']}: {named(str(of))}")
+        one, other = factor.split(TIMES)
+        level_name, at = str(of).split(TIMES)
+        otherwise = str(base).split(TIMES)[1]
+        said = f"effect of {one}={level_name} with {other}={at}, less that with {other}={otherwise}"
+    said = said or (_called(factor, of) if is_own else f"{factor}: {_called(factor, of)}")
     if is_own and row.values.get("primary"):
         said += ", primary test"
     return Change(
-        capital(str(row.values["factor"])) if is_own else capital(name_of(row)),
+        capital(factor) if is_own else capital(name_of(row)),
         said,
         reference,
         level,
         f"{difference_text(row)} {unit_of(row)}",
-        brackets(interval_of(row)),
+        interval_text(row),
         p_value(value_of(row, "p_corrected")),
         difference_mark(row, end),
-        f"{number(end)} {unit_of(row)}",
+        f"{amount(row, end)} {unit_of(row)}",
         bool(row.values.get("primary")),
         row.id,
     )
@@ -354,12 +387,6 @@ def _untested(effects: Sequence[Row]) -> set[str]:
     """The factors of which every level has the trials of its reference."""
     asked = [row for row in effects if row.values.get("primary")]
     return {*_factors(asked)} - {*_factors(row for row in asked if not is_copied(row))}
-
-
-def _programs(levels: Sequence[Row]) -> list[tuple[str, str]]:
-    """The programs among the opponents, each with what it does, where that is known here."""
-    names = [str(row.values["level"]) for row in levels if row.values["factor"] == OPPONENT]
-    return [(name, PROGRAMS[name].meaning) for name in dict.fromkeys(names) if name in PROGRAMS]
 
 
 def _crossing_of(levels: Sequence[Row]) -> str:

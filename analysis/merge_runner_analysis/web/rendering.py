@@ -14,9 +14,18 @@ from markupsafe import Markup
 
 from merge_runner_analysis.web.display_text import visible, with_minus
 from merge_runner_analysis.web.glossary import meaning
+from merge_runner_analysis.web.marks import SHAPES
 from merge_runner_analysis.web.phrases import plain
 from merge_runner_analysis.web.urls import Links
-from merge_runner_analysis.wording import MINUS, number, p_value
+from merge_runner_analysis.wording import (
+    MINUS,
+    VERDICT_RULE,
+    VERDICTS,
+    capital,
+    money,
+    number,
+    p_value,
+)
 
 TEMPLATES, STATIC = (Path(__file__).with_name(name) for name in ("templates", "static"))
 STYLE = "style.css"
@@ -77,13 +86,16 @@ def environment(
     made.filters.update(
         format=lambda text, *values: (str(text) % values).replace("-", MINUS),
         num=number,
+        usd=money,
         p=p_value,
         whole="{:,}".format,
         minus=lambda text: with_minus(str(text)),
         plain=plain,
         meaning=meaning,
     )
+    verdicts = {SHAPES[state]: words for state, words in VERDICTS.items()}
     made.globals.update(at=at, policy=policy, inlined=inlined or {}, style=STYLE, **shared)
+    made.globals.update(verdict_shapes=verdicts, verdict_rule=capital(VERDICT_RULE))
     for name in MACROS:
         macros = vars(made.get_template(f"_{name}.html").module)
         made.globals |= {k: v for k, v in macros.items() if k[0] != "_"}

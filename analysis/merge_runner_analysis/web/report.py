@@ -40,6 +40,7 @@ from merge_runner_analysis.tables.verdicts import verdicts
 from merge_runner_analysis.web.comparison import Comparison, comparison_of, no_trials
 from merge_runner_analysis.web.effect_rows import MIDDLE
 from merge_runner_analysis.web.listing import judged_collisions
+from merge_runner_analysis.web.names import names_mean, programs_of, short_names
 from merge_runner_analysis.web.phrases import plain
 from merge_runner_analysis.web.question import answer_of
 from merge_runner_analysis.web.rendering import STYLE, environment, inlined_texts, policy_of
@@ -162,6 +163,9 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
         sentences=others,
         question=question,
         apart=apart,
+        names_mean=names_mean(
+            programs_of(study.frames.specs.values()), [group.driver for group in study.played]
+        ),
         linked=False,
         part={},
         middle=MIDDLE,
@@ -193,7 +197,8 @@ def _apart(study: Study) -> Comparison | None:
     if len(groups) != 2:
         return None
     one, other = groups
-    names = (one.driver, other.driver)
+    named = short_names([one.driver, other.driver])
+    names = (named[one.driver], named[other.driver])
     return comparison_of(comparison(study, one.id, other.id), names, (no_trials, no_trials))
 
 

@@ -85,7 +85,8 @@ WILD = driver(86, collisions="unlike", gap="unlike", collided=24)
             {"o3": driver(), "wild": WILD},
             "wild does not drive like people: it crashed in 24 of 110 trials, people in 28 of 990.",
             "No difference from people is shown for o3. 2 of 8 comparisons with people show a "
-            "difference at 5 %, corrected by Holm within each of 2 models.",
+            "difference, with p below 0.05 after correction for the number of comparisons of each "
+            "model (Holm).",
         ),
     ],
 )
@@ -142,7 +143,7 @@ def test_crashes_that_another_rule_decides_are_said_by_both():
     )
 
 
-@pytest.mark.parametrize(("n", "says"), [(19, "cannot tell yet"), (20, "unlike people")])
+@pytest.mark.parametrize(("n", "says"), [(19, "cannot tell yet"), (20, "not as with people")])
 def test_no_verdict_is_shown_of_too_few_trials(n, says):
     of = row("headway", "unlike", n=n)
     assert verdict_word(of) == says

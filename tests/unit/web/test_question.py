@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from merge_runner_analysis.tables.model import Column, Row, Table
 from merge_runner_analysis.web.question import UNREAD, answer_of, answered
-from merge_runner_analysis.wording import SAME_TRIALS
+from merge_runner_analysis.wording import SAME_TRIALS, UNCORRECTED
 
 GOES_FIRST, GAP = "goes first (%)", "gap (m)"
 METRICS = {GOES_FIRST: "left_first_percent", "coll. (%)": "collided_percent", GAP: "gap_m"}
@@ -32,7 +32,7 @@ def copied(factor):
     """Levels of which a stand-in plays the same trials."""
     row = effect(factor, p=None, difference=0.0, n=0, drivers="scripted")
     values = row.values | dict.fromkeys(("estimate", "estimate_reference", "difference", "ci"))
-    return replace(row, values=values, note=SAME_TRIALS)
+    return replace(row, values=values, note=SAME_TRIALS, untested=True)
 
 
 HURRY = (
@@ -58,8 +58,8 @@ SEEN = "A change of 10.00 points or more would have been seen in four of five st
             [effect(p=0.2), effect(measure=GAP, p=0.0001, estimate=3.8, estimate_reference=4.3)],
             "No change of who goes first is shown by hurry.",
             "Hurry=yes is not shown to change it: +13.00 points [6.00, 20.00], "
-            f"corrected p = 0.200. {SEEN} Hurry changes gap at the merge point: 3.80 m with "
-            "hurry=yes, 4.30 m with hurry=no.",
+            f"corrected p = 0.200. {UNCORRECTED} {SEEN} Hurry changes the gap at the merge point: "
+            "3.80 m with hurry=yes, 4.30 m with hurry=no.",
         ),
         (
             [effect(p=0.0001), effect("hurry × persona", 0.01, difference=-8.0)],
@@ -98,8 +98,8 @@ SEEN = "A change of 10.00 points or more would have been seen in four of five st
             "No change of who goes first is shown by hurry and persona.",
             "Hurry=yes is not shown to change it: +13.00 points [6.00, 20.00], corrected p = "
             "0.200. Persona=yes is not shown to change it: +1.00 points [−6.00, 8.00], corrected p "
-            "= 0.300. A change of 10.00 points by hurry, 10.00 points by persona or more would "
-            "have been seen in four of five studies.",
+            f"= 0.300. {UNCORRECTED} A change of 10.00 points by hurry, 10.00 points by persona or "
+            "more would have been seen in four of five studies.",
         ),
         (
             [effect(n=12)],

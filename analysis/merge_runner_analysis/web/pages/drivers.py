@@ -9,7 +9,7 @@ from merge_runner.records import SIDES
 from merge_runner_analysis.published import HUMAN
 from merge_runner_analysis.tables.formats import printed
 from merge_runner_analysis.tables.model import Row as TableRow
-from merge_runner_analysis.web.comparison import set_apart
+from merge_runner_analysis.web.comparison import compared
 from merge_runner_analysis.web.computed import computed_table
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.display_text import with_minus
@@ -60,9 +60,9 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     beside = by_name.get(asked.get("with", ""))
     was_asked = own and own.facts and own.facts["asked"] and not beside
     awaited, first = _first(site, name, scope) if was_asked else (None, "")
-    compared, is_awaited, apart = None, False, None
+    job, is_awaited, apart = None, False, None
     if own and beside:
-        compared, is_awaited, apart = set_apart(site, own, beside, scope)
+        job, is_awaited, apart = compared(site, own, beside, scope)
     both = [one for one in (own, beside) if one]
     conditions = by_condition(site, scope, both)
     # Of each condition, the humans' and the drivers' share of trials in which left goes first.
@@ -76,7 +76,7 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         name=name,
         own=own,
         beside=beside,
-        compared=compared if is_awaited else None,
+        compared=job if is_awaited else None,
         apart=apart,
         linked=True,
         middle=MIDDLE,

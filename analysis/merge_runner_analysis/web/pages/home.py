@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from merge_runner_analysis.web.comparison import set_apart
+from merge_runner_analysis.web.comparison import compared
 from merge_runner_analysis.web.computed import computed_table
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.effect_rows import MIDDLE
-from merge_runner_analysis.web.judged import by_condition, by_kind, humans_of, judged, noted
+from merge_runner_analysis.web.judged import Driver, by_condition, by_kind, humans_of, judged, noted
+from merge_runner_analysis.web.names import PLAYED, names_mean, short_names
 from merge_runner_analysis.web.people import HEADINGS, likeness_of, people_of
 from merge_runner_analysis.web.question import Answer, answer_of
 from merge_runner_analysis.web.runs import standing_of
 from merge_runner_analysis.web.scope import Bar, descriptions_of, scope_of, unmarked
 from merge_runner_analysis.web.site import Site, news_of
-from merge_runner_analysis.wording import LANGUAGE_MODEL, headline
+from merge_runner_analysis.wording import LANGUAGE_MODEL, MEASURES, headline
 
 TABLES = ("effects", "levels")  # of what a study's factors change
 
@@ -32,6 +33,10 @@ def _question(site: Site, bar: Bar) -> tuple[list[Job], list[Job], Answer | None
     return [*jobs], [job for job, table in found if table is None], answer_of(*tables)
 
 
+def _is_tested(driver: Driver, measure: str) -> bool:
+    return measure in driver.cells and driver.cells[measure].values.get("p_holm") is not None
+
+
 def home_page(site: Site, asked: Mapping[str, str]) -> str:
     """The study; raises NotThere, and NothingNew where nothing is new since it was ``seen``."""
     standing = standing_of(site.catalogue)
@@ -44,15 +49,16 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         for one in drivers
         if one.prompt == scope.prompt and (not scope.drivers or unmarked(one.name) in scope.drivers)
     ]
+    short = short_names([one.name for one in shown])
     models = {
-        one.name: {name: cell.values for name, cell in one.cells.items()}
+        short[one.name]: {name: cell.values for name, cell in one.cells.items()}
         for one in shown
         if one.kind == LANGUAGE_MODEL and one.cells
     }
     kinds = by_kind(shown)
     apart = None
     if not jobs and len(models) == len(shown) == 2:  # two language models are the question
-        job, is_awaited, apart = set_apart(site, shown[0], shown[1], scope)
+        job, is_awaited, apart = compared(site, shown[0], shown[1], scope)
         jobs, asking = [job], [job] * is_awaited
     older = [job.older for job in (values["computed"], *jobs)]
     now = standing, site.catalogue.state, site.catalogue.held, older
@@ -64,6 +70,13 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         **values,
         likeness=[(one, likeness_of(one)) for of_kind in kinds.values() for one in of_kind],
         likeness_headings=HEADINGS,
+        more_compared=[
+            measure.label
+            for name, measure in MEASURES.items()
+            if name not in HEADINGS and any(_is_tested(one, name) for one in shown)
+        ],
+        short=short,
+        names_mean=names_mean(site.catalogue.ask(PLAYED), [one.name for one in shown]),
         # People's gap is that of the situations in which the first driver finished.
         people=people_of(conditions, humans_of(values["table"], next(iter(shown), None))),
         part=scope.part,

@@ -9,7 +9,7 @@ from merge_runner_analysis.web.phrases import condition_text
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.trial.prompt_parts import words_of
 from merge_runner_analysis.web.trial.reader import Trial, controlled
-from merge_runner_analysis.wording import number
+from merge_runner_analysis.wording import money, number
 
 
 def outcome_text(row: Row) -> str:
@@ -52,7 +52,7 @@ def facts(row: Row) -> list[str]:
         ", ".join(row["levels"] or ()),
         row["rmse_mps"] is not None and f"RMSE of the speed {number(row['rmse_mps'])} m/s",
         row["asked"] and f"{row['invalid']} of {row['asked']} decisions invalid",
-        row["cost_usd"] is not None and f"{row['cost_usd']:.3f} USD",
+        row["cost_usd"] is not None and money(row["cost_usd"], " USD"),
         row["caution"] and f"Note: {row['caution']}",
     )
     return [f"{text}." for text in texts if text]

@@ -1,0 +1,62 @@
+"""What the names on a page mean: of programs, servers, pairs, settings and sample sets."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from inspect import getdoc
+from typing import Any
+
+from merge_runner.config import without_endpoint
+from merge_runner.drivers.registry import EMULATOR, PROGRAMS
+from merge_runner.records import SIDES
+
+# The programs that drove in the trials of a database, as their specs have them.
+PLAYED = """
+SELECT DISTINCT side->>'$.program' AS program, side->>'$.based_on' AS based_on
+FROM (SELECT unnest([spec->'$.left', spec->'$.right']) AS side FROM specs SEMI JOIN listed
+    USING (spec_hash))
+WHERE program IS NOT NULL ORDER BY ALL
+"""
+PARTS = (
+    (re.compile(r" (at [^\s+]+?)(?=/set\d+(?: |$)|[\s+]|$)"), "the server that the model ran on"),
+    (re.compile(r"(/set\d+)"), "another series of samples of the same driver"),
+    (re.compile(r" (\[[0-9a-f]{8}\])"), "with other settings of the task than its other trials"),
+    (re.compile(r"(\+)"), "between two different drivers: who goes first is said of the first one"),
+    (re.compile(rf"^({EMULATOR})\b"), "the scripted stand-in that comes with this program"),
+)
+
+
+def programs_of(specs: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """The programs that drive in trials of these specs, as ``PLAYED`` has them."""
+    sides = (spec.get(side) or {} for spec in specs for side in SIDES)
+    return [side for side in sides if "program" in side]
+
+
+def short_names(names: Sequence[str]) -> dict[str, str]:
+    """Each name as it is shown: without its server where no other one is then called so."""
+    short = [*map(without_endpoint, names)]
+    return {
+        name: brief if short.count(brief) == 1 else name
+        for name, brief in zip(names, short, strict=True)
+    }
+
+
+def names_mean(programs: Iterable[Mapping[str, Any]], drivers: Iterable[str]) -> dict[str, str]:
+    """What programs do, by name, and what the parts of the drivers' names say."""
+    meanings = {of["program"]: program_text(of["program"], of.get("based_on")) for of in programs}
+    for name in drivers:
+        for pattern, meaning in PARTS:
+            meanings |= dict.fromkeys(pattern.findall(name), meaning)
+    return dict(sorted(meanings.items()))
+
+
+def program_text(name: str, based_on: str | None = None) -> str:
+    """What a program does, as far as what registers it is loaded here."""
+    if (program := PROGRAMS.get(name)) is not None:
+        doc = (getdoc(program.driver) or "").partition("\n")[0].rstrip(".")
+        said = program.meaning or doc or "a driver of a plug-in, which does not say what it does"
+        return f"a program: {said}"
+    if based_on and based_on in PROGRAMS:
+        return f"a program, otherwise set than usual: {PROGRAMS[based_on].meaning}"
+    return f"{based_on} otherwise set" if based_on else "a driver of this study's own plug-in"
