@@ -8,8 +8,10 @@ import pytest
 from merge_runner_analysis.explain import explain, sources_of
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import Study
+from tests.support.harness import environment
+from tests.support.program import invoke
 from tests.support.studies import changed, write_study, yielding
-from tests.support.tables import by_id, made, notes_with
+from tests.support.tables import by_id, made, notes_with, values_of
 
 SAME = "not tested: the same trials at both levels"
 PROGRAM = json.dumps({side: {"program": "own", "chance": True} for side in ("left", "right")})
@@ -127,3 +129,42 @@ def test_a_program_that_heeds_a_level_in_some_conditions_is_compared_in_all(tmp_
         assert abs(shown.values["difference"]) == pytest.approx(within)
         assert not shown.note
     assert (contrast.values["n"], contrast.values["n_reference"]) == (44, 44)
+
+
+UNREAD = """
+models = ["emulator"]
+repetitions = 3
+conditions = ["N_0_0", "L_4_0"]
+mirror = true
+[factors]
+persona = ["none", "taxi"]
+[texts.persona.taxi]
+add = [{ after = "C3.human", text = "You are a taxi driver." }]
+given_to = "ego"
+"""
+
+
+def test_verdicts_count_a_trial_once_whichever_side_has_words_that_nobody_reads(tmp_path):
+    (tmp_path / "study.toml").write_text(UNREAD)
+    asked = ("sweep", "study.toml", "--db", "t.duckdb", "--quiet")
+    assert invoke(asked, cwd=tmp_path, env=environment()).code == 0
+    study = Study(tmp_path / "t.duckdb")
+    table = made(study, "verdicts")
+    verdicts, stored = by_id(table), {group.id: len(group.trials) for group in study.models}
+    assert (stored["emulator/baseline"], stored["emulator/persona=taxi"]) == (6, 12)
+    for measure in ("headway", "collisions", "gap"):
+        own, base = (
+            verdicts[f"emulator/{name}/{measure}"] for name in ("persona=taxi", "baseline")
+        )
+        for column in ("n", "k", "estimate", "counted", "p"):
+            assert own.values.get(column) == base.values.get(column), (measure, column)
+        (source,) = explain(study, table, f"{own.id}:n").sources
+        assert len(source.trials) == own.values["n"]
+        if own.values.get("counted"):
+            (source,) = explain(study, table, f"{own.id}:counted").sources
+            assert f"{len(source.numerator)} of {len(source.trials)}" == own.values["counted"]
+    (note,) = notes_with(table, "each counts once")
+    assert note.startswith("emulator/persona=taxi: 6 of 12 trials went as another one")
+    # The first page counts them so, too.
+    levels = values_of(study, "levels")
+    assert levels["persona=none"]["ended"] == 6

@@ -12,7 +12,7 @@ from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.web import comparison
 from merge_runner_analysis.web.report import report_html
-from merge_runner_analysis.wording import brackets, number, p_value
+from merge_runner_analysis.wording import UNREADABLE, brackets, capital, number, p_value
 from tests.support.serving import client_of, listed
 from tests.support.studies import Said, write_study, yielding
 from tests.support.tables import values_of
@@ -147,3 +147,16 @@ def test_every_count_leads_to_so_many_trials(client):
     assert {"11", "33", "55"} <= {count for _, count in links}
     for address, count in links:
         assert listed(client.get(unescape(address)).text) == int(count)
+
+
+def test_a_stored_study_that_cannot_be_read_is_said_in_a_line_and_the_pages_work(drives, tmp_path):
+    drives = [*drives, *(replace(drive, variant="A1") for drive in drives)]
+    text = 'models = ["o3"]\nrepetitions = 1\nof_a_later_version = 1\n'
+    db = write_study(tmp_path / "t.duckdb", drives, config={"study": {"text": text}})
+    notes = make_tables(Study(db), ["effects"])[0].notes
+    (said,) = [note for note in notes if note.startswith(UNREADABLE)]
+    assert "of_a_later_version" in said
+    assert "\n" not in said
+    with client_of(db) as client:
+        assert capital(said) in text_of(client.get("/").text)
+        assert client.get(f"/drivers/{A}?with={B}").status_code == 200

@@ -11,6 +11,8 @@ from playwright.sync_api import expect
 
 from merge_runner.results.store import query, results_digest
 from merge_runner_analysis.figures.figure2 import figure2
+from merge_runner_analysis.selection import Selection
+from merge_runner_analysis.stats.verdicts import human_gap
 from merge_runner_analysis.study import Study
 from tests.support.gate import HANGS_S
 from tests.support.harness import PROGRAM, environment
@@ -156,6 +158,17 @@ def test_likeness_to_people_is_said_in_counts_that_lead_to_their_trials(db):
         assert 'name="variant"' not in text
         assert 'name="model"' not in text
         assert "Prompt Baseline, beside 990 trials" in Page(text).text
+
+
+def test_the_gap_of_people_is_that_of_the_situations_that_were_played(db):
+    study = Study(db, Selection(condition="L_4_8"))
+    group = next(group for group in study.baselines if group.driver == "emulator")
+    there, every = human_gap(study.human, group), human_gap(study.human, study.human)
+    assert abs(there.value - every.value) > 0.05
+    with client_of(db) as client:
+        page = Page(client.get("/", params={"condition": "L_4_8"}).text).text
+    people = page.partition("Gap at the merge point people")[2].partition("emulator")[0]
+    assert f"{there.value:.2f} m [{there.low:.2f}, {there.high:.2f}]" in people.replace("\xa0", " ")
 
 
 def test_counts_of_a_part_of_the_trials_lead_to_just_these(db):

@@ -151,7 +151,7 @@ def test_every_arm_and_every_cause_leads_to_the_trials_that_it_counts(written):
         totals = site.catalogue.counts(filter_of(asked))
         there = sum(part["trials" if "cause" in asked else "ended"] for part in totals)
         assert there == int(count), url
-    attempts = {f"attempt: {name}" for name in ("refusal", "timeout", "rate_limit", "unknown")}
+    attempts = {f"attempt: {name}" for name in ("timeout", "rate_limit", "unknown")}
     assert causes == {None, "model: o3 → another", "plan: no_array", "plan: refusal"} | attempts
 
 

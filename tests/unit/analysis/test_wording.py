@@ -14,7 +14,9 @@ from merge_runner_analysis.wording import (
     SHOWN,
     TOO_FEW,
     crashes,
+    differs,
     headline,
+    money,
     sentence,
     told,
     verdict_word,
@@ -244,3 +246,28 @@ def test_no_sentence_claims_a_direction_that_the_corrected_p_does_not_carry(of):
     for name in {*of} - {*carried}:
         alone = {**of, **{one: {**of[one], "state": OPEN, "p_holm": 1.0} for one in carried}}
         assert not DIRECTION.search(sentence({**alone, name: of[name]}))
+
+
+@pytest.mark.parametrize(
+    ("measure", "ci", "says"),
+    [
+        ("collisions", (-4.0, 5.0), "like people"),
+        ("collisions", (-9.0, -5.1), "fewer than people"),
+        ("gap", (-1.0, -0.5), "like people"),
+        ("gap", (-1.1, -0.5), "smaller than people's"),
+        ("headway", (-0.1, 0.1), "not as with people"),
+    ],
+)
+def test_within_a_margin_a_driver_is_like_people_wherever_that_is_said(measure, ci, says):
+    of = row(measure, "unlike", difference_ci=ci, p_holm=0.01)
+    assert verdict_word(of) == says
+    assert differs(of) is (says != "like people")
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(None, "–"), (0.0, "0.00"), (12.345, "12.35"), (0.5, "0.50"), (0.0123, "0.012"),
+     (-0.00056, "−0.00056")],
+)  # fmt: skip
+def test_a_price_has_two_digits_at_least(value, text):
+    assert money(value) == text

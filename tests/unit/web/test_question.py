@@ -8,11 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from merge_runner_analysis.tables.model import Column, Row, Table
+from merge_runner_analysis.web import effect_rows
 from merge_runner_analysis.web.question import UNREAD, answer_of, answered
 from merge_runner_analysis.wording import SAME_TRIALS, UNCORRECTED
 
-GOES_FIRST, GAP = "goes first (%)", "gap (m)"
-METRICS = {GOES_FIRST: "left_first_percent", "coll. (%)": "collided_percent", GAP: "gap_m"}
+GOES_FIRST, GAP, COST = "goes first (%)", "gap (m)", "cost (USD)"
+METRICS = {GOES_FIRST: "left_first_percent", "coll. (%)": "collided_percent", GAP: "gap_m",
+           COST: "cost_usd"}  # fmt: skip
 DIRECTION = re.compile(r"\bchanges\b|\binteract:")
 
 
@@ -26,6 +28,10 @@ def effect(factor="hurry", p=0.001, measure=GOES_FIRST, *, difference=13.0, n=40
     of |= {"ci": (difference - 7, difference + 7), "p_corrected": p, "detectable": 10.0}
     of |= {"n": n, "n_reference": n, "primary": "primary" if main else None}
     return Row(name, (), of | values)
+
+
+def unspaced(text):
+    return text.replace(effect_rows.NO_BREAK, " ")
 
 
 def copied(factor):
@@ -178,3 +184,49 @@ def test_levels_that_are_not_tested_are_not_drawn():
     (chart,) = made.charts
     assert [line.head for line in chart.lines] == ["hurry", ""]
     assert made.trials == 200
+
+
+def test_an_interaction_names_the_levels_of_both_factors():
+    crossed = {"level": "taxi × yes", "reference": "none × no"}
+    made = answer([effect(), effect("persona × hurry", 0.4, **crossed)], levels_of("hurry"))
+    main, interaction = made.changes
+    assert main.said == "yes, primary test"
+    assert interaction.said == "effect of persona=taxi with hurry=yes, less that with hurry=no"
+    assert (interaction.reference, interaction.level) == (None, None)
+
+
+def test_a_copy_of_the_same_driver_is_said_to_be_one():
+    opponent = {"level": "idm", "reference": "self"}
+    rows = [effect("opponent", **opponent), effect("opponent", measure=COST, **opponent)]
+    made = answer(rows, levels_of("hurry"))
+    assert "opponent=self (another copy of the same driver)." in made.claim
+    assert made.changes[0].reference.name == "self (another copy of the same driver)"
+
+
+def test_a_small_price_keeps_two_digits():
+    cheap = {"estimate": 0.00024, "estimate_reference": 0.0, "ci": (-0.0012, 0.00031)}
+    made = answer(
+        [effect(measure=COST, difference=-0.0005, **cheap), effect(p=0.2)], levels_of("hurry")
+    )
+    assert "Hurry changes the cost of a trial: 0.00024 USD with hurry=yes" in unspaced(made.rest)
+    assert effect_rows.test_text(effect(measure=COST, difference=-0.0005, **cheap)) == (
+        "−0.00050 USD [−0.0012, 0.00031], corrected p = 0.001"
+    )
+
+
+@pytest.mark.parametrize(
+    ("difference", "p", "is_said"), [(13.0, 0.2, True), (1.0, 0.2, False), (13.0, 0.01, False)]
+)
+def test_where_an_interval_leaves_out_0_without_a_difference_the_page_says_why(
+    difference, p, is_said
+):
+    made = answer([effect(), effect("persona", p, difference=difference)], levels_of("hurry"))
+    assert (UNCORRECTED in unspaced(made.rest)) is is_said
+    assert not made.uncorrected  # it is said once
+    made = answer([effect(), effect(measure=GAP, p=p, difference=difference)], levels_of("hurry"))
+    assert bool(made.uncorrected) is is_said
+
+
+def test_what_a_person_sees_at_once_is_said_of_several_other_changes():
+    others = [effect(measure=COST, p=0.0001), effect(measure="coll. (%)", p=0.01)]
+    assert "Hurry changes how many trials end in a crash: " in answered([effect(p=0.2), *others])[1]

@@ -280,7 +280,9 @@ def test_too_little_data_are_said(fit):
         assert fit(trials).n == 0
     no_fit(fit(frame([(4.0, 0.8, "finished", "left", 3.0)])), "1 finished trial with a ")
     one_cell = [(4.0, 0.8, "finished", ("left", "right")[k % 2], 4.0 + k) for k in range(20)]
-    no_fit(fit(frame(one_cell)), "too few or in too few conditions to tell what headway and speed do")
+    no_fit(
+        fit(frame(one_cell)), "too few or in too few conditions to tell what headway and speed do"
+    )
     if fit in (who_first_logit, who_first_firth):  # as many trials as coefficients
         few = OVERLAPPING.iloc[[0, 1, 5]].assign(merged_first=["left", "right", "left"])
         no_fit(fit(few), "3 finished trials with a first merger")
