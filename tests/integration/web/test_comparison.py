@@ -12,7 +12,7 @@ from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.web import comparison
 from merge_runner_analysis.web.report import report_html
-from merge_runner_analysis.wording import UNREADABLE, brackets, capital, number, p_value
+from merge_runner_analysis.wording import UNREADABLE, brackets, capital, money, number, p_value
 from tests.support.serving import client_of, listed
 from tests.support.studies import Said, write_study, yielding
 from tests.support.tables import values_of
@@ -58,13 +58,13 @@ def test_a_less_b_is_the_table_of_effects_with_its_interval_and_both_p(db, clien
     assert len(tested) >= 6
     for row in tested:
         unit = row["measure"].rpartition("(")[2].rstrip(")").replace("%", "points")
-        sign = "+" if row["difference"] > 0 else ""
-        shown = f"{sign}{number(row['difference'])} {unit} {brackets(row['ci'])}"
+        sign, form = "+" if row["difference"] > 0 else "", money if unit == "USD" else number
+        shown = f"{sign}{form(row['difference'])} {unit} {brackets(row['ci'], form)}"
         assert shown in page
         _, _, rest = page.partition(shown)
         numbers = re.match(r" (?:± [\d.]+ \S+ )?(\S+) (\S+)", rest).groups()
         assert numbers == (p_value(row["p"]), p_value(row["p_corrected"]))
-        assert row["detectable"] is None or f"{number(row['detectable'])} {unit}" in page
+        assert row["detectable"] is None or f"{form(row['detectable'])} {unit}" in page
 
 
 def test_the_headline_says_crashes_in_counts_then_points_interval_and_p(client):
