@@ -1,4 +1,4 @@
-"""Every knob as a field of a frozen model; the only reader of TOML files and the environment."""
+"""Configuration as frozen models; the only reader of TOML files and the environment."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ from merge_runner.registry import Registry
 from merge_runner.text_safety import one_line
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-# A shorter key is a dummy, and may occur in any text.
+# A shorter key is a dummy that may occur in any text.
 SHORTEST_SECRET = 8
 UNNAMED = "default"
 
 
-# Strict, or else "4" and true would be numbers.
+# Strict: without it "4" and true would be numbers.
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
-# What the equations of motion can take: the square of 1e308 is no number.
+# Bounds of the equations of motion: the square of 1e308 overflows.
 Rate = Annotated[Positive, Field(le=1e6)]
 Deviation = Annotated[NotNegative, Field(le=1e6)]
 Count = Annotated[int, Field(gt=0, strict=True)]
@@ -50,13 +50,13 @@ ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
 class Frozen(BaseModel):
-    """A configuration object: frozen, finite, and an unknown key is an error."""
+    """Configuration object: frozen, finite; an unknown key is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 def whole_steps(name: str, seconds: float, step_s: float) -> int:
-    """How many steps a time takes; raises ValueError where that is no whole number from 1."""
+    """Return a duration as a number of steps; raises ValueError unless that is an integer >= 1."""
     steps = seconds / step_s
     if steps > MOST_STEPS:
         raise ValueError(f"{name} = {seconds:g} s is more than {MOST_STEPS} steps")
@@ -66,15 +66,16 @@ def whole_steps(name: str, seconds: float, step_s: float) -> int:
 
 
 class Perception(Frozen):
-    """How the driver of one side perceives the other vehicle; by default exactly, at once, always.
+    """Observation model of the driver of one side; the default is perfect perception.
 
     ``position_sd_m`` and ``speed_sd_mps`` are the standard deviations of the errors of the relative
     distance and of the other's speed. An error after t seconds is correlated by
-    exp(-t / autocorrelation_s) with itself (Uhlenbeck and Ornstein, Phys. Rev. 36, 823, 1930); 0:
-    each instant has its own. The other is seen as it was ``delay_s`` ago. A decision receives
-    nothing with the probability ``dropout``, and shows what was received last. The other is seen up
-    to a relative distance of ``range_m``, and once the own car is within ``view_from_m`` of the
-    merge point, or past it. ``own`` gives the own position and speed errors of the same sizes.
+    exp(-t / autocorrelation_s) with itself (Uhlenbeck and Ornstein, Phys. Rev. 36, 823, 1930); with
+    0, errors are independent. The other is observed with a delay of ``delay_s``. A decision
+    receives no new observation with the probability ``dropout``; it uses the last one. The other is
+    visible up to a relative distance of ``range_m``, and once the ego is within ``view_from_m`` of
+    the merge point, or past it. With ``own``, the ego's position and speed have errors of the same
+    sizes.
     """
 
     position_sd_m: Deviation = 0.0
@@ -88,7 +89,7 @@ class Perception(Frozen):
 
     @property
     def is_random(self) -> bool:
-        """Whether errors or dropouts are drawn."""
+        """True if errors or dropouts are random."""
         return bool(self.position_sd_m or self.speed_sd_mps or self.dropout)
 
     @model_validator(mode="after")
@@ -104,28 +105,28 @@ PERFECT = Perception()
 
 
 class ScenarioConfig(Frozen):
-    """The driving task of arXiv 2604.09609 (Table I), with a switch for each open point.
+    """Driving task of arXiv 2604.09609 (Table I), with a switch for each open point.
 
     ``collision_rule``: ``euclid2d`` (centres closer than a vehicle length), ``rectangle`` (the
     vehicles' oriented boxes overlap, as in the human experiment) or ``shared_lane``
     (|s_L - s_R| below a vehicle length once either has passed the merge point).
-    ``control_start``: ``both_exits`` starts where both vehicles are out of their tunnels,
-    ``own_exit`` at the earlier exit, the other vehicle cruising until its own.
-    ``resistance``: ``human`` adds the drag of the human simulator, 0.5 + 0.005 v^2 in m/s^2;
-    drivers are not told, and a plan of zeros then slows by 1 m/s per second at 10 m/s.
+    ``control_start``: ``both_exits`` starts when both vehicles are out of their tunnels,
+    ``own_exit`` at the earlier exit; the other vehicle cruises until its own exit.
+    ``resistance``: ``human`` adds the drag of the human simulator, 0.5 + 0.005 v^2 in m/s^2. No
+    prompt mentions it; a plan of zeros then slows by 1 m/s per second at 10 m/s.
     ``history_start``: before t = 0 the history shows ``cruise`` (a = 0, constant speeds) or is
-    ``empty``. ``fallback``: after an invalid reply the last valid plan ``continue``s where it
-    was left, or ``restart``s at its first action. ``straight_after``: the prompt says "straight"
+    ``empty``. ``fallback``: after an invalid reply the last valid plan ``continue``s at its next
+    action, or ``restart``s at its first action. ``straight_after``: the prompt says "straight"
     once the ``own`` vehicle, or once ``both``, have passed the merge point.
-    ``step_s`` is the world's step. ``plan_step_s`` is how long an action of a language model's plan
-    lasts and how far apart the samples of its histories are, ``step_s`` where it is not given.
-    ``prompt_rate_hz`` is a language model's, and that of a program without a rate of its own.
-    ``perception_left`` and ``perception_right`` say what the driver of each side perceives.
+    ``step_s`` is the world's step. ``plan_step_s`` is the duration of an action of a language
+    model's plan and the sampling interval of its histories, by default ``step_s``.
+    ``prompt_rate_hz`` is the decision rate of a language model, and of a program without its own.
+    ``perception_left`` and ``perception_right`` are the observation models of the two drivers.
     """
 
     horizon_s: Positive = 4.0
     step_s: Positive = 0.2
-    # Left out where it is not given, so that specs from before it keep their hashes.
+    # Left out if not given, so that older specs keep their hashes.
     plan_step_s: Positive | None = Field(default=None, exclude_if=lambda value: value is None)
     prompt_rate_hz: Positive = 1.0
     memory_s: Positive = 2.0
@@ -139,42 +140,42 @@ class ScenarioConfig(Frozen):
     history_start: Literal["cruise", "empty"] = "cruise"
     fallback: Literal["continue", "restart"] = "continue"
     straight_after: Literal["own", "both"] = "own"
-    # Left out where they are perfect, for the same reason.
+    # Left out if perfect, for the same reason.
     perception_left: Perception = Field(default=PERFECT, exclude_if=lambda p: p == PERFECT)
     perception_right: Perception = Field(default=PERFECT, exclude_if=lambda p: p == PERFECT)
 
     def perception(self, side: Side) -> Perception:
-        """What the driver of a side perceives."""
+        """Return the perception of the driver of a side."""
         return self.perception_left if side == "left" else self.perception_right
 
     @cached_property
     def action_s(self) -> float:
-        """How long an action of a language model's plan lasts."""
+        """Duration of an action of a language model's plan."""
         return self.step_s if self.plan_step_s is None else self.plan_step_s
 
     @cached_property
     def action_steps(self) -> int:
-        """How many steps of the world an action of a language model's plan lasts."""
+        """Number of the world's steps in an action of a language model's plan."""
         return round(self.action_s / self.step_s)
 
     @cached_property
     def plan_actions(self) -> int:
-        """N, the number of actions of a language model's plan."""
+        """Number of actions of a language model's plan (N in the paper)."""
         return round(self.horizon_s / self.action_s)
 
     @cached_property
     def executed_actions(self) -> int:
-        """How many actions of a plan are driven before the next prompt."""
+        """Number of actions of a plan that are executed before the next prompt."""
         return round(1 / (self.prompt_rate_hz * self.action_s))
 
     @cached_property
     def memory_samples(self) -> int:
-        """The number of the world's samples in each history."""
+        """Number of the world's samples in each history."""
         return round(self.memory_s / self.step_s)
 
     @cached_property
     def timeout_steps(self) -> int:
-        """The number of steps after which a trial is over."""
+        """Number of steps until a trial times out."""
         return round(self.timeout_s / self.step_s)
 
     @model_validator(mode="after")
@@ -198,9 +199,9 @@ class ScenarioConfig(Frozen):
 
 
 class Price(Frozen):
-    """USD per million tokens, and where the figures were read.
+    """Price in USD per million tokens, with its source.
 
-    ``tiers`` are factors of them by the ``service_tier`` that a reply names.
+    ``tiers`` are factors by the ``service_tier`` in a reply.
     """
 
     input: NotNegative
@@ -211,7 +212,7 @@ class Price(Frozen):
 
 
 class BatchTerms(Frozen):
-    """What a batch mode costs, as a factor of what single calls cost, and where that was read."""
+    """Price of a batch mode as a factor of the usual price, with its source."""
 
     price_factor: Annotated[Positive, Field(le=1)]
     source: str
@@ -220,16 +221,16 @@ class BatchTerms(Frozen):
 class ModelEntry(Frozen):
     """One model of a ``models.toml``.
 
-    ``id`` is what is sent (UNNAMED: what a server of one's own serves); a served model that is
-    neither it nor one of ``aliases`` is a mismatch. ``parameters`` go into the request as they are,
-    and nothing else does; ``applied_defaults`` puts on record which defaults of the provider apply,
-    ``rejects`` names parameters that the model refuses or does not heed, ``efforts`` the levels of
-    ``reasoning_effort`` as parameters, for a model that has none of this name. ``successor`` names
-    the entry to go on with from the ``shutdown`` on. ``price`` is ``free``, ``genai-prices`` (the
-    table of that package) or explicit figures. ``rpm`` and ``tpm`` are requests and tokens a
-    minute. ``typical_output_tokens`` and ``typical_latency_s`` serve estimates
-    alone. A reply longer than ``max_reply_mb`` (unpacked) is refused. ``batch`` is the batch mode:
-    the ``provider``'s, ``none``, or one on the terms of another server that speaks the format.
+    ``id`` is the model id to send (UNNAMED: the model of a local server); a served model that is
+    neither the id nor one of ``aliases`` is a mismatch. The request has exactly the ``parameters``;
+    ``applied_defaults`` documents the provider's defaults, ``rejects`` the parameters that the
+    model refuses or ignores, ``efforts`` the parameters for each level of ``reasoning_effort`` of a
+    model without a parameter of this name. ``successor`` is the entry to use from the ``shutdown``
+    on. ``price`` is ``free``, ``genai-prices`` (the table of that package) or explicit figures.
+    ``rpm`` and ``tpm`` are requests and tokens a minute. ``typical_output_tokens`` and
+    ``typical_latency_s`` are for estimates only. A reply longer than ``max_reply_mb`` (unpacked) is
+    refused. ``batch`` is the batch mode: the ``provider``'s, ``none``, or the terms of another
+    server with this wire format.
     """
 
     provider: str
@@ -262,31 +263,31 @@ class ModelEntry(Frozen):
 
     @property
     def place(self) -> str:
-        """Where a user corrects it: table and file, as ``[o3] in models.toml``."""
+        """Table and file of the entry, for messages: ``[o3] in models.toml``."""
         return self._place
 
-    def standing_at(self, place: str) -> Self:
-        """Return it with another ``place``."""
+    def with_place(self, place: str) -> Self:
+        """Return a copy with another ``place``."""
         copied = self.model_copy()
         copied._place = one_line(place)
         return copied
 
     @property
     def key_envs(self) -> tuple[str, ...]:
-        """The variables that may hold the key, the first one first; raises UsageError."""
+        """Environment variables of the key, by precedence; raises UsageError."""
         return (self.key_env,) if self.key_env else PROVIDERS.require(self.provider).key_envs
 
 
 @dataclass(frozen=True, slots=True)
 class Provider:
-    """Where a provider is reached, which variables configure it, and how it takes a key.
+    """Provider: base URL, environment variables and authentication.
 
-    ``auth`` is ``bearer`` or the header that holds the key. ``error_members`` are the members that
-    every error of the provider has, by its documentation: one without them may be a gateway's.
-    ``parameters`` are those that its servers take beside those of the wire format. ``batch`` are
-    the terms of its batch mode. ``model_env`` is the variable that names the model of an entry
-    without a name; a provider with one also lists its models at ``/models``. ``if_nobody`` says
-    what to do where nobody answers.
+    ``auth`` is ``bearer`` or the header of the key. ``error_members`` are the members that every
+    error of the provider has, by its documentation: an error without them may be a gateway's.
+    ``parameters`` are accepted in addition to those of the wire format. ``batch`` are the terms of
+    the batch mode. ``model_env`` is the variable with the model id of an UNNAMED entry; such a
+    provider also lists its models at ``/models``. ``if_nobody`` is the advice for a refused
+    connection.
     """
 
     base_url: str
@@ -340,7 +341,7 @@ for _name, _provider in {
         "LOCAL_BASE_URL",
         ("LOCAL_API_KEY",),
         key_needed=False,
-        # Of vLLM, llama.cpp and Ollama; a server leaves out those that it does not know.
+        # Of vLLM, llama.cpp and Ollama; a server ignores unknown ones.
         parameters=frozenset(
             {"top_k", "min_p", "typical_p", "repeat_penalty", "repetition_penalty", "grammar"}
             | {"structured_outputs", "chat_template_kwargs", "mirostat_mode", "options"}
@@ -362,11 +363,11 @@ for _name, _provider in {
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """Where the calls of one model go.
+    """Destination of one model's calls.
 
-    ``identity`` enters every cache key: the provider's name at its default URL, ``emulator`` for
-    our own server, otherwise the normalised base URL. ``auth_headers`` hold the secret and are
-    neither hashed nor stored. ``place`` is that of its entry.
+    ``identity`` is a part of every cache key: the provider's name at its default URL, ``emulator``
+    for our own server, otherwise the normalised base URL. ``auth_headers`` hold the secret and are
+    neither hashed nor stored. ``place`` is that of the entry.
     """
 
     provider: str
@@ -377,9 +378,9 @@ class Endpoint:
 
 
 def resolve_endpoint(name: str, entry: ModelEntry, env: Mapping[str, str] = os.environ) -> Endpoint:
-    """The endpoint of a model, from its entry and the environment.
+    """Return the endpoint of a model, from its entry and the environment.
 
-    Raises UsageError where a key is needed and none is set, or where one cannot be sent.
+    Raises UsageError for a missing key, and for a key that no header can hold.
     """
     provider = PROVIDERS.require(entry.provider)
     variables = " or ".join(entry.key_envs)
@@ -414,7 +415,7 @@ def endpoint_url(entry: ModelEntry, env: Mapping[str, str] = os.environ) -> str:
 
 
 def model_id(entry: ModelEntry, env: Mapping[str, str] = os.environ) -> str | None:
-    """What is sent as the model, by the entry or the environment; None: the server says it."""
+    """Return the model id to send, from the entry or the environment; None: ask the server."""
     variable = PROVIDERS.require(entry.provider).model_env
     if variable is None or entry.id != UNNAMED:
         return entry.id
@@ -422,7 +423,7 @@ def model_id(entry: ModelEntry, env: Mapping[str, str] = os.environ) -> str | No
 
 
 def endpoint_identity(entry: ModelEntry, env: Mapping[str, str] = os.environ) -> str:
-    """What stands for the endpoint in cache keys; see Endpoint."""
+    """Return the endpoint's identity in cache keys (``Endpoint.identity``)."""
     provider = PROVIDERS.require(entry.provider)
     base_url = endpoint_url(entry, env)
     if entry.provider == "emulator":
@@ -431,9 +432,9 @@ def endpoint_identity(entry: ModelEntry, env: Mapping[str, str] = os.environ) ->
 
 
 def driver_name(model: str, endpoint: str | None) -> str:
-    """How a driver is named: with its endpoint where that is not the provider's own.
+    """Return a driver's name, with its endpoint unless that is the provider's own.
 
-    The macro of this name in schema.sql says the same.
+    The macro of this name in schema.sql is equal.
     """
     host = re.search("://([^/]+)", endpoint or "")
     return f"{model} at {host[1]}" if host else model
@@ -451,17 +452,17 @@ def without_endpoint(driver: str) -> str:
 
 
 def both_sides(model: str) -> dict[Side, str]:
-    """Who drives on each side, by what ``--model`` says: one name, or two that + joins."""
+    """Return the driver of each side by a value of ``--model``: a name, or ``LEFT+RIGHT``."""
     left, _, right = model.partition("+")
     return {"left": left, "right": right or left}
 
 
 def ego_side(sides: Mapping[Side, str], asking: Container[str], opponent: str = "") -> Side:
-    """On which side the ego of a pair sits: the driver whose odds are told, and who is named first.
+    """Return the side of the ego: the focal driver, whose odds ratio is reported, named first.
 
-    It is the one that a study does not call the opponent; else a language model before a program
-    (``asking`` holds those), and of two alike the first in the alphabet. Where both sides have one
-    driver it is the left one. The view ``trial_drivers`` says the same.
+    The ego is the driver that is not the study's opponent; else a language model before a program
+    (``asking`` has the models), else the first in the alphabet. For two equal drivers it is the
+    left one. The view ``trial_drivers`` is equal.
     """
     left, right = sides["left"], sides["right"]
     if left == right or opponent in (left, right):
@@ -472,25 +473,25 @@ def ego_side(sides: Mapping[Side, str], asking: Container[str], opponent: str = 
 
 
 def pair_name(pair: Iterable[str], endpoints: Mapping[str, str]) -> str:
-    """Who drives; from the ego on, as the view ``trial_drivers`` says but for the sample set."""
-    one, other = (driver_name(model, endpoints.get(model)) for model in pair)
-    return one if one == other else f"{one}+{other}"
+    """Return the name of a pair, the ego first, as ``trial_drivers`` without the sample set."""
+    ego, other = (driver_name(model, endpoints.get(model)) for model in pair)
+    return ego if ego == other else f"{ego}+{other}"
 
 
 def key_status(
     entry: ModelEntry, env: Mapping[str, str] = os.environ
 ) -> Literal["set", "missing", "not needed"]:
-    """Whether the environment holds the key that a live run of the model needs."""
+    """Return whether the environment holds the key of a live run of the model."""
     if not PROVIDERS.require(entry.provider).key_needed:
         return "not needed"
     return "set" if any(map(env.get, entry.key_envs)) else "missing"
 
 
 def normalised_url(url: str, named: str = "base_url") -> str:
-    """A base URL in one spelling: lower-case scheme and host, no default port, no last slash.
+    """Return a normalised base URL: lower-case scheme and host, no default port, no last slash.
 
-    Raises UsageError, which shows nothing of it: a key may have been pasted there. It is told apart
-    by what it is ``named``.
+    Raises UsageError with the name of the setting (``named``) and without the URL, since a key may
+    have been pasted there.
     """
     parts = http_url(url.strip())
     if parts is None or "@" in parts.netloc or parts.query or parts.fragment:
@@ -505,7 +506,7 @@ def normalised_url(url: str, named: str = "base_url") -> str:
 
 
 def http_url(url: str) -> SplitResult | None:
-    """The parts of a URL, or None where no host can be reached at it by HTTP."""
+    """Return the parts of an HTTP URL, or None for a URL without a possible host."""
     try:
         parts = urlsplit(url)
         name = parts.hostname or ""
@@ -520,15 +521,14 @@ def http_url(url: str) -> SplitResult | None:
 
 
 def has_screen(env: Mapping[str, str] = os.environ) -> bool:
-    """Whether a browser could open a window here."""
+    """Return whether this machine can open a browser window."""
     return sys.platform == "darwin" or bool(env.get("DISPLAY") or env.get("WAYLAND_DISPLAY"))
 
 
 def state_folder(env: Mapping[str, str] = os.environ) -> Path:
-    """Return the folder of what the program remembers for a user.
+    """Return the program's state folder of the user, in XDG_STATE_HOME or HOME.
 
-    It lies in XDG_STATE_HOME, or else in HOME, and is never relative, or else a working folder
-    could bring its own. Raises UsageError.
+    A relative one is ignored: a working folder could bring its own. Raises UsageError.
     """
     home = Path(env.get("HOME", ""), ".local/state")
     folder = next(filter(Path.is_absolute, (Path(env.get("XDG_STATE_HOME", "")), home)), None)
@@ -538,13 +538,13 @@ def state_folder(env: Mapping[str, str] = os.environ) -> Path:
 
 
 def base_urls(entries: Mapping[str, ModelEntry]) -> dict[str, str]:
-    """The variables of this environment that say where the entries' providers are reached."""
+    """Return the environment variables that set base URLs of the entries' providers."""
     variables = {PROVIDERS.require(entry.provider).base_url_env for entry in entries.values()}
     return {v: os.environ[v] for v in variables if v and os.environ.get(v)}
 
 
 def read_text(path: Path) -> str:
-    """The text of a file, without the byte order mark of Windows editors; raises UsageError."""
+    """Return the text of a file without a byte order mark; raises UsageError."""
     try:
         return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as exc:
@@ -553,7 +553,7 @@ def read_text(path: Path) -> str:
 
 
 def toml_of(text: str, where: str) -> dict[str, Any]:
-    """A TOML text as a dict; raises UsageError, which says ``where`` it stands."""
+    """Return a TOML text as a dict; raises UsageError with its place ``where``."""
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as exc:  # also a number of thousands of digits
@@ -561,7 +561,7 @@ def toml_of(text: str, where: str) -> dict[str, Any]:
 
 
 def validated(model: type[ModelT], value: object, where: str) -> ModelT:
-    """A value as a configuration object; raises UsageError, which says ``where`` it stands."""
+    """Return a value as a configuration object; raises UsageError with its place ``where``."""
     try:
         return model.model_validate(value)
     except ValidationError as exc:
@@ -569,7 +569,7 @@ def validated(model: type[ModelT], value: object, where: str) -> ModelT:
 
 
 def experiments() -> list[Path]:
-    """The folders of studies: that of the working directory goes before what ships."""
+    """Return the folders of studies: that of the working directory, then the shipped one."""
     folders = {path.resolve(): path for path in (SHIPPED_EXPERIMENTS, Path("experiments"))}
     return [path for path in reversed(folders.values()) if path.is_dir()]
 

@@ -1,4 +1,4 @@
-"""Everything that can go wrong, as one tree of exceptions."""
+"""All errors of the program, as one tree of exceptions."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ MOST_NAMES = 40
 
 
 class MergeRunnerError(Exception):
-    """The base of all errors that reach a user as one line; ``exit_code`` is the process's."""
+    """Base of all errors that users see as one line; ``exit_code`` is that of the process."""
 
     exit_code = 1
 
@@ -22,14 +22,14 @@ class UsageError(MergeRunnerError):
 def unknown_name(
     kind: str, name: str, names: Iterable[str], hint: str = "", *, likely: str = ""
 ) -> UsageError:
-    """Return the error for a name that is none of ``names``; it suggests the nearest of them.
+    """Return the error for a name that is not in ``names``; it suggests the nearest of them.
 
-    What is most ``likely`` meant stands before them, and a ``hint`` behind them.
+    The message has the ``likely`` cause before the names, and a ``hint`` after them.
     """
     from difflib import get_close_matches
 
     valid = list(names)
-    # The name of a key has its table before it.
+    # A key's name has its table as a prefix.
     near = get_close_matches(name, valid) or get_close_matches(name.rpartition(".")[2], valid)
     more = f" and {len(valid) - MOST_NAMES} more" if len(valid) > MOST_NAMES else ""
     return UsageError(
@@ -42,7 +42,7 @@ def unknown_name(
 
 
 class SweepStopped(MergeRunnerError):
-    """The whole sweep stops; finished trials and saved replies are kept."""
+    """The sweep stops; finished trials and saved replies are kept."""
 
 
 class EndpointRefused(SweepStopped):
@@ -58,15 +58,15 @@ class QuotaExhausted(SweepStopped):
 
 
 class ProviderDown(SweepStopped):
-    """Nobody listens, or one trial after the other fails and no call is answered between them."""
+    """Connections are refused, or trials fail in a row without a reply in between."""
 
 
 class NoValidDecision(SweepStopped):
-    """The first decisions of a model are all invalid, and the user has not said to go on."""
+    """All first decisions of a model are invalid, and ``--keep-going`` is not set."""
 
 
 class CacheFailed(SweepStopped):
-    """The cache can be neither written nor read, so that no reply could be kept."""
+    """The cache cannot be written or read, so that no reply could be kept."""
 
 
 class TrialSuspended(MergeRunnerError):
@@ -80,8 +80,8 @@ class StoreError(MergeRunnerError):
 
 
 class StoreLocked(StoreError):
-    """Another program holds the database for longer than we wait."""
+    """Another program holds the database longer than the program waits."""
 
 
 class RecordingError(MergeRunnerError):
-    """A recording is damaged, or is not one of ours."""
+    """A recording is damaged, or was not written by merge-runner."""

@@ -1,4 +1,4 @@
-"""Default paths, what ships with the program, and a check before a file is overwritten."""
+"""Default paths, shipped files, and a check before a file is overwritten."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ PROJECT = PACKAGE.parent
 
 
 def shipped(in_wheel: Path, in_checkout: str) -> Path:
-    """Where a file or folder is that ships with the program: in a checkout it is not copied."""
+    """Return the path of a shipped file or folder, in the wheel or in the checkout."""
     return in_wheel if in_wheel.exists() else PROJECT / in_checkout
 
 
@@ -23,9 +23,9 @@ DEFAULT_CACHE = Path("cache/responses")
 
 
 def home_of(study: str) -> Path:
-    """Return the folder of a study's results: that of its file, or of its ``experiments``.
+    """Return the folder of a study's results: that of its file, or the parent of ``experiments``.
 
-    A study of ``experiments`` that goes by its name has its results in the working directory.
+    A study given by name has its results in the working directory.
     """
     if not study.endswith(".toml"):
         return Path()
@@ -35,7 +35,7 @@ def home_of(study: str) -> Path:
 
 
 def command_at(command: str, option: str, place: Path | str, usual: Path) -> str:
-    """Return a command as it is to be typed, with an option where its place is not the usual one.
+    """Return a command to type, with the option unless its path is the ``usual`` one.
 
     >>> command_at("merge-runner audit", "--db", "other.duckdb", DEFAULT_DB)
     'merge-runner audit --db other.duckdb'
@@ -45,12 +45,12 @@ def command_at(command: str, option: str, place: Path | str, usual: Path) -> str
 
 
 def refuse_another_kind(file: Path, begins: bytes, kind: str) -> None:
-    """Raise UsageError where a file exists and does not begin like those of this kind."""
+    """Raise UsageError if a file exists and does not begin like a file of this kind."""
     if not file.is_file():
         return
-    with file.open("rb") as there:
-        found = there.read(len(begins))
-    if found.lower() != begins.lower():
+    with file.open("rb") as existing:
+        head = existing.read(len(begins))
+    if head.lower() != begins.lower():
         raise UsageError(
             f"{file} is there, and is no {kind}: name another file, or remove that one"
         )

@@ -1,4 +1,4 @@
-"""What a driver perceives of the truth: late, with errors, with gaps, and not beyond a range."""
+"""Observation model of a driver: delay, noise, dropout and a limited range."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from merge_runner.config import Perception
 from merge_runner.records import FAR_BEHIND_M, Observation
 
 TOP = 2**31
-"""The error processes last so many milliseconds; time 0 is in the middle."""
+"""Duration of the error processes in ms; time 0 is in the middle."""
 
 
-class Eyes:
-    """The eyes of one driver in one trial, which ``observe`` the truth at a step of the world.
+class NoisyObserver:
+    """Noisy observer of one driver in one trial.
 
-    ``seed`` is that of the driver's seat, so that a slot has the same errors whoever drives.
+    ``true_observation`` returns the noise-free observation at a step of the world. ``seed`` is that
+    of the driver's context: a slot has the same errors whoever drives.
     """
 
     def __init__(
@@ -28,7 +29,7 @@ class Eyes:
         perception: Perception,
         seed: int,
         step_s: float,
-        observe: Callable[[int], Observation],
+        true_observation: Callable[[int], Observation],
     ) -> None:
         self._perception, self._seed, self._step_s = perception, seed, step_s
         self._distance, self._speed, self._own_distance, self._own_speed = (
@@ -40,12 +41,12 @@ class Eyes:
                 ("own speed", perception.speed_sd_mps * perception.own),
             )
         )
-        self._observe, start = observe, observe(0)
+        self._true_observation, start = true_observation, true_observation(0)
         self._received = replace(start, other_seen=self._in_sight(start))
 
-    def told(self, step: int) -> Observation:
-        """What the driver is told at a step, the present one."""
-        now_s, truth = step * self._step_s, self._observe(step)
+    def observe(self, step: int) -> Observation:
+        """Return the driver's observation at the current step."""
+        now_s, truth = step * self._step_s, self._true_observation(step)
         if draw(self._seed, "received", round(1000 * now_s)) >= self._perception.dropout:
             self._received = self._perceived(now_s - self._perception.delay_s)
         own_speed_mps = max(0.0, truth.own_speed_mps + self._own_speed(now_s))
@@ -70,7 +71,7 @@ class Eyes:
         )
 
     def _perceived(self, time_s: float) -> Observation:
-        """The other as it appeared at a time, with its speeds since it came into sight."""
+        """Return the other vehicle as observed at a time, with its speeds since it was in sight."""
         truth = self._at(time_s)
         newest_first = [
             (time_s - steps * self._step_s, speed)
@@ -86,7 +87,7 @@ class Eyes:
         )
 
     def _appears(self, speed_mps: float, time_s: float) -> float:
-        """An error lets no speed appear negative: nobody drives backwards."""
+        # An error makes no speed negative: nobody drives backwards.
         return max(0.0, speed_mps + self._speed(time_s))
 
     def _in_sight(self, truth: Observation) -> bool:
@@ -95,11 +96,11 @@ class Eyes:
         return truth.other_seen and near and to_merge_m <= (self._perception.view_from_m or inf)
 
     def _at(self, time_s: float) -> Observation:
-        """The truth at a time; before the start of control both cruised."""
+        """Return the true observation at a time; before the start of control both cruised."""
         step = round(time_s / self._step_s)
         if step >= 0:
-            return self._observe(step)
-        start = self._observe(0)
+            return self._true_observation(step)
+        start = self._true_observation(0)
         ahead_m = (start.other_speed_mps - start.own_speed_mps) * time_s
         return replace(
             start,
@@ -111,13 +112,13 @@ class Eyes:
 def error_process(
     stream: tuple[object, ...], sd: float, autocorrelation_s: float
 ) -> Callable[[float], float]:
-    """Gaussian errors with exponential autocorrelation (Uhlenbeck and Ornstein, 1930), by time.
+    """Return an Ornstein-Uhlenbeck process: Gaussian errors by time, exponentially autocorrelated.
 
-    The value at a time in s is a function of the ``stream`` and the time alone, to the millisecond:
-    whoever asks, in whatever steps and order, finds the same process. It is laid out by halves
-    (as Levy's construction of Brownian motion is): the process is Markov, so that the value in the
-    middle of two known ones, x to either side, has the mean of both over cosh(x / tau), and the
-    variance sd^2 tanh(x / tau).
+    (Uhlenbeck and Ornstein, 1930.) The value at a time in s depends on the ``stream`` and on the
+    time alone, to the millisecond: any steps in any order give the same process. It is built by
+    bisection, as in Levy's construction of Brownian motion: the process is Markov, so that the
+    value midway between two known ones, x from each, has the mean of their values divided by
+    cosh(x / tau), and the variance sd^2 tanh(x / tau).
     """
 
     @cache
@@ -126,13 +127,13 @@ def error_process(
         chance = NormalDist().inv_cdf(0.5 + (uniform - 0.5) * (1 - 2**-52))
         if place == 0:
             return chance
-        aside = place & -place  # to the neighbours of which it is the middle
-        ratio = aside / (1000 * autocorrelation_s) if autocorrelation_s else inf
+        distance = place & -place  # to the two neighbours that it bisects
+        ratio = distance / (1000 * autocorrelation_s) if autocorrelation_s else inf
         if place == TOP:
             kept = exp(-ratio)
             return kept * standard(0) + sqrt(1 - kept**2) * chance
         variance = tanh(ratio)
-        ends = standard(place - aside) + standard(place + aside)
+        ends = standard(place - distance) + standard(place + distance)
         return ends / 2 * sqrt(1 - variance**2) + sqrt(variance) * chance
 
     return lambda time_s: sd * standard(TOP // 2 + round(1000 * time_s)) if sd else 0.0

@@ -1,4 +1,4 @@
-"""Effect that a study plants in the mock model, to rehearse an analysis on it."""
+"""Planted effects of the emulator, to rehearse an analysis on a known truth."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ Number = Annotated[float, Field(strict=True, ge=-1e6, le=1e6)]
 NotNegative = Annotated[float, Field(strict=True, ge=0, le=1e6)]
 Exponent = Annotated[float, Field(strict=True, ge=-10, le=10)]
 Temperature = Annotated[float, Field(strict=True, ge=0, le=10)]
-# Left out where it is 0, so that the trials of an effect from before it are drawn as they were.
+# Left out if 0, so that random draws of older effects do not change.
 OfOneDriver = Annotated[Number, Field(exclude_if=lambda value: value == 0.0)]
 
 
 class Persona(BaseModel):
-    """Change of the effect by a prompt that contains ``text``: each number is added."""
+    """Changes for prompts that contain the ``text``; each number is added to its namesake."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
@@ -31,15 +31,15 @@ class Persona(BaseModel):
 
 
 class PlantedEffect(BaseModel):
-    """Odds of going first in the mock model, as planted by a study.
+    """Merge-order model of the emulator.
 
-    logit P(left first) = k (x_left_first + x_headway h + x_relative_speed dv): h is the projected
-    headway in m, dv the relative speed in m/s, both left minus right, and
-    k = exp(-x_temperature (T - 1)) at the request's ``temperature`` T. The defaults are those of
-    humans (arXiv 2604.09609, Table III). ``x_noise`` is the standard deviation of noise in the
-    logit of each trial; it lowers the coefficients of a regression. ``x_gap_m`` is added to the gap
-    that both aim at. ``x_own_first`` is added to the log-odds that the asked driver goes first,
-    ``x_other_first`` to those of the other driver.
+    logit P(left first) = k (x_left_first + x_headway h + x_relative_speed dv), where h is
+    the projected headway in m, dv the relative speed in m/s, both left minus right, and
+    k = exp(-x_temperature (T - 1)) at the request's ``temperature`` T. Defaults are those of humans
+    (arXiv 2604.09609, Table III). ``x_noise`` is the standard deviation of the noise on the logit
+    of each trial; it attenuates the coefficients of a regression. ``x_gap_m`` is added to the gap
+    that both drivers aim at. ``x_own_first`` is added to the log-odds that the prompted driver goes
+    first, ``x_other_first`` to those of its opponent.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
@@ -56,9 +56,9 @@ class PlantedEffect(BaseModel):
     temperature: Temperature = 1.0
 
     def before(self, prompt: str, sign: int = 1) -> Self:
-        """Return the effect with the persona of this prompt applied, as the left driver has it.
+        """Return the effect on the reader of a prompt as one of the left driver, personas applied.
 
-        ``sign`` is 1 if the asked driver is on the left and -1 if it is on the right.
+        ``sign`` is 1 if the reader is on the left and -1 on the right.
         """
         persona, added = self.x_persona, {}
         if persona is not None and persona.text in prompt:
@@ -70,12 +70,12 @@ class PlantedEffect(BaseModel):
 
     @property
     def lead(self) -> float:
-        """Log-odds that are added for the asked driver to go first."""
+        """Change of the log-odds that the prompted driver goes first."""
         return self.x_own_first - self.x_other_first
 
     @property
     def coefficients(self) -> tuple[float, float, float]:
-        """Coefficients of the left driver's logit, without noise: intercept, h and dv."""
+        """Coefficients of the left driver's logit without noise: intercept, h, dv."""
         k = math.exp(-self.x_temperature * (self.temperature - 1))
         return k * (self.x_left_first + self.lead), k * self.x_headway, k * self.x_relative_speed
 
@@ -85,7 +85,7 @@ PARAMETERS = frozenset(name for name in PlantedEffect.model_fields if name.start
 
 
 def planted_fields(parameters: dict[str, JsonValue]) -> dict[str, JsonValue]:
-    """Return the parameters of a request that plant an effect; empty if none does."""
+    """Return the parameters of a request that plant an effect; empty without one."""
     planted = {name: value for name, value in parameters.items() if name.startswith(PREFIX)}
     if planted and "temperature" in parameters:
         planted["temperature"] = parameters["temperature"]

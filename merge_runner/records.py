@@ -1,7 +1,7 @@
-"""Frozen records that cross layers, and the hashes under which they are known.
+"""Frozen records that cross layers, with their hashes.
 
-SI units; ``left`` and ``right`` are the two branches. A recorded call may be damaged, or made up:
-it is used only if its content belongs to its key.
+SI units; ``left`` and ``right`` are the two branches. A recorded call may be damaged or forged: it
+is used only if its content matches its key.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 KEY_VERSION = 1
 SPEC_VERSION = 2  # since then one valid array in a reply is enough
-# What reading content of others can raise; RecursionError where JSON is nested deeply.
+# Errors of reading foreign content; RecursionError for deeply nested JSON.
 DAMAGED = (ValueError, TypeError, KeyError, RecursionError)
 LARGEST_STATUS = 999
 _TEXT = re.compile(r'"[^"\\]*(?:\\.[^"\\]*)*"')
@@ -40,38 +40,38 @@ ROADS: tuple[Road, Road] = ("merge", "straight")
 Tactical = Literal["M", "Y"]
 Status = Literal["finished", "collided", "timeout", "failed"]
 
-# The outcomes of an attempt that are answers.
+# Outcomes of an attempt that count as a reply.
 ANSWERS = ("ok", "refusal", "truncated", "empty")
-# The ``failure`` of a decision with a valid plan and without the tactical decision asked for.
+# The ``failure`` of a decision with a valid plan but without the requested tactical decision.
 NO_DECISION = "no_decision"
 SIDES: tuple[Side, Side] = ("left", "right")
 
-# Headers that tell the slot and the attempt to our own emulator, and to nobody else.
+# Headers that pass the slot and the attempt to our own emulator, and to no other server.
 SLOT_HEADER = "x-merge-runner-slot"
 ATTEMPT_HEADER = "x-merge-runner-attempt"
-# A scripted stand-in says what it is in every reply: by this header, and by this field of the body.
+# A mock model marks every reply: by this header, and by this field of the body.
 SCRIPTED_HEADER = "x-merge-runner-scripted"
 SCRIPTED_FIELD = "merge_runner_scripted"
-# By this field it says what it answers, so that a swapped answer is noticed: the hash of the
-# request's body, and the slot if the request named one.
+# The field that identifies the answered request, so that swapped replies are detected: the hash of
+# the request's body, and the slot if the request named one.
 ANSWERED_FIELD = "merge_runner_request"
 
-# What an attempt can have: a recorded one with other values is damaged, or made up.
+# Bounds of an attempt's values: a recorded attempt beyond them is damaged or forged.
 Amount = Annotated[float, Field(ge=0, le=2**31 - 1)]
 Tokens = Annotated[int, Field(ge=0, le=2**33)]
 
 FAR_BEHIND_M = 1000.0
-"""Where the other vehicle is put while it is not seen; see Observation."""
+"""Distance behind the ego at which an unseen vehicle is placed (``Observation``)."""
 
 
 def other_side(side: Side) -> Side:
-    """The side across the road."""
+    """Return the opposite side."""
     return "right" if side == "left" else "left"
 
 
 @dataclass(frozen=True, slots=True)
 class Slot:
-    """Where in a sweep a sample stands: two slots never share a sample by accident.
+    """Position of a sample in a sweep: different slots never share a sample by accident.
 
     ``decision`` counts from 0 within a trial, ``repetition`` from 1, ``sample_set`` from 0.
     """
@@ -83,11 +83,11 @@ class Slot:
     sample_set: Annotated[int, Field(ge=0)]
 
     def __str__(self) -> str:
-        """The slot for a reader."""
+        """Return the slot as text for people."""
         return f"{self.condition} rep {self.repetition} {self.side}, decision {self.decision}"
 
     def as_dict(self) -> dict[str, str | int]:
-        """The slot as plain JSON values, by their names' order."""
+        """Return the slot as JSON values, sorted by name."""
         return {
             "condition": self.condition,
             "decision": self.decision,
@@ -99,17 +99,16 @@ class Slot:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What one driver sees at a decision instant; ``own`` is the ego vehicle.
+    """Observation of one driver at a decision step; ``own`` is the ego vehicle.
 
-    ``relative_distance_m`` is the other's travelled distance minus the own one, so that it is
-    positive while the other is ahead. ``distance_to_merge_m`` is None on the straight road.
-    The histories are oldest first, one value per simulation step: the accelerations that the own
-    vehicle executed, and the speeds at which the other was seen before now. ``own_position_m`` is
-    travelled along the own branch; ``other_acceleration_mps2`` is what the other executed over the
-    last step, 0 before the first. Programs see these two; no prompt tells them.
-    ``other_seen`` is false while the other is out of sight: prompts say so, its history is empty,
-    and a program that does not ask finds a car that cannot matter, FAR_BEHIND_M behind it and as
-    fast as itself.
+    ``relative_distance_m`` is the other's travelled distance minus the ego's: positive while the
+    other is ahead. ``distance_to_merge_m`` is None on the straight road. The histories are oldest
+    first, one value per simulation step: the accelerations that the ego executed, and the other's
+    observed speeds before now. ``own_position_m`` is measured along the ego's branch;
+    ``other_acceleration_mps2`` is that of the other over the last step, 0 before the first. Only
+    programs use these two; no prompt contains them. ``other_seen`` is false while the other is out
+    of sight: prompts say so and its history is empty. For a program that ignores the field, the
+    other is then FAR_BEHIND_M behind the ego and as fast, where it cannot matter.
     """
 
     road: Road
@@ -126,7 +125,7 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """Tokens of one attempt; ``input`` includes the cached ones, ``output`` the reasoning ones."""
+    """Tokens of one attempt; input includes cached tokens, output includes reasoning tokens."""
 
     input_tokens: Tokens | None = None
     cached_input_tokens: Tokens | None = None
@@ -138,12 +137,11 @@ class Usage:
 class Attempt:
     """One HTTP attempt at a call.
 
-    ``outcome`` is ``ok``, ``refusal``, ``truncated`` or ``empty`` for an answer, ``unknown`` where
-    nobody knows what became of the attempt, else the named reason of the failure. ``reply`` is
-    the body as received, None if there was none.
-    ``started_at`` is UTC in ISO 8601. ``scripted`` says that a scripted stand-in answered.
-    ``batch_id`` names the provider's batch that the request was a line of; None: it was sent alone.
-    A line has no latency.
+    ``outcome`` is ``ok``, ``refusal``, ``truncated`` or ``empty`` for a reply, ``unknown`` if the
+    run was killed before the reply, else the name of the failure. ``reply`` is the body as
+    received, None without one. ``started_at`` is UTC in ISO 8601. ``scripted`` is true if a mock
+    model answered. ``batch_id`` is the provider's batch of the request, None for a request of its
+    own; a request in a batch has no latency.
     """
 
     number: Annotated[int, Field(ge=1, le=2**31 - 1)]
@@ -158,17 +156,17 @@ class Attempt:
     error: str | None = None
     cost_usd: Amount | None = None
     scripted: bool = False
-    # Left out where there is none, so that what is kept of other attempts stays as it was.
+    # Left out if None, so that the stored JSON of attempts without a batch does not change.
     batch_id: Annotated[str | None, Field(exclude_if=lambda value: value is None)] = None
 
 
 @dataclass(frozen=True, slots=True)
 class ChatRequest:
-    """One request as it is hashed and sent.
+    """One request, as it is hashed and sent.
 
     ``headers`` are those that change the meaning of the request, never a secret. ``body`` is
-    canonical JSON: the bytes that are hashed are the bytes that are sent. ``model`` is the id
-    asked for; it and ``provider`` are labels, and not hashed by themselves.
+    canonical JSON: the hashed bytes are the bytes that are sent. ``model`` is the requested id; it
+    and ``provider`` are labels and not part of the hash.
     """
 
     key: str
@@ -182,9 +180,9 @@ class ChatRequest:
 
 
 class CallFailed(MergeRunnerError):
-    """A call ended without an answer.
+    """A call ended without a reply.
 
-    ``attempts`` holds what was tried, the first ``earlier`` times by earlier runs.
+    The first ``earlier`` of its ``attempts`` were made by earlier runs.
     """
 
     def __init__(
@@ -199,14 +197,14 @@ class CallFailed(MergeRunnerError):
 
 
 class ReplayMiss(CallFailed):
-    """A sealed replay needs a reply that is not recorded."""
+    """A replay needs a reply that is not recorded."""
 
     exit_code = 4
 
 
 @dataclass(frozen=True, slots=True)
 class ChatReply:
-    """The answer to a call: its text and outcome, and every attempt, the answering one last.
+    """Reply to a call: text, outcome and all attempts, the answered one last.
 
     The first ``earlier`` attempts were made before this run, or for another trial of it.
     """
@@ -219,18 +217,18 @@ class ChatReply:
 
     @property
     def cached(self) -> bool:
-        """Whether the whole call was there already."""
+        """True if all attempts are from earlier runs or other trials."""
         return self.earlier == len(self.attempts)
 
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What a driver decided at one instant.
+    """Decision of a driver at one decision step.
 
-    ``plan`` holds the normalised accelerations of a valid decision over the whole horizon, None
-    where it was invalid; ``applied`` the ones to execute now. ``fallback`` says that ``applied``
-    comes from an older plan, or is 0 because there is none. ``failure`` names why a decision is
-    invalid; ``no_decision`` says that a valid one lacks the tactical decision asked for.
+    ``plan`` holds the normalised accelerations of a valid decision over the whole horizon, None if
+    it was invalid; ``applied`` those to execute now. With ``fallback``, ``applied`` comes from an
+    older plan, or is 0 without one. ``failure`` is the reason why a decision is invalid;
+    ``no_decision`` means that the plan is valid but the requested tactical decision is missing.
     """
 
     plan: tuple[float, ...] | None
@@ -244,7 +242,7 @@ class Decision:
 
     @property
     def valid(self) -> bool:
-        """Whether the driver gave a plan that satisfies the schema."""
+        """True if the plan satisfies the schema."""
         return self.plan is not None
 
 
@@ -252,13 +250,12 @@ class Decision:
 class TrialSpec:
     """One trial to play, or one that humans drove.
 
-    A trial of the source ``first_decision`` ends before its drivers decide again.
-    ``order`` is its place in the sweep: lower goes first. ``scripted`` says that the emulator
-    takes part, a stand-in and no language model. Humans have a ``pair`` and no ``variant``.
-    ``factors`` are the levels of the study's factors, those of ``words`` among them, ``arm`` names
-    their crossing. ``focal`` is the side of the ego where the two drivers are given different
-    things, and ``prompts`` are by side where not both are of the ``variant``. ``kinematics`` are
-    what its condition's name stands for.
+    A trial with the source ``first_decision`` ends before its drivers decide again. ``order`` is
+    its place in the sweep, lowest first. ``scripted`` is true if the emulator takes part, a mock
+    model. Humans have a ``pair`` and no ``variant``. ``factors`` are the levels of the study's
+    factors, including the text factors in ``words``; ``arm`` is their combination. ``focal`` is the
+    ego's side if the two drivers have different texts, parameters or perceptions. ``prompts`` are
+    by side if not both have the ``variant``. ``kinematics`` are the numbers of its condition.
     """
 
     trial_id: str
@@ -283,7 +280,7 @@ class TrialSpec:
 
 @dataclass(frozen=True, slots=True)
 class StateRow:
-    """One vehicle at one sample; the acceleration is the one realised over the step before it."""
+    """One vehicle at one sample; the acceleration is that realised over the step before it."""
 
     step: int
     time_s: float
@@ -295,23 +292,23 @@ class StateRow:
 
 @dataclass(frozen=True, slots=True)
 class DecisionRow:
-    """One decision of one driver, at its number and time in the trial.
+    """One decision of one driver, with its number and time in the trial.
 
-    ``told`` is what the driver was told where its perception is imperfect, None: the truth.
+    ``observed`` is the driver's observation under imperfect perception, None if it was noise-free.
     """
 
     number: int
     time_s: float
     side: Side
     decision: Decision
-    told: Observation | None = None
+    observed: Observation | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class FailedCall:
-    """A call without an answer, and what was tried, the first ``earlier`` times by earlier runs.
+    """Call without a reply; the first ``earlier`` of its attempts were made by earlier runs.
 
-    ``missed`` says that a replay found no reply to it, and did not try.
+    ``missed`` means that a replay had no recorded reply and made no attempt.
     """
 
     number: int
@@ -324,7 +321,7 @@ class FailedCall:
 
 @dataclass(frozen=True, slots=True)
 class TrialRecord:
-    """A played trial with its whole trace."""
+    """Played trial with its trace."""
 
     spec: TrialSpec
     status: Status
@@ -337,28 +334,28 @@ class TrialRecord:
 
     @property
     def calls(self) -> list[ChatReply | FailedCall]:
-        """All calls of its drivers."""
+        """Calls of both drivers."""
         replies = [row.decision.reply for row in self.decisions if row.decision.reply]
         return [*replies, *self.failed_calls]
 
     @property
     def scripted(self) -> bool:
-        """Whether a scripted stand-in drove on a side, or answered any call."""
+        """True if a mock model drove either side or answered any call."""
         return self.spec.scripted or any(
             is_scripted(call.request, attempt) for call in self.calls for attempt in call.attempts
         )
 
 
 def is_scripted(request: ChatRequest, attempt: Attempt) -> bool:
-    """Whether a scripted stand-in answered, whatever base URL or model name was used.
+    """Return whether a mock model answered, whatever base URL or model name was used.
 
-    The body says so even where a recording has lost the header.
+    The body says so even if a recording lost the header.
     """
     return attempt.scripted or request.provider == "emulator" or says_scripted(attempt.reply or "")
 
 
 def says_scripted(body: str) -> bool:
-    """Whether a body has the field at its top; what a model writes in its answer is no field."""
+    """Return whether the body has the field at its top level; a model's text does not count."""
     if SCRIPTED_FIELD in body:
         with suppress(ValueError, RecursionError):
             payload = json.loads(body)
@@ -368,7 +365,7 @@ def says_scripted(body: str) -> bool:
 
 
 def canonical_json(value: object) -> str:
-    """Return the one spelling of a JSON value: sorted keys, no spaces; NaN raises ValueError."""
+    """Return a JSON value as canonical text: sorted keys, no spaces; raises ValueError for NaN."""
     return _CANONICAL.encode(value)
 
 
@@ -394,10 +391,10 @@ def make_request(
 
 
 def call_key(*, endpoint: str, path: str, headers: dict[str, str], body: str, slot: Slot) -> str:
-    """Return the key of a reply: the SHA-256 of one canonical JSON object of all parts.
+    """Return the key of a reply: the SHA-256 of a canonical JSON object of all its parts.
 
-    These are the key version, the endpoint's identity, the path, the headers that change the
-    meaning of a request, its exact ``body``, canonical already, and the slot.
+    The parts are the key version, the endpoint's identity, the path, the headers that change the
+    meaning of the request, its canonical ``body``, and the slot.
     """
     # "body" sorts before the other names and "slot" after them, so that the whole is canonical.
     parts = {"endpoint": endpoint, "headers": headers, "key_version": KEY_VERSION, "path": path}
@@ -407,7 +404,7 @@ def call_key(*, endpoint: str, path: str, headers: dict[str, str], body: str, sl
 
 
 def without_prompt(body: str) -> str:
-    """Return a canonical body without its longest text, which is the prompt."""
+    """Return a canonical body without its longest string, which is the prompt."""
     return body.replace(max(_TEXT.findall(body), key=len, default='""'), '""')
 
 
@@ -415,14 +412,13 @@ def check_call(
     key: str,
     request: ChatRequest,
     attempts: tuple[Attempt, ...],
-    asked: ChatRequest | None = None,
+    expected: ChatRequest | None = None,
 ) -> None:
-    """Raise one of DAMAGED unless a call belongs to its key and its attempts are possible.
+    """Raise one of DAMAGED unless a call matches its key and its attempts are possible.
 
-    The last attempt is the one that was answered. A request equal to the one that is ``asked``
-    needs no key of its own.
+    The last attempt is the answered one. A request equal to the ``expected`` one is not hashed.
     """
-    if request != asked:
+    if request != expected:
         content = call_key(
             endpoint=request.endpoint,
             path=request.path,
@@ -446,15 +442,15 @@ def check_call(
 
 
 def check_body(body: str) -> None:
-    """Raise one of DAMAGED for the body of a request that we would not send."""
+    """Raise one of DAMAGED unless a request's body is a canonical JSON object."""
     value = json.loads(body)
     if not isinstance(value, dict) or canonical_json(value) != body:
         raise ValueError("its request is not a canonical JSON object")
 
 
-@lru_cache(maxsize=1)  # who checks a reply reads it next
+@lru_cache(maxsize=1)  # a reply is read right after its check
 def reply_object(text: str) -> dict[str, Any]:
-    """Return the JSON object of a reply, not to be changed; raises one of DAMAGED."""
+    """Return the JSON object of a reply, shared and read only; raises one of DAMAGED."""
     value = json.loads(text)
     if not isinstance(value, dict):
         raise ValueError("a reply is not a JSON object")

@@ -1,4 +1,4 @@
-"""Whether another model answered than was asked for: decided here, and nowhere else."""
+"""Detection of replies by another model than requested, in one place for all callers."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from merge_runner.text_safety import quoted
 if TYPE_CHECKING:
     import duckdb
 
-# The id that was asked for, and the one that answered.
+# (requested id, served id)
 Pair = tuple[str, str]
-# Those of a database, and the aliases that any of its sweeps declares, as pairs too.
+# Pairs of a database, and the aliases that its sweeps declare, as pairs too.
 PAIRS = """
 SELECT DISTINCT model_requested, model_served FROM calls
 WHERE model_requested IS NOT NULL AND model_served IS NOT NULL ORDER BY ALL
@@ -25,13 +25,13 @@ FROM sweeps, json_each(config, '$.models') ORDER BY ALL
 
 
 def others_among(pairs: Iterable[Pair], aliases: Iterable[Pair]) -> list[Pair]:
-    """Return the pairs in which another model answered; ``aliases`` pair ids with aliases."""
+    """Return the pairs whose served model is neither the requested one nor one of its aliases."""
     declared = {*aliases}
     return [pair for pair in pairs if pair[1] not in (None, pair[0]) and pair not in declared]
 
 
 def other_models(connection: duckdb.DuckDBPyConnection) -> list[Pair]:
-    """Return the pairs of a database in which another model answered."""
+    """Return the pairs (requested, served) of a database in which another model answered."""
     pairs, aliases = (connection.execute(sql).fetchall() for sql in (PAIRS, ALIASES))
     return others_among(pairs, aliases)
 

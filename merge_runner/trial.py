@@ -1,7 +1,7 @@
-"""One trial: both drivers observe the same state, those that are due decide, and time goes on.
+"""Closed loop of one trial: both drivers observe one state, those whose step it is decide.
 
-A trial does no I/O. Programs decide at once; a language model's prompt is a question, which whoever
-plays the trial gets answered: by a server, by a recording, or by a person.
+A trial does no I/O. A program decides at once. A language model's prompt is a question; the caller
+gets the answer from a server, a recording or a person.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from merge_runner.config import PERFECT, ScenarioConfig
 from merge_runner.drivers.base import Driver
 from merge_runner.drivers.language_model import LlmDriver, Question
 from merge_runner.errors import UsageError
-from merge_runner.perception import Eyes
+from merge_runner.perception import NoisyObserver
 from merge_runner.records import (
     SIDES,
     CallFailed,
@@ -32,7 +32,7 @@ from merge_runner.scenarios.merge.world import World
 
 
 class Trial:
-    """A trial under way; it ends with its world, or at the first instant at which a call fails."""
+    """Trial under way; it ends with its world, or at the first decision step with a failed call."""
 
     def __init__(
         self,
@@ -40,9 +40,11 @@ class Trial:
         scenario: ScenarioConfig,
         drivers: Mapping[Side, Driver | LlmDriver],
     ) -> None:
-        # Each side starts as its own driver says, or else as the other's does.
-        given = {side: d.starts for side, d in drivers.items() if hasattr(d, "starts")}
-        starts = {side: given.get(side, other)[side] for other in given.values() for side in SIDES}
+        # A driver may set the start of its side, and of the other side if that driver sets none.
+        by_driver = {side: d.starts for side, d in drivers.items() if hasattr(d, "starts")}
+        starts = {
+            side: by_driver.get(side, other)[side] for other in by_driver.values() for side in SIDES
+        }
         self._spec = spec
         self._world = World(scenario, spec.kinematics, TRACK, starts)
         self._states = {
@@ -54,34 +56,34 @@ class Trial:
         self._rows: list[DecisionRow] = []
 
     def pending(self) -> list[Question]:
-        """Go on to the next instant with questions, and return these; none: the trial has ended.
+        """Advance to the next decision step with questions and return them; none: the trial ended.
 
-        Raises UsageError for a decision of a program that cannot be driven.
+        Raises UsageError if a program's decision cannot be executed.
         """
         while not (self._questions or self._failures or self._world.status):
             for side, state in self._states.items():
                 if state.is_due():
-                    asked = state.ask()
-                    if isinstance(asked, Question):
-                        self._questions.append(asked)
+                    outcome = state.decide()
+                    if isinstance(outcome, Question):
+                        self._questions.append(outcome)
                     else:
-                        self._decided[side] = asked
+                        self._decided[side] = outcome
             if not self._questions:
-                self._go_on()
+                self._advance()
         return self._questions
 
     def answer(self, decisions: Mapping[Side, Decision]) -> None:
-        """Take the decisions on all pending questions but the failed ones, and drive by them."""
+        """Take the decisions for all pending questions except the failed ones, and execute them."""
         self._decided.update(decisions)
         self._questions = []
-        self._go_on()
+        self._advance()
 
     def fail(self, side: Side, error: CallFailed) -> None:
-        """Note that the question of a side has no answer: the trial ends, and is not driven on."""
+        """Note that a side's question has no answer; the trial ends before the next step."""
         self._failures[side] = error
 
     def record(self) -> TrialRecord:
-        """The trial as it was played."""
+        """Return the trial up to now as a record."""
         world, failures = self._world, self._failures
         failed = [side for side in SIDES if side in failures]
         return TrialRecord(
@@ -105,15 +107,15 @@ class Trial:
             ),
         )
 
-    def _go_on(self) -> None:
-        """Drive by what is decided until a driver may decide again."""
+    def _advance(self) -> None:
+        """Execute the decisions until the next decision step of either driver."""
         world, (left, right) = self._world, self._states.values()
         time_s = world.time_s
         for state in (left, right):
             if state.side in self._decided:
                 decision = self._decided.pop(state.side)
                 state.take(decision)
-                row = DecisionRow(state.number, time_s, state.side, decision, state.told)
+                row = DecisionRow(state.number, time_s, state.side, decision, state.observed)
                 self._rows.append(row)
         if not self._failures:
             steps = min(left.steps_left, right.steps_left)
@@ -121,7 +123,7 @@ class Trial:
 
 
 def play_trial(trial: Trial, decide: Callable[[Question], Decision]) -> TrialRecord:
-    """Play a trial to its end with answers that are there already; a CallFailed ends it."""
+    """Play a trial to its end with an answer for each question; a CallFailed ends the trial."""
     while questions := trial.pending():
         decisions: dict[Side, Decision] = {}
         for question in questions:
@@ -135,9 +137,9 @@ def play_trial(trial: Trial, decide: Callable[[Question], Decision]) -> TrialRec
 
 
 class _DriverState:
-    """A driver in its trial: what it decided last, and at which step of the world.
+    """State of a driver in its trial: its last decision and the step of that decision.
 
-    It has ``eyes`` where its perception is imperfect, and was ``told`` what they saw.
+    ``observed`` is its last noisy observation, None under perfect perception.
     """
 
     def __init__(
@@ -146,50 +148,50 @@ class _DriverState:
         self.driver, self.side, self._world = driver, side, world
         self._pace = driver.context.pace
         self._interval = self._pace.interval_steps
-        perception, self._eyes = scenario.perception(side), None
+        perception, self._observer = scenario.perception(side), None
         if perception != PERFECT:
             observe = partial(world.observe, side)
-            self._eyes = Eyes(perception, driver.context.seed, scenario.step_s, observe)
-        self.number = 0  # of its last instant: they count from the start of the trial
-        self.told: Observation | None = None
+            self._observer = NoisyObserver(perception, driver.seat.seed, scenario.step_s, observe)
+        self.number = 0  # of the last decision step, counted from the start of the trial
+        self.observed: Observation | None = None
         self._driven: list[float] | None = None  # by step since the decision
         self._decided_at = 0
         self._in_control = False
 
     @property
     def steps_left(self) -> int:
-        """The steps of the world until its next instant."""
+        """Number of the world's steps until its next decision step."""
         return self._interval - self._world.step % self._interval
 
     def is_due(self) -> bool:
-        """Whether it decides now: it is in control, from some time on for good."""
+        """Return whether it decides now. Once in control, it stays in control."""
         self._in_control = self._in_control or self._world.in_control(self.side)
         return self._in_control and self._world.step % self._interval == 0
 
-    def ask(self) -> Decision | Question:
-        """What the driver decides, or asks a model."""
+    def decide(self) -> Decision | Question:
+        """Return the decision of a program, or the question to a language model."""
         self.number = self._world.step // self._interval
-        self.told = self._eyes.told(self._world.step) if self._eyes else None
-        observation = self.told or self._world.observe(self.side)
-        asked = self.driver.decide(observation, self.number)
-        return asked if isinstance(asked, Question) else _decided(asked, self.side)
+        self.observed = self._observer.observe(self._world.step) if self._observer else None
+        observation = self.observed or self._world.observe(self.side)
+        outcome = self.driver.decide(observation, self.number)
+        return outcome if isinstance(outcome, Question) else _decided(outcome, self.side)
 
     def take(self, decision: Decision) -> None:
-        """Drive by a decision from now on; raises UsageError for one that cannot be driven."""
-        applied, wanted = decision.applied, self._pace.executed_actions
+        """Execute a decision from now on; raises UsageError for one that cannot be executed."""
+        applied, expected = decision.applied, self._pace.executed_actions
         driven: list[float] = []
         for action in applied:
             if -1 <= action <= 1:
                 driven += [action] * self._pace.action_steps
-        if len(applied) != wanted or len(driven) != self._interval:
+        if len(applied) != expected or len(driven) != self._interval:
             raise UsageError(
-                f"the {self.side} driver decided on {applied}, and is to drive {wanted} actions "
+                f"the {self.side} driver decided on {applied}, and is to drive {expected} actions "
                 "from -1 to 1"
             )
         self._driven, self._decided_at = driven, self._world.step
 
     def actions(self, steps: int) -> list[float] | list[None]:
-        """What is driven in the next steps; None: nothing is decided yet, and it cruises."""
+        """Return the actions of the next steps; None: no plan yet, constant speed."""
         if self._driven is None:
             return [None] * steps
         since = self._world.step - self._decided_at
@@ -197,7 +199,7 @@ class _DriverState:
 
 
 def _decided(deciding: Coroutine[Any, Any, Decision], side: Side) -> Decision:
-    """What an ``async def decide`` returns, which waits for nothing; raises UsageError."""
+    """Return the result of an ``async def decide`` that awaits nothing; raises UsageError."""
     try:
         deciding.send(None)
     except StopIteration as end:

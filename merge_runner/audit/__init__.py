@@ -1,1 +1,1 @@
-"""Checks that what is stored is what was asked, answered and driven, and each sample only once."""
+"""Consistency checks of stored requests, replies and states, and of unique samples."""

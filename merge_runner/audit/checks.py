@@ -1,4 +1,4 @@
-"""Audits by SQL alone (checks.sql): of one sweep, of what belongs to none, and of a recording."""
+"""Audits in SQL (checks.sql): of a sweep, of orphan rows, and of a recording."""
 
 from __future__ import annotations
 
@@ -38,17 +38,17 @@ CREATE OR REPLACE TEMP TABLE audited AS
 SELECT trial_id, spec_hash FROM linked SEMI JOIN trials USING (trial_id, spec_hash)
 ANTI JOIN done USING (trial_id, spec_hash)
 """
-# Where the formats have the answer.
+# Members of a reply that hold the model's answer, over all wire formats.
 ANSWERS = ("choices", "output", "candidates", "content")
 MOST_INVALID_SHARE = 0.2
-# One row a trial that ended and a model that was asked in it. An invalid decision is a fallback.
+# One row per ended trial and called model. An invalid decision is a fallback.
 ASKED_DECISIONS = """
 SELECT trial_id, spec_hash, if(side = 'left', model_left, model_right) AS model,
     count(*) AS asked, count(*) FILTER (NOT valid) AS invalid
 FROM decisions JOIN trials USING (trial_id, spec_hash)
 WHERE call_key IS NOT NULL AND status <> 'failed' GROUP BY ALL
 """
-# How many decisions of each driver, prompt and model that was asked are invalid.
+# Invalid decisions by driver, prompt and called model.
 DECIDED = f"""
 SELECT driver || '/' || variant, model, sum(invalid)::BIGINT, sum(asked)::BIGINT
 FROM ({ASKED_DECISIONS}) JOIN (SELECT trial_id, spec_hash, variant FROM trials)
@@ -56,7 +56,7 @@ FROM ({ASKED_DECISIONS}) JOIN (SELECT trial_id, spec_hash, variant FROM trials)
 JOIN trial_drivers USING (trial_id, spec_hash) SEMI JOIN audited USING (trial_id, spec_hash)
 GROUP BY driver, variant, model, spec_hash ORDER BY ALL
 """  # noqa: S608 # constants
-# Of one sweep, or of all.
+# Calls of one sweep, or of all.
 AUDITED_CALLS = """
 calls WHERE ($sweep_id IS NULL OR (trial_id, spec_hash) IN
     (SELECT (trial_id, spec_hash) FROM sweep_trials WHERE sweep_id = $sweep_id))
@@ -65,16 +65,16 @@ PLACES = f"SELECT rowid FROM {AUDITED_CALLS} ORDER BY rowid"  # noqa: S608 # con
 REPLIES = f"""
 SELECT rowid, reply::VARCHAR FROM {AUDITED_CALLS} AND rowid BETWEEN $first AND $last
 """  # noqa: S608 # constants
-OF_CALLS = ("served_findings", "attempt_findings", "exchanged_findings", "shared_findings")
-BATCH = 100
+CALL_FINDINGS = ("served_findings", "attempt_findings", "exchanged_findings", "shared_findings")
+ENTRIES_AT_ONCE = 100
 SHOWN = 20
 REPLIES_AT_ONCE = 4_000
-NEVER = datetime(1970, 1, 1)  # noqa: DTZ001 # as the database has all times
+NEVER = datetime(1970, 1, 1)  # noqa: DTZ001 # times of the database have no zone
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that does not hold, and where; docs/recordings.md lists the kinds."""
+    """Violation of a check, with its place; docs/recordings.md lists the kinds."""
 
     kind: str
     text: str
@@ -91,10 +91,10 @@ class Finding:
 
 @dataclass(slots=True)
 class Audit:
-    """What was checked of ``subject``: a sweep, a database, a recording or a cache.
+    """Audit of ``subject``: a sweep, a database, a recording or a cache.
 
-    The checks add to it. ``counts`` say how much was checked, in the order of checking; of a sweep
-    among them ``missing`` and ``failed`` trials. All holds where there is no finding.
+    ``counts`` are the numbers of checked items, in the order of the checks; for a sweep they
+    include ``missing`` and ``failed`` trials. The audit passes without a finding.
     """
 
     subject: str
@@ -104,15 +104,15 @@ class Audit:
 
     @property
     def ok(self) -> bool:
-        """Whether all holds."""
+        """True without a finding."""
         return not self.findings
 
     def as_dict(self) -> dict[str, Any]:
-        """The audit as JSON values."""
+        """Return the audit as JSON values."""
         return {**asdict(self), "ok": self.ok}
 
     def lines(self) -> Iterator[str]:
-        """The audit for a reader, with the first findings."""
+        """Yield the audit as lines of text, with the first findings."""
         number = len(self.findings)
         yield f"{self.subject}: " + (f"{number} findings" if number else "all holds")
         yield "  checked: " + ", ".join(f"{n} {name}" for name, n in self.counts.items())
@@ -126,9 +126,9 @@ class Audit:
 def audited_database(
     path: Path, sweep_id: str | None = None
 ) -> Iterator[duckdb.DuckDBPyConnection]:
-    """Open a database with the views of checks.sql; raises UsageError or StoreError.
+    """Open a database with the views of checks.sql and the replies of one sweep, or of all.
 
-    Replies are read of one sweep, or of all.
+    Raises UsageError or StoreError.
     """
     try:
         with read_database(path) as connection:
@@ -140,24 +140,25 @@ def audited_database(
 
 
 def prepare(connection: duckdb.DuckDBPyConnection, sweep_id: str | None = None) -> None:
-    """Make the views of checks.sql, and read the ids of the replies of a sweep, or of all."""
+    """Create the views of checks.sql, and read the reply ids of a sweep, or of all."""
     make_views(connection)
     append(connection, "other_models", other_models(connection))
-    of = {"sweep_id": sweep_id}
-    places = [place for (place,) in connection.execute(PLACES, of).fetchall()]
-    for first in range(0, len(places), REPLIES_AT_ONCE):  # what they tell lies in memory meanwhile
+    parameters = {"sweep_id": sweep_id}
+    places = [place for (place,) in connection.execute(PLACES, parameters).fetchall()]
+    for first in range(0, len(places), REPLIES_AT_ONCE):  # a chunk is in memory at once
         last = min(first + REPLIES_AT_ONCE, len(places)) - 1
-        between = {**of, "first": places[first], "last": places[last]}
-        some = connection.execute(REPLIES, between).fetchall()
-        append(connection, "told", [row for each in some if (row := _told(*each))])
+        span = {**parameters, "first": places[first], "last": places[last]}
+        replies = connection.execute(REPLIES, span).fetchall()
+        rows = [row for place, reply in replies if (row := _reply_contents(place, reply))]
+        append(connection, "reply_contents", rows)
     connection.execute("INSERT INTO reply_ids FROM identified")
 
 
-def _told(place: int, reply: str | None) -> tuple[int, str | None, str, str] | None:
-    """Return what a reply tells: its id, a hash of its answer, and what it says that it answers.
+def _reply_contents(place: int, reply: str | None) -> tuple[int, str | None, str, str] | None:
+    """Return a row of ``reply_contents``: the reply's id, a hash of its answer, its request.
 
-    What is beside the answer, such as a time, may differ in a copy. In an unknown format everything
-    counts: else any two of its answers would be equal.
+    Members other than the answer, such as a time, may differ in a copy. In an unknown format the
+    hash covers the whole body: else all its answers would be equal.
     """
     try:
         body = json.loads(reply or "")
@@ -165,8 +166,8 @@ def _told(place: int, reply: str | None) -> tuple[int, str | None, str, str] | N
         return None
     if not isinstance(body, dict):
         return None
-    found = body.get("id") or body.get("responseId")
-    reply_id = found.encode(errors="replace").decode() if isinstance(found, str) else None
+    member = body.get("id") or body.get("responseId")
+    reply_id = member.encode(errors="replace").decode() if isinstance(member, str) else None
     known = (body[name] for name in ANSWERS if body.get(name) is not None)
     answer = json.dumps(next(known, body)).encode()
     content = hashlib.blake2b(answer, digest_size=16).hexdigest()
@@ -174,12 +175,12 @@ def _told(place: int, reply: str | None) -> tuple[int, str | None, str, str] | N
 
 
 def make_views(connection: duckdb.DuckDBPyConnection) -> None:
-    """Make the views of checks.sql, of which ``alike`` reads ``audited`` alone."""
+    """Create the views of checks.sql; ``alike`` needs only the table ``audited``."""
     connection.execute(files("merge_runner.audit").joinpath("checks.sql").read_text("utf-8"))
 
 
 def audit_sweep(path: Path, sweep_id: str, planned: Sequence[TrialKey], *, finished: bool) -> Audit:
-    """Audit a sweep that has just been played by its own replies; see ``check_sweep``."""
+    """Audit a sweep after its run (``check_sweep``)."""
     with audited_database(path, sweep_id) as connection:
         return check_sweep(connection, sweep_id, planned, finished=finished)
 
@@ -191,17 +192,17 @@ def check_sweep(
     *,
     finished: bool,
 ) -> Audit:
-    """Audit the trials of a sweep that were not audited with another one.
+    """Audit the trials of a sweep that were not audited with an earlier one.
 
-    ``planned`` is empty where the sweep's trials are not known. In a sweep that claims to have
-    ``finished``, missing and failed trials are findings; in another one they are a note.
+    ``planned`` is empty if the sweep's trials are not known. Missing and failed trials are findings
+    in a ``finished`` sweep, and a note in an unfinished one.
     """
     connection.execute("DELETE FROM subject; DELETE FROM planned")
     append(connection, "subject", [(sweep_id, finished, bool(planned))])
     append(connection, "planned", planned)
     connection.execute(AUDITED)
     counts = {"trials": len(planned), **next(by_name(connection.execute("FROM counts")))}
-    views = ("list_findings", "state_findings", *OF_CALLS)
+    views = ("list_findings", "state_findings", *CALL_FINDINGS)
     findings = _findings(connection, views, sweep_id)
     audit = Audit(sweep_id, counts, findings, [*_notes(connection)])
     connection.execute("INSERT INTO done FROM audited")
@@ -209,7 +210,7 @@ def check_sweep(
 
 
 def check_rest(connection: duckdb.DuckDBPyConnection, path: Path) -> Audit:
-    """Audit what a database holds beside and between its sweeps."""
+    """Audit a database for orphan rows, and note calls that sweeps share."""
     connection.execute(
         "CREATE OR REPLACE TEMP TABLE audited AS SELECT trial_id, spec_hash FROM trials"
     )
@@ -226,7 +227,7 @@ def check_rest(connection: duckdb.DuckDBPyConnection, path: Path) -> Audit:
 def _findings(
     connection: duckdb.DuckDBPyConnection, views: Iterable[str], sweep_id: str | None = None
 ) -> list[Finding]:
-    """What the views hold, read one by one: as one query they would hold their memory together."""
+    """Return the rows of the views, one query each: a joint query would need their joint memory."""
     selects = (f"SELECT DISTINCT * FROM {view} ORDER BY ALL" for view in views)  # noqa: S608 # constants
     rows = [row for select in selects for row in by_name(connection.execute(select))]
     return [
@@ -238,12 +239,12 @@ def _findings(
 def _notes(connection: duckdb.DuckDBPyConnection) -> Iterator[str]:
     yield from (text for (text,) in connection.execute("FROM notes").fetchall())
     for group, model, invalid, asked in connection.execute(DECIDED).fetchall():
-        if why := not_judged(model, invalid, asked):
-            yield f"{group}: {why}"
+        if reason := not_judged(model, invalid, asked):
+            yield f"{group}: {reason}"
 
 
 def not_judged(model: str, invalid: int, asked: int) -> str:
-    """Why nothing is concluded from a model's trials; empty where few enough are invalid."""
+    """Return why a model is not judged; "" for a share of invalid decisions within the limit."""
     if invalid <= MOST_INVALID_SHARE * asked:
         return ""
     return (
@@ -253,9 +254,9 @@ def not_judged(model: str, invalid: int, asked: int) -> str:
 
 
 def audit_recording(file: Path) -> Audit:
-    """Audit a recording; one that is damaged is a finding. Raises UsageError without a file.
+    """Audit a recording; damage is a finding. Raises UsageError without a file.
 
-    Its calls become those of a database in memory, and the checks of a database read them.
+    Its calls are written into a database in memory, with the checks of a database.
     """
     with in_memory(SETTINGS) as connection:
         connection.execute(schema_sql())
@@ -266,35 +267,37 @@ def audit_recording(file: Path) -> Audit:
             return Audit(str(file), findings=[Finding("recording", str(exc))])
         configs = (canonical_json({"models": sweep.models}) for sweep in sweeps)
         rows = ((n, "", NEVER, None, None, c, None, None, "{}") for n, c in enumerate(configs))
-        append(connection, "sweeps", rows)  # of which the aliases of models are read
+        append(connection, "sweeps", rows)  # for the aliases of models
         prepare(connection)
         connection.execute("INSERT INTO audited SELECT trial_id, spec_hash FROM trials")
         columns = 'calls, attempts, "reply ids"'
         counts = next(by_name(connection.execute(f"SELECT {columns} FROM counts")))  # noqa: S608 # constants
-        findings = _findings(connection, OF_CALLS)
+        findings = _findings(connection, CALL_FINDINGS)
         return Audit(str(file), counts, findings, notes=[*_notes(connection)])
 
 
 def _fill(connection: duckdb.DuckDBPyConnection, entries: Iterator[CachedCall]) -> None:
     """Fill the tables with the calls of a recording.
 
-    A spec stands for an endpoint, and a trial for a repetition of a condition: a recording does not
-    say which prompt variant a call was made for.
+    Each endpoint becomes a spec, and each repetition of a condition a trial: a recording does not
+    have the prompt variant of a call.
     """
     specs: dict[str, str] = {}
     trials: dict[TrialKey, Row] = {}
-    while batch := list(islice(entries, BATCH)):
+    while chunk := list(islice(entries, ENTRIES_AT_ONCE)):
         rows: list[Row] = []
-        for entry in batch:
+        for entry in chunk:
             slot, endpoint = entry.request.slot, entry.request.endpoint
             specs[endpoint] = canonical_json({side: {"endpoint": endpoint} for side in SIDES})
-            set_ = f"/set{slot.sample_set}" if slot.sample_set else ""
-            key = (f"{slot.condition}/rep{slot.repetition:02d}{set_}", endpoint)
+            suffix = f"/set{slot.sample_set}" if slot.sample_set else ""
+            key = (f"{slot.condition}/rep{slot.repetition:02d}{suffix}", endpoint)
             trials[key] = (
                 *(*key, None, "llm", None, None, None, slot.condition, 0.0, 0.0),
                 *(slot.repetition, slot.sample_set, "finished", None, 0.0, None, False, None),
             )
-            rows += [call_row(key, entry.request, each, cached=True) for each in entry.attempts]
+            rows += [
+                call_row(key, entry.request, attempt, cached=True) for attempt in entry.attempts
+            ]
         append(connection, "calls", rows)
     append(connection, "specs", specs.items())
     append(connection, "trials", trials.values())

@@ -56,7 +56,7 @@ def read_entries(path: Path) -> dict[str, ModelEntry]:
     """
     tables = toml_of(read_text(path), str(path)).items()
     return {
-        name: validated(ModelEntry, table, f"{path}: [{name}]").standing_at(f"[{name}] in {path}")
+        name: validated(ModelEntry, table, f"{path}: [{name}]").with_place(f"[{name}] in {path}")
         for name, table in tables
     }
 
@@ -107,7 +107,7 @@ def with_parameter(name: str, entry: ModelEntry, parameter: str, level: JsonValu
     """
     if parameter == CAP:
         capped = validated(ModelEntry, {**dict(entry), CAP: level}, name)
-        return capped.standing_at(entry.place)
+        return capped.with_place(entry.place)
     if parameter == EFFORT and entry.efforts:
         if level not in entry.efforts:
             raise unknown_name(f"{EFFORT} of {name}", str(level), entry.efforts)

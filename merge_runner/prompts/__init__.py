@@ -1,1 +1,1 @@
-"""From an observation to the prompt, and from a reply's text to a validated plan."""
+"""Prompts from observations, and validated plans from replies."""

@@ -1,14 +1,13 @@
-"""The prompt as named text blocks, C0 to C5 (arXiv 2604.09609, Table II), and its variants.
+"""Prompt as named text blocks, C0 to C5 (arXiv 2604.09609, Table II), and its variants.
 
 The paper's own wording is not public: this is a reconstruction from its description. A variant is
-the baseline without some blocks and with some others, so that it changes nothing else.
+the baseline without some blocks and with others, and changes nothing else.
 
-A study's factors of words go on from there: their levels add, replace and remove blocks of any
-variant, whose name is then composed: ``A1 hurry=yes``.
+The levels of a study's text factors add, replace and remove blocks of any variant. The variant then
+has a composed name: ``A1 hurry=yes``.
 
-Numbers have two decimals, in m, s, m/s and m/s^2, or in the unit of their name; lists are those of
-Python. What is about the other car is "not seen" while that is so, and without the unit that a
-template has behind it.
+Numbers have two decimals, in m, s, m/s and m/s^2, or in the unit of their name; lists have Python's
+syntax. A value of an unseen car is "not seen", without the unit after it in a template.
 """
 
 from __future__ import annotations
@@ -38,9 +37,9 @@ MPH_OF_MPS = 3600 / 1609.344  # the international mile of 1959
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """What a prompt is about; ``plan`` is the rest of the last valid one, None before the first.
+    """Situation of a prompt; ``plan`` is the rest of the last valid plan, None before the first.
 
-    ``first`` says that the driver has not decided before.
+    ``first`` is true at the driver's first decision.
     """
 
     seen: Observation
@@ -49,19 +48,19 @@ class Situation:
     first: bool
 
     def of_other(self, value: float) -> str:
-        """A number about the other car, which may be out of sight."""
+        """Return a value of the other car as text, or "not seen"."""
         return decimal(value) if self.seen.other_seen else NOT_SEEN
 
 
 def _own_accelerations(now: Situation) -> str:
-    """The means of the world's samples over each action, the last of which ends now."""
+    """Return the mean acceleration over each action; the last action ends now."""
     values, every = now.seen.own_accelerations_mps2, now.task.action_steps
     starts = range(len(values) % every, len(values), every)
     return listing(values if every == 1 else [fmean(values[i : i + every]) for i in starts])
 
 
 def _other_speeds(now: Situation) -> str:
-    """One of the world's samples for each action; the last of them is one action before now."""
+    """Return one observed speed for each action; the last is from one action before now."""
     if not now.seen.other_seen:
         return NOT_SEEN
     values, every = now.seen.other_speeds_mps, now.task.action_steps
@@ -86,11 +85,11 @@ FIELDS: Mapping[str, Callable[[Situation], str]] = {
     "other_speed_kmh": lambda now: now.of_other(now.seen.other_speed_mps * KMH_OF_MPS),
     "own_speed_mph": lambda now: decimal(now.seen.own_speed_mps * MPH_OF_MPS),
     "other_speed_mph": lambda now: now.of_other(now.seen.other_speed_mps * MPH_OF_MPS),
-    # Own minus other.
+    # Own minus other's.
     "relative_speed": lambda now: now.of_other(now.seen.own_speed_mps - now.seen.other_speed_mps),
-    # How far the other car is ahead, negative if it is behind.
+    # Distance to the other car, negative if it is behind.
     "relative_distance": lambda now: now.of_other(now.seen.relative_distance_m),
-    # Before the merge point alone.
+    # Only before the merge point.
     "distance_to_merge": lambda now: decimal(now.seen.distance_to_merge_m or 0.0),
     "own_accelerations": _own_accelerations,
     "other_speeds": _other_speeds,
@@ -106,12 +105,12 @@ FIELDS: Mapping[str, Callable[[Situation], str]] = {
 
 
 def decimal(value: float) -> str:
-    """Two decimals, and never a negative zero."""
+    """Return a number with two decimals, without a negative zero."""
     return f"{value:.2f}".replace("-0.00", "0.00")
 
 
 def listing(values: Iterable[float]) -> str:
-    """Values as a Python list of two decimals."""
+    """Return values as a Python list with two decimals."""
     return f"[{', '.join([f'{value:.2f}' for value in values])}]".replace("-0.00", "0.00")
 
 
@@ -119,11 +118,11 @@ def listing(values: Iterable[float]) -> str:
 class Block:
     """One paragraph of the prompt.
 
-    ``meaning`` says in a few words what it is for. ``merge`` and ``straight`` are its templates
-    before and after the merge point, None where it is left out. Those of the paper have no
-    ``before``: they are in the prompt of every variant that does not remove them, as they are
-    registered. Any other stands before the block ``before`` in those variants that add it. Raises
-    UsageError where a template names what there is not.
+    ``meaning`` is its purpose in a few words. ``merge`` and ``straight`` are its templates before
+    and after the merge point, None: no paragraph there. The paper's blocks have no ``before``: they
+    are in every variant that does not remove them, in the order of registration. Any other block
+    comes before the block ``before`` in the variants that add it. Raises UsageError for an unknown
+    template variable.
     """
 
     meaning: str
@@ -140,25 +139,22 @@ class Block:
 
     @property
     def digest(self) -> str:
-        """Its ``digest_of``: its meaning is for readers alone."""
+        """Hash of the templates and the position, without the meaning (``digest_of``)."""
         return digest_of(self.merge, self.straight, self.before)
 
 
 def digest_of(merge: str | None, straight: str | None, before: str | None) -> str:
-    """SHA-256 of a block's templates, and of where it stands if that is not its place in the paper.
-
-    They may be any text here.
-    """
+    """Return the SHA-256 of a block's templates, and of its position unless it is the paper's."""
     place = "" if before is None else f"\0{before}"
     return hashlib.sha256(f"{merge}\0{straight}{place}".encode()).hexdigest()
 
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """The baseline without the blocks that it ``removes``, and with those that it ``adds``.
+    """Prompt variant: the baseline without the blocks ``removes``, with the blocks ``adds``.
 
-    Tables and figures show its ``title``, or its name where that is empty. One that a study makes
-    holds all its ``blocks`` in order.
+    Tables and figures show its ``title``, by default its name. A variant of a study has all its
+    ``blocks`` in order.
     """
 
     removes: frozenset[str] = frozenset()
@@ -168,10 +164,10 @@ class Variant:
 
 
 def named(template: str) -> list[str]:
-    """What a template names in braces; raises UsageError."""
+    """Return the template variables (names in braces); raises UsageError."""
     try:
         parts = [part for part in Formatter().parse(template) if part[1] is not None]
-        # Fields are texts already; a width could be so large that it fills the memory.
+        # Fields are texts; a large width could fill the memory.
         if any(spec or conversion for _, _, spec, conversion in parts):
             raise ValueError("a field stands alone in its braces")
     except ValueError as exc:
@@ -205,7 +201,7 @@ _SITUATIONS = (
 
 
 def _tabled(situation: str) -> str:
-    """The same with its list as a table."""
+    """Return a situation with its list as a table."""
     introduction, *items = situation.split("\n- ")
     rows = (re.sub(r"(.*): (\S+) ?(.*)", r"| \1 | \2 | \3 |", item) for item in items)
     return "\n".join([introduction, "| quantity | value | unit |", "|---|---|---|", *rows])
@@ -247,7 +243,7 @@ _GAP = "Time gap (how long the car behind takes to where the car ahead is now): 
 _KMH = "In km/h: your speed is {own_speed_kmh}, the speed of the other car {other_speed_kmh}"
 _MPH = "In mph: your speed is {own_speed_mph}, the speed of the other car {other_speed_mph}"
 
-# The name, the meaning, and a text for both roads, or one for each.
+# Name, meaning, and a text for both roads, or one for each.
 _PAPER = (
     ("C0", "situation", *_SITUATIONS),
     ("C1", "history", _HISTORY),
@@ -297,33 +293,30 @@ for _name, _removed, _title in (
 
 Rewording = Callable[[Mapping[str, Block]], dict[str, Block]]
 WORDS = Registry[Mapping[str, Rewording]]("factor of words")
-"""What the levels of a study's factors of words do to the blocks of a prompt, by factor and level.
-
-A level that leaves the prompt as it is has none.
-"""
+"""Changes of a prompt's blocks by text factor and level; a level without a text has none."""
 
 
 def composed(variant: str, words: Iterable[str]) -> str:
-    """Return the name of a variant with these levels of words: ``A1 hurry=yes``."""
+    """Return the name of a variant with these text levels: ``A1 hurry=yes``."""
     names = [name for name in (variant, *words) if name != BASELINE]
     return " ".join(names) or BASELINE
 
 
 def decomposed(variant: str) -> tuple[str, list[str]]:
-    """Return the variant that a composed one is made from, and its levels of words, in order."""
+    """Return the base variant of a composed one, and its text levels in order."""
     names = variant.split(" ")
     words = [name for name in names if "=" in name]
     return (BASELINE if len(words) == len(names) else names[0]), words
 
 
 def title_of(variant: str) -> str:
-    """How tables and figures name a variant, which need not be registered here any more."""
+    """Return the name of a variant in tables and figures; it need not be registered."""
     known = VARIANTS.get(variant)
     return (known and known.title) or variant
 
 
 def blocks_of(variant: str) -> dict[str, Block]:
-    """The blocks of a variant by name, in the order of its prompt; raises UsageError."""
+    """Return the blocks of a variant by name, in the prompt's order; raises UsageError."""
     prompt, words = decomposed(variant)
     blocks = _variant_blocks(prompt)
     for word in words:
@@ -331,7 +324,7 @@ def blocks_of(variant: str) -> dict[str, Block]:
         blocks = require(WORDS.require(factor), f"level of {factor}", level)(blocks)
     if not words:
         return blocks
-    # So that the hash of each added block says what follows it, whatever was added later.
+    # The hash of an added block covers the block after it, also one that was added later.
     following = [*list(blocks)[1:], LAST]
     return {
         name: block if block.before is None else replace(block, before=after)
@@ -347,7 +340,7 @@ def _variant_blocks(variant: str) -> dict[str, Block]:
         require(known, BLOCKS.kind, name, f"the variant {variant} names it")
     paper = {name: block for name, block in known.items() if block.before is None}
     blocks = {name: block for name, block in paper.items() if name not in chosen.removes}
-    # In the order of names, which is that of no import.
+    # In the order of names, independent of imports.
     for name in sorted(chosen.adds - blocks.keys()):
         blocks = with_block(blocks, name, known[name])
     return {name: known[name] for name in blocks}
@@ -362,30 +355,30 @@ def with_block(
     after: bool = False,
     earlier: Collection[str] = (),
 ) -> dict[str, Block]:
-    """The blocks of a prompt and one more, before or ``after`` its anchor.
+    """Return the blocks of a prompt with a further block, before or ``after`` its anchor.
 
-    After an anchor it stands behind what levels of words, or ``earlier`` prompts, added there.
-    Without an anchor it stands where it says itself, or before the first block of the paper that
-    follows there; else at the end. Raises UsageError for a place that there is not.
+    After an anchor it follows the blocks that text levels, or ``earlier`` prompts, added there.
+    Without an anchor it precedes its ``before``, or the next block of the paper that is present;
+    else it is last. Raises UsageError for an unknown position.
     """
     if anchor is None and block.before is not None:
-        paper = {each: known for each, known in BLOCKS.items() if known.before is None}
+        paper = {key: known for key, known in BLOCKS.items() if known.before is None}
         require(paper, f"place of the prompt block {name}, before", block.before)
-        later = dropwhile(lambda each: each != block.before, paper)
-        anchor = next((each for each in later if each in blocks), None)
+        later = dropwhile(lambda key: key != block.before, paper)
+        anchor = next((key for key in later if key in blocks), None)
     names = list(blocks)
-    place = len(names) if anchor is None else names.index(anchor) + after
-    added_there = {*earlier, *(each for each in names if "=" in each)}  # as ``hurry=yes.1``
-    while after and place < len(names) and names[place] in added_there:
-        place += 1
-    # Where it stands is a part of its hash.
-    added = replace(block, before=[*names, LAST][place])
-    names.insert(place, name)
-    return {each: blocks.get(each, added) for each in names}
+    index = len(names) if anchor is None else names.index(anchor) + after
+    added_before = {*earlier, *(key for key in names if "=" in key)}  # as ``hurry=yes.1``
+    while after and index < len(names) and names[index] in added_before:
+        index += 1
+    # The position is a part of the hash.
+    added = replace(block, before=[*names, LAST][index])
+    names.insert(index, name)
+    return {key: blocks.get(key, added) for key in names}
 
 
 class Prompt:
-    """The blocks of a prompt by name, in order, and the template that they make on each road."""
+    """Blocks of a prompt by name, in order, with their template for each road."""
 
     def __init__(self, blocks: Mapping[str, Block]) -> None:
         self.blocks = dict(blocks)
@@ -393,11 +386,11 @@ class Prompt:
 
     @property
     def digests(self) -> dict[str, str]:
-        """Block name to digest."""
+        """Digests by block name."""
         return {name: block.digest for name, block in self.blocks.items()}
 
     def asks_tactical(self, road: Road) -> bool:
-        """Whether it asks for a tactical decision on a road."""
+        """Return whether the prompt asks for a tactical decision on a road."""
         block = self.blocks.get(TACTICAL)
         return (
             block is not None and (block.merge if road == "merge" else block.straight) is not None
@@ -405,7 +398,7 @@ class Prompt:
 
 
 def prompt_of(variant: str) -> Prompt:
-    """The prompt of a variant; raises UsageError."""
+    """Return the prompt of a variant; raises UsageError."""
     return Prompt(blocks_of(variant))
 
 
@@ -417,11 +410,11 @@ def render_prompt(
     scenario: ScenarioConfig,
     first: bool = True,
 ) -> str:
-    """The text of a prompt.
+    """Return the text of a prompt.
 
     ``remaining_plan`` is the unexecuted rest of the last valid plan (normalised accelerations),
-    None before the first. ``first`` says that the driver has not decided before; it makes a
-    difference only where there is no plan.
+    None before the first. ``first`` is true at the driver's first decision; it has an effect only
+    without a plan.
     """
     template, names = prompt.templates[observation.road]
     now = Situation(observation, scenario, remaining_plan, first)
@@ -430,7 +423,7 @@ def render_prompt(
 
 
 def _template(blocks: Iterable[Block], road: Road) -> tuple[str, frozenset[str]]:
-    """The blocks that a road has, one below the other; and the fields that they name."""
+    """Return the joined template of the blocks for a road, and its variables."""
     templates = (block.merge if road == "merge" else block.straight for block in blocks)
     whole = "\n\n".join(template for template in templates if template is not None) + "\n"
     return whole, frozenset(named(whole))

@@ -1,17 +1,16 @@
-"""A reply's text as a validated plan; what is ambiguous is refused by name, nothing is evaluated.
+"""Parser of replies into validated plans; ambiguous replies fail, and no code is evaluated.
 
-A reply should "contain a length-N array" (arXiv 2604.09609): one valid array is enough, whatever
-other lists stand beside it. It is looked for in the code blocks, and where none there is valid, in
-the prose. Different valid arrays in the same of these two are ambiguous; equal ones are one.
+A reply should "contain a length-N array" (arXiv 2604.09609): one valid array is enough, with any
+other lists in the reply. The parser searches the code blocks; without a valid array there, it
+searches the prose. Different valid arrays in one of the two are ambiguous; equal ones are one.
 
-The reasons: ``no_array``, ``several_arrays`` (different valid ones) or, where none is valid, what
-is wrong with the array that comes nearest to a plan, one of the wanted length before any other:
-``out_of_range``, ``wrong_length``, ``not_finite`` and ``not_a_number`` (an entry is no number
-literal).
+Failures: ``no_array``, ``several_arrays`` (different valid ones) or, without a valid array, the
+fault of the array nearest to a plan, arrays of the expected length first: ``out_of_range``,
+``wrong_length``, ``not_finite`` and ``not_a_number`` (an entry is no number literal).
 
 The tactical decision is read at the head of the reply, as a letter or in words (Merge first,
-Yield), perhaps after a label (Decision:). Where there is none, it is read from the lines that have
-such a label and nothing else, or from members of a JSON object of that name; these must agree.
+Yield), perhaps after a label (Decision:). Without one there, it is read from the lines that have
+only such a label with a choice, or from members of a JSON object of that name; these must agree.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from merge_runner.records import Tactical
 
 _ARRAY = re.compile(r"\[([^\[\]]*)\]")
 _NUMBER = re.compile(r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
-# Possessive, so that the time stays linear however much space there is.
+# Possessive, so that the time is linear in the amount of space.
 _NUMBERS = re.compile(
     rf"(?:\s*+{_NUMBER.pattern}\s*+,)*+\s*+{_NUMBER.pattern}\s*+(?:,\s*+)?", _NUMBER.flags
 )
@@ -34,7 +33,7 @@ _NOT_FINITE = re.compile(
     r"|float\((['\"])[+-]?(?:nan|inf|infinity)\1\)",
     re.IGNORECASE,
 )
-# From the array that comes nearest to a plan to the one that is farthest from it.
+# From the array nearest to a plan to the farthest.
 _FAILURES = ("out_of_range", "wrong_length", "not_finite", "not_a_number")
 _SIGN_APART = re.compile(r"^([+-])\s+")
 _COMMENT = re.compile(r"#[^\n]*")
@@ -53,7 +52,7 @@ _CHOICE = (
     rf"|(?:(?P<merge>{_MERGE})|yield(?: to the other (?:car|driver|vehicle))?)"
     r"(?![^\W_])(?:[\W_]++(?P<same>[MY])(?![^\W_]))?+)"
 )
-# Some replies number their parts as the output format does; a brace begins a JSON object.
+# Some replies number their parts like the output format; a brace begins a JSON object.
 _HEAD = r"(?:[^\w{]|_)*+(?:1[\W_]++)?"
 _CHOICE_LINE = re.compile(rf"{_HEAD}(?P<label>{_LABEL}*+){_CHOICE}[\W_]*+", re.IGNORECASE)
 _CHOICE_WITH_REASON = re.compile(
@@ -67,24 +66,24 @@ _MEMBER = re.compile(
     rf"""["']{_CHOICE}["']""",
     re.IGNORECASE,
 )
-# What follows a choice and takes it back: another one, as in "M, Y" and "yield; no, merge first".
+# Text after a choice that revokes it: another choice, as in "M, Y" and "yield; no, merge first".
 _CONTRARY = {
     "M": re.compile(r"[,;]\W*(?:(?:no|or)\W+)?(?:Y|yield)(?![^\W_])", re.IGNORECASE),
     "Y": re.compile(r"[,;]\W*(?:(?:no|or)\W+)?(?:M|merge first|go first)(?![^\W_])", re.IGNORECASE),
 }
-# A line with a choice is short; the limit also bounds the time that a hostile line can take.
+# A line with a choice is short; the limit also bounds the time for a hostile line.
 _LONGEST_LINE = 80
 _LEADING_TOKEN = re.compile(r"[*_`#>\s\"'(\[]{0,20}([MY])(?=[\s*_`\"'):.,;\]\u2013\u2014-]|$)")
-# Models write these for the ASCII minus sign.
+# Variants of the ASCII minus sign in models' replies.
 _MINUSES = dict.fromkeys("\u2010\u2011\u2012\u2013\u2014\u2212\ufe63\uff0d", "-")
-# Some put these between characters, where nobody sees them.
+# Invisible characters in some models' replies.
 _INVISIBLE = dict.fromkeys("\u200b\u200c\u200d\u2060\ufeff", "")
 _AS_ASCII = str.maketrans(_MINUSES | _INVISIBLE)
 
 
 @dataclass(frozen=True, slots=True)
 class ParsedReply:
-    """What a reply says. ``plan`` is None where it is invalid, and ``failure`` says why."""
+    """Parsed reply; ``plan`` is None if it is invalid, for the reason ``failure``."""
 
     plan: tuple[float, ...] | None
     tactical: Tactical | None
@@ -93,8 +92,8 @@ class ParsedReply:
 
 
 def parse_reply(text: str, plan_actions: int) -> ParsedReply:
-    """Read a reply that should hold a list of ``plan_actions`` numbers in [-1, 1]."""
-    # Half a surrogate pair, which JSON can spell, is a character that no table can hold.
+    """Parse a reply that should contain a list of ``plan_actions`` numbers in [-1, 1]."""
+    # JSON can contain half a surrogate pair, which no table can store.
     text = text.encode(errors="replace").decode().replace("\r\n", "\n")
     prose, places = _split(text)
     plan, failure = _plan(places, plan_actions)
@@ -105,7 +104,7 @@ def parse_reply(text: str, plan_actions: int) -> ParsedReply:
 
 
 def _split(text: str) -> tuple[str, tuple[str, ...]]:
-    """The prose, and where to look for a plan, one place after the other."""
+    """Return the prose, and the texts to search for a plan, in order."""
     parts = text.split("```")
     if len(parts) > 1:
         prose = "\n".join(part.strip() for part in parts[0::2]).strip()
@@ -132,7 +131,7 @@ def _plan(places: Iterable[str], plan_actions: int) -> tuple[tuple[float, ...] |
 
 
 def _failure(array: tuple[float | str, ...], plan_actions: int) -> str | None:
-    """Why an array is no plan; None: it is one."""
+    """Return why an array is no valid plan; None for a valid one."""
     numbers = [entry for entry in array if isinstance(entry, float)]
     words = [entry for entry in array if isinstance(entry, str)]
     if not words and len(numbers) == plan_actions and -1 <= min(numbers) <= max(numbers) <= 1:
@@ -146,7 +145,7 @@ def _failure(array: tuple[float | str, ...], plan_actions: int) -> str | None:
 
 
 def _entries(inside: str) -> tuple[float | str, ...]:
-    """The entries of an array: numbers, and as it is spelled what is not a number."""
+    """Return the entries of an array: numbers, and the text of an entry that is no number."""
     if not inside.isascii():
         inside = inside.translate(_AS_ASCII)
     if _NUMBERS.fullmatch(inside):
@@ -158,7 +157,7 @@ def _entries(inside: str) -> tuple[float | str, ...]:
 
 
 def _tactical(prose: str) -> tuple[Tactical | None, str]:
-    """The M/Y token at the head of the reply, and the prose without it."""
+    """Return the M/Y token at the head of the reply, and the prose without it."""
     first_line, _, rest = prose.partition("\n")
     whole = _TOKEN_LINE.fullmatch(first_line) if len(first_line) <= _LONGEST_LINE else None
     if whole and (whole[2] or whole[1])[0].upper() == _token(whole):
@@ -172,7 +171,7 @@ def _tactical(prose: str) -> tuple[Tactical | None, str]:
 
 
 def _in_words(prose: str, text: str) -> tuple[Tactical | None, str]:
-    """The decision where no letter is at the head of the reply, and the prose without it."""
+    """Return the decision of a reply without a letter at its head, and the prose without it."""
     lines = [line for line in prose.split("\n") if line.strip()]
     short = [line for line in lines if len(line) <= _LONGEST_LINE]
     heads = [line for line in lines[:2] if len(line) <= _LONGEST_LINE]
@@ -185,14 +184,14 @@ def _in_words(prose: str, text: str) -> tuple[Tactical | None, str]:
     if begin and (choice := _choice(begin)):
         is_taken_back = _CONTRARY[choice].match(prose, begin.start("reason"))
         return (None, prose) if is_taken_back else (choice, prose[begin.end() :].strip())
-    labelled = [found for line in short if (found := _CHOICE_LINE.fullmatch(line))]
-    choices = {*map(_choice, [found for found in labelled if found["label"]])}
+    matches = [match for line in short if (match := _CHOICE_LINE.fullmatch(line))]
+    choices = {*map(_choice, [match for match in matches if match["label"]])}
     choices = choices or {*map(_choice, _MEMBER.finditer(text))}
     return (choices.pop() if len(choices) == 1 else None), prose
 
 
 def _choice(match: re.Match[str]) -> Tactical | None:
-    """The choice of a match; None where its words and its letter disagree."""
+    """Return the choice of a match; None if its words and its letter disagree."""
     if letter := match["letter"]:
         letter = letter.upper()
         if (match["word"] or letter)[0].upper() != letter:

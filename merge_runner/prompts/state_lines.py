@@ -1,6 +1,6 @@
-"""What a prompt may say of the state beyond the paper's numbers, in words where it has no value.
+"""Additional state variables of a prompt beyond the paper's, in words if they are undefined.
 
-All is computed from what the driver is told, at present speeds, and has its unit in it.
+They are computed from the driver's observation, at present speeds, and contain their unit.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ NOT_SEEN = "not seen"
 OTHER = "the other car"
 STRAIGHT = "not defined on the straight road"
 EQUAL_MPS = 0.05
-# What is smaller is 0.00 in a prompt.
+# Smaller values are 0.00 in a prompt.
 LEVEL_M = STANDING_MPS = 0.005
 
 
 def projected_headway(seen: Observation) -> str:
-    """Which car is ahead, and how far, when the first of them reaches the merge point."""
+    """Return which car is ahead, and by how far, when the first one reaches the merge point."""
     if not seen.other_seen:
         return NOT_SEEN
     own_m = seen.distance_to_merge_m
@@ -26,8 +26,8 @@ def projected_headway(seen: Observation) -> str:
         return STRAIGHT
     other_m = own_m - seen.relative_distance_m
     if own_m <= 0 or other_m <= 0:
-        who = "you have" if own_m <= 0 else f"{OTHER} has"
-        return f"not defined, {who} passed the merge point"
+        subject = "you have" if own_m <= 0 else f"{OTHER} has"
+        return f"not defined, {subject} passed the merge point"
     own_mps, other_mps = seen.own_speed_mps, seen.other_speed_mps
     times = [m / mps for m, mps in ((own_m, own_mps), (other_m, other_mps)) if mps >= STANDING_MPS]
     if not times:
@@ -37,7 +37,7 @@ def projected_headway(seen: Observation) -> str:
 
 
 def own_time_to_merge(seen: Observation) -> str:
-    """The time until the own car reaches the merge point."""
+    """Return the time until the own car reaches the merge point."""
     if seen.distance_to_merge_m is None or seen.distance_to_merge_m <= 0:
         return "you have passed it"
     if seen.own_speed_mps < STANDING_MPS:
@@ -46,7 +46,7 @@ def own_time_to_merge(seen: Observation) -> str:
 
 
 def other_time_to_merge(seen: Observation) -> str:
-    """The time until the other car reaches the merge point."""
+    """Return the time until the other car reaches the merge point."""
     if not seen.other_seen:
         return NOT_SEEN
     if seen.distance_to_merge_m is None:
@@ -60,7 +60,7 @@ def other_time_to_merge(seen: Observation) -> str:
 
 
 def time_gap(seen: Observation) -> str:
-    """Which car is ahead, and how long the one behind takes to where that is now."""
+    """Return which car is ahead, and the time until the one behind reaches its present position."""
     if not seen.other_seen:
         return NOT_SEEN
     ahead_m = -seen.relative_distance_m
@@ -71,7 +71,7 @@ def time_gap(seen: Observation) -> str:
 
 
 def relative_speed(seen: Observation) -> str:
-    """Which car is faster, and by how much."""
+    """Return which car is faster, and by how much."""
     if not seen.other_seen:
         return NOT_SEEN
     faster_mps = seen.other_speed_mps - seen.own_speed_mps
@@ -94,4 +94,4 @@ LINES: Mapping[str, Callable[[Observation], str]] = {
     "time_gap": time_gap,
     "relative_speed_in_words": relative_speed,
 }
-"""The fields of templates that are words."""
+"""Template variables with a text as value."""

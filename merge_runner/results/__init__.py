@@ -1,1 +1,1 @@
-"""Results at rest: the database, recordings, and where they come from."""
+"""Stored results: database, recordings and provenance."""

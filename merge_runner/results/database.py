@@ -1,4 +1,4 @@
-"""Opens the results database and waits for other programs that hold it."""
+"""Access to the results database, with waiting for other programs that hold it."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from merge_runner.text_safety import first_line, quoted
 
 SCHEMA_VERSION = 10
 SCHEMA = Path(__file__).with_name("schema.sql")
-"""The tables; see ``schema_sql`` for all that a database has."""
+"""Tables and views without those of the measures (``schema_sql`` has both)."""
 LOCK_RETRY_S = 0.05
 PATIENCE_S = 60.0
 ROWS_AT_ONCE = 100
 ROWS_OF_A_GROUP = 4_096
-"""Of what is written: a group is rewritten, in memory, with each transaction until it is full."""
+"""Size of written row groups: each transaction rewrites a group in memory until it is full."""
 BYTES_OF_A_CALL, MERGED_BYTES = 3_000, 2**26
-"""How many a call takes where replies are short, compressed and with its share of the states, and
-by how much the file may exceed that for its row groups still to be merged."""
+"""Compressed bytes of a call with short replies and its share of the states; and the excess of the
+file's size up to which its row groups are merged."""
 SIZES = """
 SELECT greatest(max(stats(request).max_string_length), max(stats(reply).max_string_length), 0),
     (SELECT count(*) FROM calls)
@@ -46,12 +46,12 @@ LOG = logging.getLogger(__name__)
 ResultT = TypeVar("ResultT")
 Settings = dict[str, str | bool | int | float | list[str]]
 SETTINGS: Settings = {
-    # The defaults are shares of the machine's, and most of that memory would cache the file. A
-    # thread unpacks the texts of 2,048 rows at once: 128 MB where replies are of 64 KB.
-    "memory_limit": "1GB",  # see limit_memory
+    # DuckDB's defaults are shares of the machine's memory, mostly spent on caching the file. A
+    # thread unpacks the texts of 2,048 rows at once: 128 MB for replies of 64 KB.
+    "memory_limit": "1GB",  # limit_memory lowers it
     "threads": 2,
-    "max_vacuum_tasks": 0,  # see merge_small_groups
-    # Of new files: the oldest DuckDB that can open them.
+    "max_vacuum_tasks": 0,  # merge_small_groups raises it
+    # The oldest DuckDB that can open new files.
     "storage_compatibility_version": "v1.2.0",
 }
 REBUILD = (
@@ -61,18 +61,18 @@ REBUILD = (
 
 
 def schema_sql() -> str:
-    """The SQL that makes a database: its tables, and views of them with the measures."""
+    """Return the SQL that creates a database: tables, views and measures."""
     return f"{SCHEMA.read_text(encoding='utf-8')}\n{measures_sql()}"
 
 
 def has_these_measures(connection: duckdb.DuckDBPyConnection) -> bool:
-    """Whether this version of the program defined the measures of the open database."""
+    """Return whether the open database has the measures of this version of the program."""
     return connection.execute("SELECT measures_version()").fetchone() == (measures_version(),)
 
 
-@cache  # warns once per file, which a page may read a hundred times
+@cache  # one warning per file, which a page may read a hundred times
 def warn_of_other_measures(path: Path) -> None:
-    """Log that another version of the program defined the measures of a database."""
+    """Warn that a database has the measures of another version of the program."""
     LOG.warning(
         "another version of the program defined the measures (trial_metrics and its views) of %s, "
         "and they are read as they are; `merge-runner sweep` into it brings them up to date",
@@ -82,14 +82,14 @@ def warn_of_other_measures(path: Path) -> None:
 
 @cache
 def _spill_folder(pid: int) -> str:
-    """Make the private folder of a process for what does not fit into memory; it goes with it.
+    """Create the private spill folder of a process, removed at its exit.
 
-    A name that others can tell beforehand could be a folder of theirs.
+    Another user could own a folder with a predictable name.
     """
     folder = tempfile.mkdtemp(prefix="merge-runner-")
 
     def remove() -> None:
-        if os.getpid() == pid:  # and not a fork of it
+        if os.getpid() == pid:  # not in a fork
             shutil.rmtree(folder, ignore_errors=True)
 
     atexit.register(remove)
@@ -97,42 +97,42 @@ def _spill_folder(pid: int) -> str:
 
 
 def in_memory(settings: Settings) -> duckdb.DuckDBPyConnection:
-    """A new database in memory, which spills into a private folder."""
+    """Return a new in-memory database that spills into a private folder."""
     spilling: Settings = {"temp_directory": _spill_folder(os.getpid())}
     connection = duckdb.connect(config=settings | spilling)
-    # DuckDB takes `python -c` for an interactive prompt: a slow query would draw into our output.
-    # In a notebook without ipywidgets it can draw nothing, and refuses to be told so.
+    # DuckDB takes `python -c` for an interactive prompt and would draw a progress bar for a slow
+    # query. In a notebook without ipywidgets it refuses this setting.
     with contextlib.suppress(duckdb.InvalidInputException):
         connection.execute("SET enable_progress_bar = false")
     return connection
 
 
 class Instance:
-    """A DuckDB instance; attaching a file to it takes the file's lock, detaching frees it.
+    """DuckDB instance; attaching a file takes the file's lock, detaching releases it.
 
-    Making an instance takes longer than most queries, so one is used for everything. After an error
-    it may be unusable, and a new one is made.
+    Creating an instance takes longer than most queries, so that one is shared. After an error it
+    may be unusable and is replaced.
     """
 
     def __init__(self) -> None:
         self._connection: duckdb.DuckDBPyConnection | None = None
 
     def cursor(self) -> duckdb.DuckDBPyConnection:
-        """A separate connection to the instance."""
+        """Return a separate connection to the instance."""
         if self._connection is None:
             self._connection = in_memory(SETTINGS)
         return self._connection.cursor()
 
     def drop(self) -> None:
-        """Make a new instance next time; this one ends with the last of its connections.
+        """Create a new instance at the next use; this one ends with its last connection.
 
-        Closing it would close those of other threads with it.
+        Closing it would close the connections of other threads.
         """
         self._connection = None
 
 
 class Reading:
-    """What a thread does with databases, which another thread may end."""
+    """Database reads of one thread, which another thread may interrupt."""
 
     def __init__(self) -> None:
         self.is_over = False
@@ -140,12 +140,12 @@ class Reading:
         self._one_at_a_time = Lock()  # a connection that is interrupted is not closed meanwhile
 
     def uses(self, connection: duckdb.DuckDBPyConnection | None) -> None:
-        """Note the connection that is open; None before it is closed."""
+        """Set the open connection; None before it is closed."""
         with self._one_at_a_time:
             self._connection = connection
 
     def end(self) -> None:
-        """End the query that runs, and what waits for a file; one that begins later goes on."""
+        """Interrupt the running query and the wait for a file; a later query is not interrupted."""
         with self._one_at_a_time:
             self.is_over = True
             if self._connection is not None:
@@ -156,31 +156,31 @@ _READING: ContextVar[Reading | None] = ContextVar("reading", default=None)
 
 
 async def in_thread(read: Callable[[], ResultT]) -> ResultT:
-    """Read databases in a thread; a task that is cancelled ends the reading before it ends."""
+    """Read databases in a thread; cancelling the task interrupts the thread and waits for it."""
     reading = Reading()
 
     def reads() -> ResultT:
         _READING.set(reading)  # in the thread's own context
         return read()
 
-    # No task: Ctrl-C may cancel all tasks of the loop, and the thread would go on unseen.
+    # Not a task: Ctrl-C may cancel all tasks of the loop, and the thread would run on unnoticed.
     loop = asyncio.get_running_loop()
     thread = loop.run_in_executor(None, copy_context().run, reads)
     try:
         await asyncio.wait([thread])
-    except (asyncio.CancelledError, KeyboardInterrupt):  # Ctrl-C may come before it waits
+    except (asyncio.CancelledError, KeyboardInterrupt):  # Ctrl-C may come before the wait
         while not thread.done():
-            reading.end()  # again, where it was between two queries
+            reading.end()  # repeated, since the thread may have been between two queries
             with contextlib.suppress(asyncio.CancelledError):
                 await asyncio.wait([thread], timeout=LOCK_RETRY_S)
-        thread.exception()  # nobody wants it any more
+        thread.exception()  # retrieved, or asyncio would log it
         raise
     return thread.result()
 
 
 SHARED = Instance()
-OURS = "merge_runner_"  # begins the names under which files are attached here
-# Another process holds the file; another connection of this one does.
+ATTACHED = "merge_runner_"  # prefix of the names of attached files
+# The file is held by another process, or by another connection of this one.
 _BUSY = ("Could not set lock", "Unique file handle conflict", "already attached")
 
 
@@ -188,16 +188,16 @@ _BUSY = ("Could not set lock", "Unique file handle conflict", "already attached"
 def open_database(
     path: Path, *, read_only: bool, patience_s: float, instance: Instance = SHARED
 ) -> Iterator[duckdb.DuckDBPyConnection]:
-    """Open the database, waiting until others close it; raises StoreError."""
+    """Open the database once other programs have closed it; raises StoreError."""
     connection, reading = instance.cursor(), _READING.get()
-    name = f"{OURS}{id(connection)}"  # of no other file that is open
+    name = f"{ATTACHED}{id(connection)}"  # unique among the open files
     mode = "READ_ONLY" if read_only else f"READ_WRITE, ROW_GROUP_SIZE {ROWS_OF_A_GROUP}"
-    # A name such as md:x or :memory: names a file, too.
+    # As an absolute path, since DuckDB gives names such as md:x or :memory: another meaning.
     _attach(connection, f"{quoted(path.absolute())} AS {name} ({mode})", path, patience_s, instance)
     try:
         if reading is not None:
             reading.uses(connection)
-        # Whoever used the instance before may have limited it; see limit_memory.
+        # An earlier user of the instance may have called limit_memory.
         connection.execute(
             f"USE {name}; SET memory_limit = '{SETTINGS['memory_limit']}'; "
             f"SET threads = {SETTINGS['threads']}"
@@ -210,7 +210,7 @@ def open_database(
         try:
             connection.execute(f"USE memory; DETACH {name}")
         except duckdb.Error as exc:
-            # As on a full disk: what was committed stays in the log beside the file.
+            # As on a full disk: committed data stay in the write-ahead log of the file.
             LOG.warning("the database was not closed in order: %s", first_line(exc))
             instance.drop()
     finally:
@@ -226,8 +226,8 @@ def _attach(
     patience_s: float,
     instance: Instance,
 ) -> None:
-    """Attach a file, again and again while another one holds it."""
-    began, told, reading = time.monotonic(), False, _READING.get()
+    """Attach a file, with retries while another program holds it."""
+    began, has_warned, reading = time.monotonic(), False, _READING.get()
     while True:
         try:
             connection.execute(f"ATTACH {file}")
@@ -245,8 +245,8 @@ def _attach(
                 ) from exc
             if waited_s >= patience_s or (reading is not None and reading.is_over):
                 raise StoreLocked(f"{path} is held by {_holder(exc)}: close it there") from exc
-            if waited_s > 1 and not told:
-                told = True
+            if waited_s > 1 and not has_warned:
+                has_warned = True
                 LOG.warning(
                     "waiting up to %.0f s for %s to close %s", patience_s, _holder(exc), path
                 )
@@ -256,22 +256,23 @@ def _attach(
 
 
 def _is_of_this_process(exc: duckdb.Error) -> bool:
-    """Whether a connection of the user, as in a notebook, holds the file; ours soon close it."""
-    return bool(re.search(rf'already attached by database "(?!{OURS}\d+")', str(exc)))
+    """Return whether the user's own connection holds the file, as in a notebook."""
+    # Connections of the program close soon.
+    return bool(re.search(rf'already attached by database "(?!{ATTACHED}\d+")', str(exc)))
 
 
 def _holder(exc: duckdb.Error) -> str:
-    """Who holds the file, as DuckDB says it: the program and its process."""
-    found = re.search(r"lock is held in (.+) \(PID (\d+)\)", str(exc))
-    return f"{Path(found[1]).name} (PID {found[2]})" if found else "another program"
+    """Return the program and process id that hold the file, from DuckDB's message."""
+    match = re.search(r"lock is held in (.+) \(PID (\d+)\)", str(exc))
+    return f"{Path(match[1]).name} (PID {match[2]})" if match else "another program"
 
 
 def limit_memory(connection: duckdb.DuckDBPyConnection, longest: int = 0) -> None:
-    """Let DuckDB use little memory, and one thread, where texts are short and calls not many.
+    """Limit DuckDB to little memory and one thread for short texts and few calls.
 
-    That holds until the instance opens a database again. ``longest`` is the length of the longest
-    text that will be stored. A row group of such calls takes 64 MB, an audit of 200,000 of them
-    110 MB; more would only cache the file.
+    The limit holds until the instance opens a database again. ``longest`` is the length of the
+    longest text to store. A row group of such calls takes 64 MB, an audit of 200,000 calls 110 MB;
+    more memory would only cache the file.
     """
     [(stored, calls)] = connection.execute(SIZES).fetchall()
     is_little = bool(max(stored, longest) < 8_192 and calls < 210_000)
@@ -280,9 +281,9 @@ def limit_memory(connection: duckdb.DuckDBPyConnection, longest: int = 0) -> Non
 
 
 def merge_small_groups(connection: duckdb.DuckDBPyConnection) -> None:
-    """Let the next write merge small row groups, unless the rows hold long texts.
+    """Let the next write merge small row groups, unless the rows have long texts.
 
-    Merging takes as much memory as the texts of a full group, and rewrites these each time.
+    Merging takes as much memory as the texts of a full group, and rewrites the group each time.
     """
     [(calls, path)] = connection.execute(
         "SELECT estimated_size, path FROM duckdb_tables() JOIN duckdb_databases() "
@@ -293,30 +294,30 @@ def merge_small_groups(connection: duckdb.DuckDBPyConnection) -> None:
 
 
 def of_sweeps(sweep_ids: Iterable[str]) -> str:
-    """What is true, in SQL, of the rows of some sweeps."""
+    """Return the SQL condition for rows of these sweeps."""
     return f"sweep_id IN ({', '.join(map(quoted, sweep_ids))})"
 
 
 def only(sweep_ids: Iterable[str] | None) -> str:
-    """What keeps, in SQL, the rows of the trials of some sweeps; None: all are kept."""
+    """Return the SQL join that keeps the trials of these sweeps; None: an empty text."""
     if sweep_ids is None:
         return ""
-    wanted = f"FROM sweep_trials WHERE {of_sweeps(sweep_ids)}"
-    return f"SEMI JOIN ({wanted}) USING (trial_id, spec_hash)"
+    trials = f"FROM sweep_trials WHERE {of_sweeps(sweep_ids)}"
+    return f"SEMI JOIN ({trials}) USING (trial_id, spec_hash)"
 
 
 def fetched(result: duckdb.DuckDBPyConnection) -> Iterator[tuple[Any, ...]]:
-    """The rows of a result, a few at a time; its connection runs no other query until the end."""
+    """Return the rows of a result, fetched in chunks; the connection is busy until the last."""
     return chain.from_iterable(iter(partial(result.fetchmany, ROWS_AT_ONCE), []))
 
 
 def names_of(result: duckdb.DuckDBPyConnection) -> list[str]:
-    """The names of a result's columns."""
+    """Return the column names of a result."""
     return [column[0] for column in result.description or ()]
 
 
 def by_name(result: duckdb.DuckDBPyConnection) -> Iterator[dict[str, Any]]:
-    """The rows of a result, each by the names of its columns."""
+    """Return the rows of a result as dictionaries by column."""
     names = names_of(result)
     return (dict(zip(names, row, strict=True)) for row in result.fetchall())
 
@@ -334,7 +335,7 @@ def append(
 def write_database(
     path: Path, patience_s: float = PATIENCE_S
 ) -> Iterator[duckdb.DuckDBPyConnection]:
-    """Open the database for one transaction, which is committed at the end; raises StoreError."""
+    """Open the database for one transaction, committed at the end; raises StoreError."""
     with open_database(path, read_only=False, patience_s=patience_s) as connection:
         try:
             connection.begin()
@@ -366,7 +367,7 @@ def read_database(
 
 @contextmanager
 def unreadable_is_usage() -> Iterator[None]:
-    """A damaged file, or one that is not a database, is for the user to replace."""
+    """Turn errors of a damaged or foreign file into a UsageError with advice."""
     try:
         yield
     except StoreLocked:

@@ -25,7 +25,7 @@ from merge_runner.results.database import (
 from merge_runner.text_safety import csv_writer, first_line, in_spreadsheet, printable, quoted
 
 Rows = Iterable[tuple[Any, ...]]
-# A column without a comment means what the first of its name does.
+# A column without a comment has the meaning of the first column with its name.
 _DESCRIBED = """
 WITH relations AS (
     SELECT table_oid AS oid, table_name AS name, comment, false AS is_view, database_name
@@ -43,7 +43,7 @@ SELECT name, is_view, relations.comment,
 FROM relations JOIN columns ON oid = table_oid AND relations.database_name = columns.database_name
 GROUP BY oid, name, is_view, relations.comment ORDER BY is_view, oid
 """
-# Each factor with the type that all its levels have; they are written as ``level_text`` does.
+# Each factor with the common type of its levels, which are written by ``level_text``.
 FACTORS = """
 SELECT factor, CASE
     WHEN bool_and(kind = 'BOOLEAN') THEN 'BOOLEAN'
@@ -69,13 +69,13 @@ ORDER BY trial_id, spec_hash
 NAME = "trials_wide"
 COMMENT = "One row a trial: trials, trial_drivers, trial_metrics, and a column for each factor."
 DICTIONARY = "dictionary.csv"
-OF_A_FACTOR = "the level of a factor of the study"  # what no other table has
+LEVEL_MEANING = "the level of a factor of the study"  # of columns that no other table has
 HEADINGS = ["table", "column", "type", "meaning"]
 
 
 @dataclass(frozen=True, slots=True)
 class SchemaColumn:
-    """A column, its type, and what is said of it; its unit is the end of its name."""
+    """Column with its type and comment; the end of its name is the unit."""
 
     name: str
     kind: str
@@ -84,7 +84,7 @@ class SchemaColumn:
 
 @dataclass(frozen=True, slots=True)
 class SchemaTable:
-    """A table or a view."""
+    """Table or view with its columns."""
 
     name: str
     is_view: bool
@@ -94,14 +94,14 @@ class SchemaTable:
 
 @cache
 def tables() -> list[SchemaTable]:
-    """Tables, then views, in the order of their definitions."""
+    """Return the tables, then the views, in the order of their definitions."""
     with duckdb.connect() as connection:
         connection.execute(schema_sql())
         return described(connection)
 
 
 def described(connection: duckdb.DuckDBPyConnection) -> list[SchemaTable]:
-    """The tables and views of an open database, and the temporary ones of the connection."""
+    """Return the tables and views of an open database, including temporary ones."""
     return [
         SchemaTable(name, is_view, comment, [SchemaColumn(*column) for column in columns])
         for name, is_view, comment, columns in connection.execute(_DESCRIBED).fetchall()
@@ -109,14 +109,14 @@ def described(connection: duckdb.DuckDBPyConnection) -> list[SchemaTable]:
 
 
 def units() -> str:
-    """What holds for all columns: the definitions' first line."""
+    """Return the first line of the schema, which has the units of all columns."""
     return schema_sql().partition("\n")[0].removeprefix("-- ")
 
 
 def wide_trials(factors: Iterable[tuple[str, str]], sweep_ids: Sequence[str] | None = None) -> str:
-    """Return the query of all trials, or of those of some sweeps, with their FACTORS.
+    """Return the SQL of the trials with their FACTORS as columns; of some sweeps, or of all.
 
-    A factor that is called like a column of the trials has ``factor_`` before its name.
+    A factor with the name of another column gets the prefix ``factor_``.
     """
     relations = ("trials", "trial_drivers", "trial_metrics")
     fixed = (table.columns for table in tables() if table.name in relations)
@@ -129,14 +129,14 @@ def wide_trials(factors: Iterable[tuple[str, str]], sweep_ids: Sequence[str] | N
 
 
 def export_tables(db: Path, folder: Path, sweep_ids: Sequence[str] | None = None) -> None:
-    """Write the folder: all rows, or those of some sweeps and their trials.
+    """Write a folder with all rows, or with those of some sweeps and their trials.
 
-    Its dictionary says what each column means and, in a row without a column, each table. Raises
-    UsageError where the folder is neither empty nor an earlier export's.
+    The dictionary has the meaning of each column and, in a row without a column, of each table.
+    Raises UsageError if the folder has content that is not an earlier export.
     """
     dictionary, first = folder / DICTIONARY, ",".join(HEADINGS).encode()
-    there = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
-    if there and not (dictionary.is_file() and dictionary.read_bytes().startswith(first)):
+    has_content = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+    if has_content and not (dictionary.is_file() and dictionary.read_bytes().startswith(first)):
         raise UsageError(f"{folder} is there and no earlier export: name another folder")
     try:
         with read_database(db) as connection:
@@ -146,7 +146,7 @@ def export_tables(db: Path, folder: Path, sweep_ids: Sequence[str] | None = None
             connection.execute(f"COMMENT ON VIEW {NAME} IS {quoted(COMMENT)}")
             tables = described(connection)
             levels = {
-                (NAME, name): OF_A_FACTOR
+                (NAME, name): LEVEL_MEANING
                 for factor, _ in factors
                 for name in (factor, f"factor_{factor}")
             }
@@ -177,7 +177,7 @@ def export_tables(db: Path, folder: Path, sweep_ids: Sequence[str] | None = None
 
 
 def _rows_of(sweep_ids: Sequence[str] | None, table: SchemaTable) -> str:
-    """What keeps the rows of some sweeps, of their trials, or of the specs of these."""
+    """Return the SQL clause that selects the rows of these sweeps, their trials or their specs."""
     names = {column.name for column in table.columns}
     if sweep_ids is None or not names & {"sweep_id", "spec_hash"}:
         return ""
@@ -185,8 +185,8 @@ def _rows_of(sweep_ids: Sequence[str] | None, table: SchemaTable) -> str:
         return f"WHERE {of_sweeps(sweep_ids)}"
     if "trial_id" in names:
         return only(sweep_ids)
-    own = f"FROM sweep_trials WHERE {of_sweeps(sweep_ids)}"
-    return f"SEMI JOIN ({own}) USING (spec_hash)"
+    trials = f"FROM sweep_trials WHERE {of_sweeps(sweep_ids)}"
+    return f"SEMI JOIN ({trials}) USING (spec_hash)"
 
 
 def _write_csv(path: Path, names: list[str], rows: Rows) -> None:
@@ -195,7 +195,7 @@ def _write_csv(path: Path, names: list[str], rows: Rows) -> None:
 
 
 def write_csv(names: list[str], rows: Rows, out: TextIO) -> None:
-    """Write CSV in which a spreadsheet finds no formula to run."""
+    """Write CSV without cells that a spreadsheet would run as a formula."""
     csv_writer(out).writerows(map(in_spreadsheet, row) for row in chain((names,), rows))
 
 
@@ -214,14 +214,14 @@ def write_json(names: list[str], rows: Rows, out: TextIO) -> None:
 
 
 def write_table(names: list[str], rows: Rows, out: TextIO) -> None:
-    """Write columns as wide as their widest cell; rich would hold all rows in memory at once."""
+    """Write columns as wide as their widest cell, via a file to save memory."""
     widths = [0] * len(names)
-    with TemporaryFile("w+", encoding="utf-8", errors="surrogatepass") as kept:
+    with TemporaryFile("w+", encoding="utf-8", errors="surrogatepass") as lines:
         for row in chain((names,), rows):
             cells = ["" if value is None else str(value) for value in row]
             widths = [max(width, len(cell)) for width, cell in zip(widths, cells, strict=True)]
-            kept.write(json.dumps(cells) + "\n")
-        kept.seek(0)
-        for line in kept:
+            lines.write(json.dumps(cells) + "\n")
+        lines.seek(0)
+        for line in lines:
             padded = map(str.ljust, json.loads(line), widths)
             out.write(printable("  ".join(padded).rstrip()) + "\n")

@@ -1,8 +1,7 @@
-"""How much a Parquet file unpacks to, read from its pages' headers before any page is decoded.
+"""Unpacked size of a Parquet file, read from its page headers before any page is decoded.
 
-DuckDB's memory limit covers a page's bytes, and neither the entries of a dictionary nor what a
-delta encoding makes of a few bytes. A reader goes by each page's own header: what the footer says
-of a column is not what bounds it.
+DuckDB's memory limit covers a page's bytes, but neither the entries of a dictionary nor the output
+of a delta encoding. A reader follows each page's own header, so that the footer is no bound.
 """
 
 from __future__ import annotations
@@ -23,22 +22,22 @@ SELECT row_group_id, row_group_num_rows, num_values, total_compressed_size,
     if(dictionary_page_offset >= 4, dictionary_page_offset, data_page_offset)
 FROM parquet_metadata({}) ORDER BY row_group_id
 """
-# What an entry of a dictionary takes: its place in the file's page and its share of a query.
+# Memory of a dictionary entry: in the page, and its share of a query.
 BYTES_OF_ENTRY = 64
 # Kinds of pages.
 DATA, DICTIONARY, DATA_2 = 0, 2, 3
 # Encodings in which each value has its own bytes, or is one of a dictionary.
 PLAIN, PLAIN_DICTIONARY, RLE_DICTIONARY = 0, 2, 8
-# Kinds of fields in Thrift's compact form.
+# Kinds of fields in Thrift's compact protocol.
 TRUE, FALSE, I32, I64, BINARY, STRUCT = 1, 2, 5, 6, 8, 12
 DEEPEST = 4
 Fields = dict[tuple[int, int], Any]
-"""The value of each field, by its number and its kind."""
+"""Field values by (number, kind)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """A page as its header describes it: its bytes when unpacked, its values, where it ends."""
+    """Page by its header: unpacked bytes, number of values, offset of its end."""
 
     is_dictionary: bool
     size: int
@@ -47,11 +46,11 @@ class Page:
 
 
 def group_bytes(file: Path, pattern: str, connection: duckdb.DuckDBPyConnection) -> Iterator[int]:
-    """Yield the bytes that decoding each row group takes at most, all columns together.
+    """Yield an upper bound of the bytes to decode each row group, over all columns.
 
-    ``pattern`` names the file in SQL. Of a column a reader holds the dictionary and one page.
-    Raises ValueError for pages that are not as the footer says, or in an encoding that can unpack
-    to more than its header says.
+    ``pattern`` names the file in SQL. A reader holds the dictionary and one page of each column.
+    Raises ValueError for pages that contradict the footer, or have an encoding that can unpack to
+    more than the header says.
     """
     chunks = connection.execute(CHUNKS.format(pattern)).fetchall()
     with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
@@ -62,7 +61,7 @@ def group_bytes(file: Path, pattern: str, connection: duckdb.DuckDBPyConnection)
 
 
 def _chunk_bytes(data: mmap.mmap, rows: int, values: int, packed: int, start: int) -> int:
-    """Return the bytes that decoding a column of a row group takes at most."""
+    """Return an upper bound of the bytes to decode a column of a row group."""
     at, end, seen, dictionary, largest = start, start + packed, 0, 0, 0
     while at < end:
         page = _page(data, at)
@@ -79,11 +78,10 @@ def _chunk_bytes(data: mmap.mmap, rows: int, values: int, packed: int, start: in
 
 
 def _page(data: mmap.mmap, at: int) -> Page:
-    """Read the header of a page."""
     try:
         header, at = _struct(data, at)
         kind, size, packed = (header[number, I32] for number in (1, 2, 3))
-        # By the kind of page: the field with its own header, and the field of the encoding there.
+        # By page kind: the field with its own header, and the encoding's field in that header.
         field, encoded = {DATA: (5, 2), DICTIONARY: (7, 2), DATA_2: (8, 4)}[kind]
         values, encoding = header[field, STRUCT][1, I32], header[field, STRUCT][encoded, I32]
     except (KeyError, IndexError) as exc:
@@ -96,9 +94,9 @@ def _page(data: mmap.mmap, at: int) -> Page:
 
 
 def _struct(data: mmap.mmap, at: int, depth: int = 0) -> tuple[Fields, int]:
-    """Read a struct in Thrift's compact form; returns its fields, and where it ends.
+    """Read a struct in Thrift's compact protocol; return its fields and the offset of its end.
 
-    What readers may take in different ways, such as a field that comes twice, is refused.
+    Ambiguous content, such as a repeated field, raises ValueError.
     """
     fields: Fields = {}
     number = 0
@@ -125,7 +123,7 @@ def _struct(data: mmap.mmap, at: int, depth: int = 0) -> tuple[Fields, int]:
 
 
 def _number(data: mmap.mmap, at: int) -> tuple[int, int]:
-    """Read a number of seven bits a byte; returns where it ends, too."""
+    """Read a variable-length integer; return it and the offset of its end."""
     value = shift = 0
     while (byte := data[at]) & 0x80:
         value, shift, at = value | (byte & 0x7F) << shift, shift + 7, at + 1

@@ -1,4 +1,4 @@
-"""Where results come from: the program's commit or version, and its packages' versions."""
+"""Provenance of results: the program's commit or version, and its packages' versions."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ PACKAGES = ("merge-runner", "diskcache", "duckdb", "httpx", "httpx-aiohttp", "py
 
 
 def versions() -> dict[str, str]:
-    """Python's and the packages' versions."""
+    """Return the versions of Python and the packages."""
     return {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
 
 
 def git_state() -> tuple[str, bool | None]:
-    """The commit of the program's own checkout, and whether there are uncommitted changes.
+    """Return the commit of the program's checkout, and whether it has uncommitted changes.
 
-    Files that git does not track, such as a study of the user's, are no change of the program.
-    Without a checkout that tracks the package: the installed version and None.
+    Untracked files, such as a user's study, are no change of the program. Without a checkout that
+    tracks the package, return the installed version and None.
     """
     tracked = _git("ls-files", "--error-unmatch", "merge_runner/__init__.py")
     if tracked and (commit := _git("rev-parse", "HEAD")):
@@ -29,20 +29,20 @@ def git_state() -> tuple[str, bool | None]:
 
 
 def program() -> str:
-    """The program that made a text, for its readers."""
-    made_by, changed = git_state()
+    """Return the program's version in words, for the head of a report."""
+    version_name, changed = git_state()
     if changed is None:
-        return f"{made_by}, installed"
-    also = ", with changes that are not committed" if changed else ""
-    return f"merge-runner at commit {made_by}{also}"
+        return f"{version_name}, installed"
+    suffix = ", with changes that are not committed" if changed else ""
+    return f"merge-runner at commit {version_name}{suffix}"
 
 
 def _git(*arguments: str) -> str:
-    """What git says about the repository at PROJECT, and about no other around it; or nothing."""
-    own = ["-C", str(PROJECT), f"--git-dir={PROJECT / '.git'}", f"--work-tree={PROJECT}"]
+    """Return git's output for the repository at PROJECT, never one around it; "" on failure."""
+    place = ["-C", str(PROJECT), f"--git-dir={PROJECT / '.git'}", f"--work-tree={PROJECT}"]
     try:
         done = subprocess.run(  # noqa: S603 # constant arguments
-            ["git", *own, *arguments],  # noqa: S607 # the user's own git
+            ["git", *place, *arguments],  # noqa: S607 # the user's own git
             capture_output=True,
             text=True,
             check=True,

@@ -1,10 +1,10 @@
-"""Portable recordings: what a sweep asked and was answered, as one Parquet file.
+"""Portable recordings: the requests and replies of a sweep in one Parquet file.
 
 One row per call: the parts of its key, the exact request body, and all attempts as JSON. The
-file's key-value metadata hold where it comes from. Any Parquet tool can query it.
+file's key-value metadata have its provenance. Any Parquet tool can query it.
 
 A recording may come from anybody: nothing in it is executed, it is read in bounded memory, and
-nothing of it is added to the cache unless the whole file is one that an export could have written.
+nothing of it is added to the cache unless an export could have written the whole file.
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ from merge_runner.results.rows import Row
 from merge_runner.text_safety import first_line, one_line, quoted
 
 FORMAT = "merge-runner recording 2"
-"""Read for ever: a model that is shut down cannot be asked again."""
+"""Stays readable for ever: a model cannot be asked again after its shutdown."""
 PROVENANCE_HASH = "provenance_sha256"
 SWEEPS = "sweeps"
-"""Holds the rows of several sweeps; a recording of one sweep has the columns of its row instead."""
+"""Metadata key of the rows of several sweeps; one sweep has a key for each column instead."""
 COLUMNS = {
     "call_key": "VARCHAR",
     "provider": "VARCHAR",
@@ -68,17 +68,17 @@ COLUMNS = {
     "body": "VARCHAR",
     "attempts": "VARCHAR",
 }
-"""docs/recordings.md says what they mean."""
+"""Columns with their SQL types; docs/recordings.md has their meanings."""
 SLOT = ("condition", "repetition", "side", "decision", "sample_set")
-# Far beyond any sweep; a file that claims more was made to do harm.
+# Far beyond any sweep; a file that claims more is hostile.
 MOST_CALLS = 10_000_000
 BLOCK, MOST_BLOCK_BYTES = 2048, 2**28
-"""DuckDB hands out this many rows at once, and their texts may have this many bytes."""
+"""Number of rows that DuckDB returns at once, and the maximum bytes of their texts."""
 MOST_GROUP_BYTES = 2 * MOST_BLOCK_BYTES
-"""What decoding a row group may take: an export writes little more than BLOCK rows into one."""
+"""Maximum bytes to decode a row group; an export writes about BLOCK rows into one."""
 WRITTEN_AT_ONCE = 16
 SHOWN = 70
-# Misses that differ in numbers alone have one cause.
+# Misses that differ only in numbers have one cause.
 _NUMBER = re.compile(r"-?\d+(\.\d+)?")
 SETTINGS: Settings = {
     **database.SETTINGS,
@@ -89,10 +89,10 @@ SETTINGS: Settings = {
 
 
 class RecordedSweep(BaseModel):
-    """A sweep in a recording; ``repetitions`` of each prompt variant, in each condition.
+    """Sweep in a recording, read from the configuration of any version of the program.
 
-    It is read from the configuration of any version that wrote a recording. ``arms`` has the
-    labels of the arms of a study; recordings of plain sweeps may have none.
+    ``repetitions`` are by prompt variant, for each condition. ``arms`` has the labels of the arms
+    of a study; recordings of plain sweeps may have none.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -116,10 +116,10 @@ class RecordedSweep(BaseModel):
 def export_recording(
     file: Path, cache: ResponseCache, keys: list[str], provenance: dict[str, str]
 ) -> int:
-    """Write the entries under these keys, in their order; returns their number.
+    """Write the calls with these keys in this order, and return their number.
 
-    Raises RecordingError. Damaged entries are left out; once the others are written, the error
-    names them.
+    Raises RecordingError. Damaged calls are left out; the error names them after the others are
+    written.
     """
     if file.is_dir():
         raise UsageError(f"{file} is a folder: name a file")
@@ -135,9 +135,9 @@ def export_recording(
             columns = ", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())
             connection.execute(f"CREATE TABLE calls ({columns})")
             content, rows = hashlib.sha256(), _exported_rows(cache, keys, damaged)
-            while batch := list(islice(rows, WRITTEN_AT_ONCE)):
-                append(connection, "calls", batch)
-                for row in batch:
+            while chunk := list(islice(rows, WRITTEN_AT_ONCE)):
+                append(connection, "calls", chunk)
+                for row in chunk:
                     content.update(_fingerprint(row[0], row[-1]))
             metadata = {
                 **provenance,
@@ -165,7 +165,7 @@ def export_recording(
 
 
 def _exported_rows(cache: ResponseCache, keys: list[str], damaged: list[str]) -> Iterator[Row]:
-    """Yield the rows of the entries under these keys; what is wrong with others is noted."""
+    """Yield the rows of the calls with these keys; add errors of damaged calls to ``damaged``."""
     for key in keys:
         try:
             entry = cache.get(key)
@@ -186,10 +186,10 @@ def _exported_rows(cache: ResponseCache, keys: list[str], damaged: list[str]) ->
 
 
 def read_recording(file: Path) -> Iterator[CachedCall]:
-    """Yield all entries of a recording, each verified; raises RecordingError."""
+    """Yield all calls of a recording, each verified; raises RecordingError."""
     seen: set[str] = set()
     content = hashlib.sha256()
-    with opened(file) as (connection, told):
+    with opened(file) as (connection, metadata):
         rows = connection.execute(f"SELECT {', '.join(COLUMNS)} FROM recording")  # noqa: S608 # constants
         for number, values in enumerate(fetched(rows), 1):
             try:
@@ -201,8 +201,9 @@ def read_recording(file: Path) -> Iterator[CachedCall]:
             seen.add(entry.request.key)
             content.update(_fingerprint(values[0], values[-1]))
             yield entry
-    found = {"calls": str(len(seen)), "content_sha256": content.hexdigest()}
-    if told != told | found or told.get(PROVENANCE_HASH) != _provenance_hash(told):
+    actual = {"calls": str(len(seen)), "content_sha256": content.hexdigest()}
+    is_complete = metadata == metadata | actual
+    if not is_complete or metadata.get(PROVENANCE_HASH) != _provenance_hash(metadata):
         raise RecordingError(
             f"{file} is not as it was exported: its calls, or what it says of where it comes from, "
             "have another hash"
@@ -211,9 +212,9 @@ def read_recording(file: Path) -> Iterator[CachedCall]:
 
 @contextmanager
 def spilled(files: Iterable[Path]) -> Iterator[Overlay]:
-    """Open recordings as their verified entries by key, and count these.
+    """Open recordings as their verified calls by key, with a count of their kinds.
 
-    Raises RecordingError, also where two recordings hold different replies to one call.
+    Raises RecordingError, also for two recordings with different replies to one call.
     """
     with closing(sqlite3.connect("", check_same_thread=False)) as db:
         db.execute("CREATE TABLE entries (key TEXT PRIMARY KEY, entry TEXT)")
@@ -221,7 +222,7 @@ def spilled(files: Iterable[Path]) -> Iterator[Overlay]:
 
 
 def _spill(files: Iterable[Path], db: sqlite3.Connection) -> Iterator[tuple[ChatRequest, Attempt]]:
-    """Write recordings' entries, and yield the request and the answer of each."""
+    """Write the calls of recordings, and yield the request and the last attempt of each."""
     entries = Spilled(db)
     for file in files:
         for entry in read_recording(file):
@@ -239,7 +240,7 @@ def _spill(files: Iterable[Path], db: sqlite3.Connection) -> Iterator[tuple[Chat
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Spilled(Mapping[str, CachedCall]):
-    """Entries by key in a temporary database; SQLite keeps a large one in a file."""
+    """Calls by key in a temporary database, which SQLite moves into a file when it is large."""
 
     _db: sqlite3.Connection
 
@@ -261,9 +262,9 @@ class Spilled(Mapping[str, CachedCall]):
 
 
 def import_recording(file: Path, cache: ResponseCache) -> tuple[int, int]:
-    """Verify the whole file, then add what the cache lacks; returns (added, already there).
+    """Verify the whole file, then add the calls that the cache lacks; return (added, present).
 
-    The file is read twice, so that nothing of a file whose damage shows only at its end is added.
+    The file is read twice, so that nothing is added from a file that is damaged at its end.
     """
     for _ in read_recording(file):
         pass
@@ -271,10 +272,10 @@ def import_recording(file: Path, cache: ResponseCache) -> tuple[int, int]:
 
 
 def summarise(file: Path) -> dict[str, Any]:
-    """Verify a recording and count what it holds: its calls, by model, endpoint and outcome.
+    """Verify a recording and count its calls by model, endpoint and outcome.
 
-    Of the calls a mock model answered ``scripted``; ``cost_usd`` is what its replies cost when they
-    were made. ``plugins`` are the files whose source it carries.
+    ``scripted`` is the number of calls that a mock model answered, ``cost_usd`` the cost of the
+    replies when they were made. ``plugins`` are the files whose source the recording has.
     """
     names = ("models_requested", "models_served", "endpoints", "outcomes")
     counts = {name: Counter[str]() for name in names}
@@ -284,15 +285,15 @@ def summarise(file: Path) -> dict[str, Any]:
         request, last = entry.request, entry.attempts[-1]
         numbers.update(calls=1, scripted=is_scripted(request, last), attempts=len(entry.attempts))
         cost_usd += sum(attempt.cost_usd or 0.0 for attempt in entry.attempts)
-        told = (request.model, last.model_served or "unknown", request.endpoint, last.outcome)
-        for count, value in zip(counts.values(), told, strict=True):
+        values = (request.model, last.model_served or "unknown", request.endpoint, last.outcome)
+        for count, value in zip(counts.values(), values, strict=True):
             count[value] += 1
-    told_of = {"plugins": carried_plugins(provenance), "provenance": provenance}
-    return {**numbers, "cost_usd": round(cost_usd, 6), **counts, **told_of}
+    origin = {"plugins": carried_plugins(provenance), "provenance": provenance}
+    return {**numbers, "cost_usd": round(cost_usd, 6), **counts, **origin}
 
 
 def summary_lines(file: Path, summary: dict[str, Any]) -> Iterator[str]:
-    """Yield the summary of a recording (``summarise``) for a reader."""
+    """Yield the summary of a recording (``summarise``) as lines of text."""
     for row in sweep_rows(summary["provenance"]):
         study, trials, models = "unknown", "unknown", ""
         with suppress(*DAMAGED):
@@ -303,10 +304,10 @@ def summary_lines(file: Path, summary: dict[str, Any]) -> Iterator[str]:
             ]
             planned = sum(arm["repetitions"] for arm in arms) * len(config["conditions"])
             trials = f"{planned} of {models}"
-        asked = (str(row.get(when) or "?")[:16] for when in ("started_at", "ended_at"))
+        times = (str(row.get(name) or "?")[:16] for name in ("started_at", "ended_at"))
         yield one_line(f"study    {study}")
         yield one_line(f"trials   {trials}")
-        yield f"played   {' to '.join(asked)} UTC"
+        yield f"played   {' to '.join(times)} UTC"
     for model, calls in summary["models_requested"].items():
         yield f"model    {model}: {calls} calls"
     scripted, calls = summary["scripted"], summary["calls"]
@@ -322,18 +323,18 @@ def summary_lines(file: Path, summary: dict[str, Any]) -> Iterator[str]:
 
 
 def _fingerprint(key: str, attempts: str) -> bytes:
-    """Return what a recording's hash covers of a row; the key covers the rest."""
+    """Return the part of a row that the recording's hash covers; the key covers the rest."""
     return f"{key} {attempts}\n".encode()
 
 
 def _provenance_hash(metadata: dict[str, str]) -> str:
-    """Return a hash of everything that a file says about itself."""
-    told = {name: text for name, text in metadata.items() if name != PROVENANCE_HASH}
-    return hashlib.sha256(canonical_json(told).encode()).hexdigest()
+    """Return a hash of a file's metadata."""
+    hashed = {name: text for name, text in metadata.items() if name != PROVENANCE_HASH}
+    return hashlib.sha256(canonical_json(hashed).encode()).hexdigest()
 
 
 def _entry(row: dict[str, Any]) -> CachedCall:
-    """Return the entry of a row, which belongs to its key; raises one of DAMAGED."""
+    """Return the call of a row after a check against its key; raises one of DAMAGED."""
     check_body(row["body"])
     request = {name: row[name] for name in ("provider", "endpoint", "model", "path", "body")}
     request |= {"key": row["call_key"], "slot": {name: row[name] for name in SLOT}}
@@ -346,13 +347,13 @@ def _entry(row: dict[str, Any]) -> CachedCall:
 
 @contextmanager
 def opened(file: Path) -> Iterator[tuple[duckdb.DuckDBPyConnection, dict[str, str]]]:
-    """Open a recording as the view ``recording``, with its metadata; raises RecordingError.
+    """Open a recording as the view ``recording`` with its metadata, neither of them verified.
 
-    Neither is verified.
+    Raises RecordingError.
     """
     if not file.is_file():
         raise UsageError(f"there is no recording {file}")
-    # A pattern that matches the file alone, whatever its name.
+    # Escaped, so that the pattern matches this file only.
     pattern = quoted(re.sub(r"([*?\[])", r"[\1]", str(file.resolve())))
     with in_memory(SETTINGS) as connection:
         try:
@@ -387,11 +388,11 @@ def opened(file: Path) -> Iterator[tuple[duckdb.DuckDBPyConnection, dict[str, st
 def _refuse_bombs(file: Path, pattern: str, connection: duckdb.DuckDBPyConnection) -> None:
     """Raise RecordingError for more rows or longer texts than recordings have.
 
-    Nothing is decoded before it is known how much that takes.
+    The size of the decoded data is known before anything is decoded.
     """
     not_ours = f"{file} is not one of our recordings"
     ((calls,),) = connection.execute("SELECT count(*) FROM recording").fetchall()
-    if calls > MOST_CALLS:  # what a footer claims is not there to be read
+    if calls > MOST_CALLS:  # the footer's claim, before any row is read
         raise RecordingError(f"{not_ours}: it claims {calls} calls")
     try:
         largest = max(group_bytes(file, pattern, connection), default=0)
@@ -411,15 +412,15 @@ def _refuse_bombs(file: Path, pattern: str, connection: duckdb.DuckDBPyConnectio
 
 
 def read_provenance(file: Path) -> dict[str, str]:
-    """Return what a recording says about its origin, not verified; raises RecordingError."""
+    """Return a recording's metadata, not verified; raises RecordingError."""
     with opened(file) as (_, metadata):
         return metadata
 
 
 def provenance_of(sweeps: list[dict[str, Any]]) -> dict[str, str]:
-    """Return the metadata of the sweeps that a recording is made of.
+    """Return the metadata of the sweeps of a recording.
 
-    The command line, whose paths tell of people and machines, stays in the database.
+    The command line is left out: its paths may name people and machines.
     """
     rows = [
         {name: str(value) for name, value in row.items() if value is not None} for row in sweeps
@@ -432,7 +433,7 @@ def provenance_of(sweeps: list[dict[str, Any]]) -> dict[str, str]:
 
 
 def carried_plugins(provenance: dict[str, str]) -> list[str]:
-    """Return the names of the plug-ins whose source a recording carries, as it says itself."""
+    """Return the names of the plug-ins in a recording's metadata, not verified."""
     names = set[str]()
     for row in sweep_rows(provenance):
         with suppress(*DAMAGED):
@@ -441,7 +442,7 @@ def carried_plugins(provenance: dict[str, str]) -> list[str]:
 
 
 def described_sweeps(provenance: dict[str, str]) -> list[RecordedSweep]:
-    """Return the sweeps as a recording says itself, without those whose configuration is odd."""
+    """Return the sweeps in a recording's metadata, without those with invalid configurations."""
     sweeps = []
     for row in sweep_rows(provenance):
         with suppress(*DAMAGED):
@@ -450,7 +451,7 @@ def described_sweeps(provenance: dict[str, str]) -> list[RecordedSweep]:
 
 
 def sweep_rows(provenance: dict[str, str]) -> list[Any]:
-    """Return the rows of sweeps that a recording has, as it says itself."""
+    """Return the rows of sweeps in a recording's metadata, not verified."""
     with suppress(*DAMAGED):
         return [row for row in json.loads(provenance[SWEEPS]) if isinstance(row, dict)]
     return [provenance]
@@ -459,10 +460,10 @@ def sweep_rows(provenance: dict[str, str]) -> list[Any]:
 def recorded_part(
     files: Iterable[Path], names: Collection[str], model: str, sample_set: int
 ) -> RecordedSweep | None:
-    """What recordings hold of one sweep: all that several of them, or several runs, hold of it.
+    """Return the recorded part of a sweep, merged over recordings and runs; None without any.
 
-    It may have several ``names``. Repetitions and conditions of which no call is there are no part
-    of it. None where no recording says that it is of this sweep. Raises RecordingError.
+    The sweep may have several ``names``. Repetitions and conditions without a recorded call are
+    left out. Raises RecordingError.
     """
     part = None
     for file in files:
@@ -485,7 +486,7 @@ def recorded_part(
 
 
 def described(files: Sequence[Path], entries: Iterable[CachedCall]) -> str:
-    """What recordings hold, or a cache without files: how many calls of each model."""
+    """Return in words how many calls of each model the recordings (or the cache) hold."""
     models = Counter(entry.request.model for entry in entries)
     counts = ", ".join(f"{calls} calls of {model}" for model, calls in sorted(models.items()))
     named = ", ".join(map(str, files)) or "the cache"
@@ -494,24 +495,24 @@ def described(files: Sequence[Path], entries: Iterable[CachedCall]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Miss:
-    """A call that a replay lacked, and the trial that needed it."""
+    """Call without a recorded reply, and the trial that needed it."""
 
     trial_id: str
     request: ChatRequest
 
 
 def explain(misses: list[Miss], recorded: Iterable[CachedCall]) -> list[str]:
-    """How each miss differs from the nearest request: one text for all that differ in the same way.
+    """Return how misses differ from the nearest recorded request, one text per kind of difference.
 
-    The text names the first trial, side and decision, and how many more there are. The nearest
-    request is one of the same slot, else one of the same place in another repetition, else any;
-    among several of one slot, the one with the fewest differences.
+    The text names the first trial, side and decision, and the number of further ones. The nearest
+    request has the same slot, else the same condition, side and decision, else it is any; among
+    several of one slot, it is the one with the fewest differences.
     """
     place = attrgetter("condition", "side", "decision")
-    wanted = {miss.request.slot for miss in misses}
+    slots = {miss.request.slot for miss in misses}
     known: dict[object, list[ChatRequest]] = {}  # by slot, the first by place, the first of all
     for request in (entry.request for entry in recorded):
-        if request.slot in wanted:
+        if request.slot in slots:
             known.setdefault(request.slot, []).append(request)
         for key in (place(request.slot), None):
             known.setdefault(key, [request])
@@ -519,9 +520,9 @@ def explain(misses: list[Miss], recorded: Iterable[CachedCall]) -> list[str]:
     for miss in misses:
         keys = (miss.request.slot, place(miss.request.slot), None)
         near = next((known[key] for key in keys if key in known), [])
-        found = min((_differences(other, miss.request) for other in near), key=len, default=[])
-        text = f"the nearest recorded request differs in {'; '.join(found)}"
-        text = text if found else "nothing is recorded at all"
+        fields = min((_differences(other, miss.request) for other in near), key=len, default=[])
+        text = f"the nearest recorded request differs in {'; '.join(fields)}"
+        text = text if fields else "nothing is recorded at all"
         alike.setdefault(_NUMBER.sub("0", text), []).append((miss, text))
     lines = []
     for group in alike.values():
@@ -533,9 +534,9 @@ def explain(misses: list[Miss], recorded: Iterable[CachedCall]) -> list[str]:
     return lines
 
 
-def _differences(recorded: ChatRequest, wanted: ChatRequest) -> list[str]:
-    """Return the fields that differ, each with both values; of texts the first lines that do."""
-    old, new, texts = _fields(recorded), _fields(wanted), []
+def _differences(recorded: ChatRequest, expected: ChatRequest) -> list[str]:
+    """Return the differing fields with both values; for texts the first differing lines."""
+    old, new, texts = _fields(recorded), _fields(expected), []
     for name in sorted(old.keys() | new.keys()):
         before, after = old.get(name), new.get(name)
         if isinstance(before, str) and isinstance(after, str):
@@ -549,14 +550,14 @@ def _differences(recorded: ChatRequest, wanted: ChatRequest) -> list[str]:
 
 
 def _fields(request: ChatRequest) -> dict[str, object]:
-    """The fields that a request's key covers, those of its body each by its path."""
-    told = {"endpoint": request.endpoint, "path": request.path, "headers": request.headers}
+    """Return the values that a request's key covers, by the path of each."""
+    parts = {"endpoint": request.endpoint, "path": request.path, "headers": request.headers}
     body = json.loads(request.body)
-    return dict(leaves({**asdict(request.slot), **told, "body": body}))
+    return dict(leaves({**asdict(request.slot), **parts, "body": body}))
 
 
 def leaves(value: object, name: str = "") -> Iterator[tuple[str, object]]:
-    """Yield the values within a JSON value, each with its path."""
+    """Yield (path, value) for each scalar within a JSON value."""
     if isinstance(value, dict | list):
         for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
             yield from leaves(inner, f"{name}.{key}".lstrip("."))

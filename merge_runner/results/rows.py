@@ -1,4 +1,4 @@
-"""A trial's record as rows of the tables (schema.sql), and these against the stored ones."""
+"""Rows of the tables (schema.sql) of a trial's record, and their comparison with stored rows."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ TrialKey = tuple[str, str]
 """(trial_id, spec_hash)"""
 
 SHOWN = 60
-"""Characters of a value that differs."""
-AT_ONCE = 32
-"""Trials whose rows are in memory together."""
+"""Maximum characters of a differing value in a message."""
+TRIALS_AT_ONCE = 32
+"""Number of trials whose rows are in memory together."""
 
-_OF_THESE = (
+_OF_TRIALS = (
     "SEMI JOIN (SELECT unnest(?) AS trial_id, unnest(?) AS spec_hash) USING (trial_id, spec_hash)"
 )
 _SPANS = (
     "SELECT (trial_id, spec_hash), (min(rowid), max(rowid)) FROM {} GROUP BY trial_id, spec_hash"
 )
 FACTORS = "trial_factors"
-# What identifies a row within a trial.
+# Key columns of a row within a trial.
 PLACES: dict[str, tuple[str, ...]] = {
     "trials": (),
     FACTORS: ("factor",),
@@ -52,14 +52,14 @@ PLACES: dict[str, tuple[str, ...]] = {
     "decisions": ("decision", "side"),
     "calls": ("decision", "side", "attempt"),
 }
-# Fields that are columns side by side; dataclasses.astuple would copy each value.
+# Fields that are adjacent columns; dataclasses.astuple would copy each value.
 _state = attrgetter(*(field.name for field in fields(StateRow)))
 _usage = attrgetter(*(field.name for field in fields(Usage)))
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
 
 
 def rows_of(record: TrialRecord) -> dict[str, list[Row]]:
-    """All rows of a trial, by table."""
+    """Return the rows of a trial by table."""
     spec, condition = record.spec, record.spec.kinematics
     key = (spec.trial_id, spec.spec_hash)
     trial = (
@@ -83,7 +83,7 @@ def rows_of(record: TrialRecord) -> dict[str, list[Row]]:
 
 
 def factor_rows(spec: TrialSpec) -> Iterator[Row]:
-    """Rows of ``trial_factors``."""
+    """Return the rows of ``trial_factors`` of a trial."""
     key = (spec.trial_id, spec.spec_hash)
     return ((*key, factor, level, factor in spec.words) for factor, level in spec.factors)
 
@@ -100,23 +100,23 @@ def _decision_rows(record: TrialRecord) -> Iterator[Row]:
             prompt,
             None if prompt is None else hashlib.sha256(prompt.encode()).hexdigest(),
             None if decision.reply is None else decision.reply.request.key,
-            *_told(row.told),
+            *_perceived(row.observed),
         )
 
 
-def _told(told: Observation | None) -> Row:
-    """What a driver was told, of the other vehicle only where it was seen; NULLs: the truth."""
-    if told is None:
+def _perceived(seen: Observation | None) -> Row:
+    """Return the columns of a noisy observation; NULLs: noise-free, or an unseen vehicle."""
+    if seen is None:
         return (None,) * 7
     other: Row = (None,) * 4
-    if told.other_seen:
-        other = (told.relative_distance_m, told.other_speed_mps, told.other_acceleration_mps2)
-        other = (*other, list(told.other_speeds_mps))
-    return (told.other_seen, told.own_position_m, told.own_speed_mps, *other)
+    if seen.other_seen:
+        other = (seen.relative_distance_m, seen.other_speed_mps, seen.other_acceleration_mps2)
+        other = (*other, list(seen.other_speeds_mps))
+    return (seen.other_seen, seen.own_position_m, seen.own_speed_mps, *other)
 
 
 def call_row(key: TrialKey, request: ChatRequest, attempt: Attempt, *, cached: bool) -> Row:
-    """The row of an attempt at a decision's call."""
+    """Return the row of ``calls`` of an attempt."""
     return (
         *(request.key, *key, request.slot.side, request.slot.decision, attempt.number),
         *(request.provider, request.model, attempt.model_served, attempt.http_status),
@@ -130,13 +130,13 @@ def call_row(key: TrialKey, request: ChatRequest, attempt: Attempt, *, cached: b
 
 
 def _as_json(attempt: Attempt) -> str | None:
-    """A reply that is not JSON, such as a proxy's HTML page, becomes a JSON string.
+    """Return a reply as JSON; a reply that is not JSON, such as HTML, becomes a JSON string.
 
-    So does one that the database would refuse: with half of a surrogate pair, or nested deeper than
-    any honest reply. An answer was read as JSON already.
+    So does a reply that the database would refuse: with half of a surrogate pair, or nested too
+    deeply. A valid answer was parsed as JSON before.
     """
     text = attempt.reply
-    # Most texts have nothing that needs a search for half a pair.
+    # Most texts need no search for half a surrogate pair.
     plain = text is None or (text.isascii() and "\\u" not in text)
     answered = attempt.http_status == 200 and attempt.outcome in ANSWERS
     if text is None or (answered and (plain or not _SURROGATE.search(text))):
@@ -149,9 +149,10 @@ def _as_json(attempt: Attempt) -> str | None:
 
 
 class Difference(NamedTuple):
-    """What differs in rows of a trial: ``name`` is TABLE.COLUMN, or says that it is the rows.
+    """Difference between stored and expected rows of a trial.
 
-    ``place`` is that of the first of them, and ``text`` says how it differs.
+    ``name`` is TABLE.COLUMN, or ``rows of TABLE``. ``place`` has the key columns of the first
+    differing row, and ``text`` describes the difference.
     """
 
     name: str
@@ -168,28 +169,28 @@ class Stored:
     rows: dict[TrialKey, list[Row]]
 
     def named(self, key: TrialKey) -> Iterator[dict[str, Any]]:
-        """The rows of a trial, each by the names of its columns."""
+        """Return the rows of a trial as dictionaries by column."""
         return (dict(zip(self.names, row, strict=True)) for row in self.rows.get(key, ()))
 
     def differences(
         self,
         key: TrialKey,
-        wanted: Iterable[Row],
+        expected: Iterable[Row],
         *,
         ignored: Collection[str] = (),
         tolerance: float = 0.0,
     ) -> Iterator[Difference]:
-        """The differences of a trial's stored rows from the wanted ones."""
+        """Yield the differences between a trial's stored and expected rows."""
         names, stored = PLACES[self.table], self.rows.get(key, [])
         at = [self.names.index(name) for name in names]
         old = {tuple(row[i] for i in at): row for row in stored}
-        new = {tuple(row[i] for i in at): row for row in wanted}
-        odd = new.keys() ^ old.keys()
-        if self.table == FACTORS:  # another study may have other ones for the same trial
-            odd -= old.keys()
-        if number := len(odd) + len(stored) - len(old):
+        new = {tuple(row[i] for i in at): row for row in expected}
+        unmatched = new.keys() ^ old.keys()
+        if self.table == FACTORS:  # another study may have other factors for the same trial
+            unmatched -= old.keys()
+        if number := len(unmatched) + len(stored) - len(old):
             yield self._difference(
-                f"rows of {self.table}", min(odd or old), number, "are missing or too many"
+                f"rows of {self.table}", min(unmatched or old), number, "are missing or too many"
             )
         common = [place for place in new if place in old and old[place] != new[place]]
         for index, name in enumerate(self.names):
@@ -214,7 +215,7 @@ def stored_rows(
     keys: Sequence[TrialKey],
     span: tuple[int, int] | None = None,
 ) -> Stored:
-    """The rows of these trials."""
+    """Return the rows of a table for these trials."""
     result = rows_of_trials(connection, "*", table, keys, span)
     names, rows = names_of(result), defaultdict[TrialKey, list[Row]](list)
     key = itemgetter(*map(names.index, ("trial_id", "spec_hash")))
@@ -230,17 +231,17 @@ def rows_of_trials(
     keys: Sequence[TrialKey],
     span: tuple[int, int] | None = None,
 ) -> duckdb.DuckDBPyConnection:
-    """A query for the rows of these trials, to be fetched.
+    """Query the rows of a table for these trials, and return the result to fetch.
 
-    A trial's rows lie together in the table. Their place, the ``span`` of their row ids, is looked
-    up first, so that no other rows are read.
+    The rows of a trial are adjacent in the table. The ``span`` of their row ids is looked up first,
+    so that no other rows are read.
     """
     names = [[key[0] for key in keys], [key[1] for key in keys]]
     if span is None:
-        sql = f"SELECT min(rowid), max(rowid) FROM {table} {_OF_THESE}"  # noqa: S608 # constants
+        sql = f"SELECT min(rowid), max(rowid) FROM {table} {_OF_TRIALS}"  # noqa: S608 # constants
         (span,) = connection.execute(sql, names).fetchall()
     return connection.execute(
-        f"SELECT {columns} FROM {table} {_OF_THESE} WHERE rowid BETWEEN ? AND ?",  # noqa: S608 # constants
+        f"SELECT {columns} FROM {table} {_OF_TRIALS} WHERE rowid BETWEEN ? AND ?",  # noqa: S608 # constants
         [*names, *span],
     )
 
@@ -248,26 +249,26 @@ def rows_of_trials(
 def in_order(
     connection: duckdb.DuckDBPyConnection, keys: Collection[TrialKey]
 ) -> Iterator[tuple[TrialKey, dict[str, Stored]]]:
-    """Yield trials with their rows of each table, in the order in which they are stored.
+    """Yield trials with their rows of each table, in storage order.
 
-    The rows of a few are read at once, which are one stretch of each table.
+    The rows of TRIALS_AT_ONCE trials are read together: one range of row ids in each table.
     """
     spans: dict[str, dict[TrialKey, tuple[int, int]]] = {
         table: dict(connection.execute(_SPANS.format(table)).fetchall()) for table in PLACES
     }
     stored = sorted(keys & spans["trials"].keys(), key=spans["trials"].__getitem__)
-    for first in range(0, len(stored), AT_ONCE):
-        some, tables = stored[first : first + AT_ONCE], {}
-        for table, of_trials in spans.items():
-            ends = [*chain.from_iterable(of_trials.get(key, ()) for key in some)] or [0]
-            tables[table] = stored_rows(connection, table, some, (min(ends), max(ends)))
-        yield from ((key, tables) for key in some)
+    for first in range(0, len(stored), TRIALS_AT_ONCE):
+        chunk, tables = stored[first : first + TRIALS_AT_ONCE], {}
+        for table, by_trial in spans.items():
+            ends = [*chain.from_iterable(by_trial.get(key, ()) for key in chunk)] or [0]
+            tables[table] = stored_rows(connection, table, chunk, (min(ends), max(ends)))
+        yield from ((key, tables) for key in chunk)
 
 
-def same_value(one: Any, other: Any, tolerance: float) -> bool:  # noqa: ANN401 # any value of a table
-    """Whether two values of a table are equal; numbers, even within lists, within the tolerance."""
-    if isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
-        return all(same_value(a, b, tolerance) for a, b in zip(one, other, strict=True))
-    if not (isinstance(one, float) and isinstance(other, float)):
-        return bool(one == other)
-    return one == other or abs(one - other) <= tolerance
+def same_value(left: Any, right: Any, tolerance: float) -> bool:  # noqa: ANN401 # any value of a table
+    """Return whether two table values are equal; floats, also in lists, within the tolerance."""
+    if isinstance(left, list) and isinstance(right, list) and len(left) == len(right):
+        return all(same_value(a, b, tolerance) for a, b in zip(left, right, strict=True))
+    if not (isinstance(left, float) and isinstance(right, float)):
+        return bool(left == right)
+    return left == right or abs(left - right) <= tolerance

@@ -1,4 +1,4 @@
-"""Results in DuckDB. The file is open only while a batch is written, so that others can read it."""
+"""Results in DuckDB. The file is open only during a transaction, so that others can read it."""
 
 from __future__ import annotations
 
@@ -50,17 +50,17 @@ from merge_runner.results.rows import (
 from merge_runner.scenarios.merge.measures import measures_sql
 from merge_runner.served_model import other_models
 
-# Columns that differ from run to run: whether the run made an attempt itself, and when.
-OF_A_RUN = frozenset({"cached", "started_at", "latency_s"})
+# Columns that depend on the run: whether it made an attempt itself, and when.
+RUN_COLUMNS = frozenset({"cached", "started_at", "latency_s"})
 FACTS = Path(__file__).with_name("facts.sql")
 SWEEPS = "FROM sweeps ORDER BY started_at"
-# The trials of some sweeps that no other one has.
-GOING = """
-CREATE OR REPLACE TEMP TABLE going AS
+# Trials that only the sweeps to delete have.
+TO_DELETE = """
+CREATE OR REPLACE TEMP TABLE to_delete AS
 SELECT trial_id, spec_hash FROM sweep_trials
 GROUP BY ALL HAVING bool_and(list_contains(?, sweep_id))
 """
-# By their slots.
+# Sorted by slot.
 CALLS_OF = """
 SELECT DISTINCT condition, rep, side, decision, sample_set, call_key
 FROM decisions JOIN trials USING (trial_id, spec_hash)
@@ -72,9 +72,9 @@ SELECT sweep_id FROM sweeps SEMI JOIN (
     FROM sweep_trials SEMI JOIN calls USING (trial_id, spec_hash)
 ) USING (sweep_id) ORDER BY started_at
 """
-# The first and the third of these columns order the rows of a trial. Digests keep the value that
-# the source of a first decision had in schema 9.
-OF_THE_DIGEST = {
+# The first and the third column order the rows of a trial. A digest has the value that the source
+# of a first decision had in schema 9.
+DIGEST_COLUMNS = {
     "trials": "pair, if(source = 'first_decision', 'seat', source), model_left, model_right, "
     "variant, condition, rep, sample_set, status, merged_first, end_time_s, error",
     "states": "step, time_s, side, position_m, velocity_mps, acceleration_mps2",
@@ -84,10 +84,10 @@ OF_THE_DIGEST = {
 
 
 class Store:
-    """Writes sweeps and whole trials; every method is one short transaction."""
+    """Writer of sweeps and whole trials; every method is one short transaction."""
 
     def __init__(self, path: Path) -> None:
-        """Open or make the database; raises UsageError for a foreign one or another schema."""
+        """Open or create the database; raises UsageError for a foreign file or another schema."""
         self.path = path
         if path.exists() and not path.is_file():
             raise UsageError(f"{path} is not a file: name one with --db")
@@ -107,9 +107,9 @@ class Store:
     def begin_sweep(
         self, sweep: dict[str, Any], specs: dict[str, str], stored: Sequence[TrialSpec]
     ) -> None:
-        """Add a sweep's row, what its spec hashes stand for, and its trials already stored.
+        """Add a sweep with its specs, and link its trials that are already stored.
 
-        Their levels are added, too, which another study may have stored without.
+        Their factor levels are added as well: another study may have stored them without.
         """
         with write_database(self.path) as connection:
             connection.execute("INSERT INTO sweeps BY NAME SELECT unnest(?)", [sweep])
@@ -119,7 +119,7 @@ class Store:
             _add_factors(connection, [*chain.from_iterable(map(factor_rows, stored))])
 
     def end_sweep(self, sweep_id: str, ended_at: datetime, exit_code: int) -> None:
-        """Note when and how a sweep ended."""
+        """Store the end time and the exit code of a sweep."""
         with write_database(self.path) as connection:
             connection.execute(
                 "UPDATE sweeps SET ended_at = ?, exit_code = ? WHERE sweep_id = ?",
@@ -127,28 +127,28 @@ class Store:
             )
 
     def ended_trials(self, specs: Mapping[TrialKey, TrialSpec]) -> set[TrialKey]:
-        """The keys of those trials that are stored and did not fail.
+        """Return the keys of the trials that are stored and did not fail.
 
-        Raises UsageError where one of their conditions had other numbers when they were stored:
-        the spec's hash does not cover these.
+        Raises UsageError if a condition is stored with other numbers, which spec hashes do not
+        cover.
         """
-        named = list(specs)
+        keys = list(specs)
         kinematics = {spec.condition: spec.kinematics for spec in specs.values()}
         columns = "DISTINCT condition, projected_headway_m, relative_velocity_mps"
         with read_database(self.path) as connection:
-            for name, *numbers in rows_of_trials(connection, columns, "trials", named).fetchall():
+            for name, *numbers in rows_of_trials(connection, columns, "trials", keys).fetchall():
                 condition = kinematics[name]
                 if numbers != [condition.projected_headway_m, condition.relative_velocity_mps]:
                     raise UsageError(
                         f"the condition {name} is stored with a headway of {numbers[0]:g} m and a "
                         f"relative velocity of {numbers[1]:g} m/s: give the changed one a new name"
                     )
-            return {key for key, ended in _ended(connection, named).items() if ended}
+            return {key for key, ended in _ended(connection, keys).items() if ended}
 
     def decisions_by_spec(self, spec_hashes: Collection[str]) -> list[tuple[Any, ...]]:
-        """Of the trials that did not fail, by spec and side, how many decisions are (in)valid.
+        """Count valid and invalid decisions by spec and side, without failed trials.
 
-        (spec_hash, side, valid ones, invalid ones, failure and rationale of an invalid one)
+        Rows: (spec_hash, side, valid, invalid, failure and rationale of the first invalid one).
         """
         sql = """
             SELECT spec_hash, side, count(*) FILTER (valid), count(*) FILTER (NOT valid),
@@ -169,12 +169,12 @@ class Store:
         *,
         patience_s: float = PATIENCE_S,
     ) -> dict[str, list[str]]:
-        """Store whole trials, replacing failed ones; those that had ended are compared instead.
+        """Store whole trials, replacing failed ones; compare those that are already stored.
 
-        They are linked to a sweep, unless they were recorded elsewhere. Returns the ids of those
-        that are stored with other values, and in which columns.
+        They are linked to a sweep unless ``sweep_id`` is None. Returns the ids of trials that are
+        stored with other values, with the differing columns.
         """
-        # Made before the lock is taken, although a trial that is stored already needs none.
+        # Before the lock is taken, although trials that are already stored need no rows.
         played = [(_key(record), record.status, rows_of(record)) for record in records]
         texts = [len(str(value)) for *_, rows in played for row in rows["calls"] for value in row]
         with write_database(self.path, patience_s) as connection:
@@ -189,10 +189,10 @@ class Store:
     def add_recorded(
         self, records: Sequence[TrialRecord], specs: Mapping[str, str]
     ) -> tuple[int, int, list[str]]:
-        """Store recorded trials, which belong to no sweep; one already stored stays as it is.
+        """Store recorded trials without a sweep; trials that are already stored do not change.
 
-        Returns how many were added, how many were stored already, and the ids of those that are
-        stored with other values.
+        Returns the number added, the number already stored, and the ids of trials that are stored
+        with other values.
         """
         keys = {_key(record): record.spec for record in records}
         added = len(keys.keys() - self.ended_trials(keys))
@@ -201,9 +201,9 @@ class Store:
 
 
 def query(path: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
-    """Run one read-only query; returns the column names and the rows. Raises UsageError.
+    """Run one read-only query and return its column names and rows; raises UsageError.
 
-    It reaches no file and no network, and changes no setting.
+    The query has no access to files, the network or settings.
     """
     with answer(path, sql) as result:
         return names_of(result), result.fetchall()
@@ -211,10 +211,10 @@ def query(path: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
 
 @contextmanager
 def answer(path: Path, sql: str) -> Iterator[duckdb.DuckDBPyConnection]:
-    """The result of a query, to be fetched; the database is locked until the block ends."""
-    # The settings hold for a whole instance, and cannot be taken back.
+    """Yield the result of a query to fetch; the database is locked until the block ends."""
+    # The restrictions hold for a whole instance and cannot be lifted.
     with read_database(path, Instance()) as connection:
-        # DuckDB looks at no signal while several of its threads work on a query.
+        # DuckDB ignores signals while several of its threads work on a query.
         connection.execute("SET threads = 1")
         try:
             with answering(connection, sql) as result:
@@ -229,11 +229,11 @@ def answer(path: Path, sql: str) -> Iterator[duckdb.DuckDBPyConnection]:
 def answering(
     connection: duckdb.DuckDBPyConnection, sql: str
 ) -> Iterator[duckdb.DuckDBPyConnection]:
-    """Run one query, which reaches only the open database, to be fetched; raises UsageError.
+    """Run one query that can access only the open database, and yield its result to fetch.
 
-    The connection's whole instance stays restricted.
+    The connection's whole instance stays restricted. Raises UsageError.
     """
-    # External access alone leaves the database's own files open to COPY ... TO.
+    # Without the file system, COPY ... TO could still write the database's own files.
     connection.execute(
         "SET temp_directory = ''; SET enable_external_access = false; "
         "SET disabled_filesystems = 'LocalFileSystem'; SET lock_configuration = true"
@@ -241,9 +241,9 @@ def answering(
     kinds = duckdb.StatementType
     try:
         statements = connection.extract_statements(sql)
-        # A PIVOT consists of several.
+        # A PIVOT has several statements.
         reading = (kinds.SELECT, kinds.EXPLAIN, kinds.MULTI)
-        if [each.type in reading for each in statements] != [True]:
+        if [statement.type in reading for statement in statements] != [True]:
             raise UsageError(
                 "one query at a time, and one that only reads: SELECT, FROM, WITH, VALUES, "
                 "PIVOT, SUMMARIZE, DESCRIBE, SHOW or EXPLAIN"
@@ -251,28 +251,28 @@ def answering(
         connection.execute(statements[0])
         yield connection
     except duckdb.IOException:
-        raise  # a query reaches no file but the database, so it is the database that is damaged
+        raise  # a query can read no other file: the database is damaged
     except duckdb.OutOfMemoryException as exc:
         raise UsageError(
             f"the query needs more than the {SETTINGS['memory_limit']} of memory that it may use: "
             "ask for fewer rows or columns at once; requests and replies are long"
         ) from exc
-    except (duckdb.Error, ValueError) as exc:  # or a kind of statement that the client knows not
+    except (duckdb.Error, ValueError) as exc:  # ValueError: a statement type unknown to the client
         raise UsageError(f"the query failed: {exc}") from exc
 
 
 def results_digest(path: Path, sweep_ids: Sequence[str] | None = None) -> tuple[str, int]:
-    """A hash of all results, or of those of some sweeps, and the number of trials in it.
+    """Return a hash of all results, or of those of some sweeps, and the number of its trials.
 
-    The hash covers what happened (trials, states, decisions), whatever the order of storage, but
-    not when, where or at what price: no clock times, latencies, costs, cache keys or spec hashes.
+    The hash covers trials, states and decisions, in any storage order. It does not cover clock
+    times, latencies, costs, cache keys or spec hashes.
     """
     digests: dict[TrialKey, Any] = {}
     with read_database(path) as connection:
-        wanted = f"SELECT trial_id, spec_hash FROM trials {only(sweep_ids)}"  # noqa: S608
-        chosen = None if sweep_ids is None else {*connection.execute(wanted).fetchall()}
-        for table, columns in OF_THE_DIGEST.items():
-            # A trial's rows lie together in the table, which is too large to be sorted; a join
+        keys = f"SELECT trial_id, spec_hash FROM trials {only(sweep_ids)}"  # noqa: S608
+        chosen = None if sweep_ids is None else {*connection.execute(keys).fetchall()}
+        for table, columns in DIGEST_COLUMNS.items():
+            # The rows of a trial are adjacent in the table, which is too large to be sorted; a join
             # would mix them.
             sql = f"SELECT trial_id, spec_hash, {columns} FROM {table}"  # noqa: S608
             for key, rows in groupby(fetched(connection.execute(sql)), key=itemgetter(0, 1)):
@@ -286,26 +286,26 @@ def results_digest(path: Path, sweep_ids: Sequence[str] | None = None) -> tuple[
 
 
 def recorded_sweeps(path: Path, sweep_ids: Sequence[str]) -> tuple[list[dict[str, Any]], list[str]]:
-    """The rows of sweeps (the newest if none is named) and the keys of the calls that they used.
+    """Return the rows of these sweeps, or of the newest, and the keys of their calls.
 
     Raises UsageError.
     """
     with read_database(path) as connection:
         sweeps = {row["sweep_id"]: row for row in by_name(connection.execute(SWEEPS))}
-        wanted = list(dict.fromkeys(sweep_ids)) or [*sweeps][-1:] or [""]
-        rows = [require(sweeps, "sweep", sweep_id, f"in {path}") for sweep_id in wanted]
-        keys = connection.execute(CALLS_OF, [wanted]).fetchall()
+        ids = list(dict.fromkeys(sweep_ids)) or [*sweeps][-1:] or [""]
+        rows = [require(sweeps, "sweep", sweep_id, f"in {path}") for sweep_id in ids]
+        keys = connection.execute(CALLS_OF, [ids]).fetchall()
     return rows, [key for *_, key in keys]
 
 
 def sweeps_with_calls(path: Path) -> list[str]:
-    """Return the ids of the sweeps that asked a model, oldest first; raises UsageError."""
+    """Return the ids of the sweeps with calls, oldest first; raises UsageError."""
     with read_database(path) as connection:
         return [sweep_id for (sweep_id,) in connection.execute(THAT_ASKED).fetchall()]
 
 
 def sweep_facts(path: Path, sweep_id: str) -> dict[str, Any]:
-    """Count a sweep's trials, decisions and answers, by the views of facts.sql."""
+    """Count a sweep's trials, decisions and replies, by the views of facts.sql."""
     with read_database(path) as connection:
         limit_memory(connection)
         connection.execute("SET VARIABLE sweep_id = ?", [sweep_id])
@@ -320,9 +320,9 @@ def sweep_facts(path: Path, sweep_id: str) -> dict[str, Any]:
 
 
 def to_forget(db: Path, patterns: Sequence[str]) -> tuple[list[str], str]:
-    """Return the ids of the sweeps to forget, in which * stands for anything, and all that goes.
+    """Return the ids of the sweeps that match the patterns, and a description of the deletion.
 
-    Raises UsageError where a pattern names nothing.
+    Raises UsageError for a pattern without a match.
     """
     with read_database(db) as connection:
         rows = connection.execute("SELECT sweep_id FROM sweeps ORDER BY ALL").fetchall()
@@ -332,18 +332,18 @@ def to_forget(db: Path, patterns: Sequence[str]) -> tuple[list[str], str]:
             if not matching:
                 raise unknown_name("sweep", pattern, known, f"in {db}; * stands for anything")
             ids += [sweep_id for sweep_id in matching if sweep_id not in ids]
-        connection.execute(GOING, [ids])
-        ((trials,),) = connection.execute("SELECT count(*) FROM going").fetchall()
+        connection.execute(TO_DELETE, [ids])
+        ((trials,),) = connection.execute("SELECT count(*) FROM to_delete").fetchall()
     return ids, f"{len(ids)} sweeps ({', '.join(ids)}) and the {trials} trials of no other one"
 
 
 def forget(db: Path, ids: Sequence[str]) -> None:
-    """Remove sweeps, their trials, and the specs that no trial is left of; see ``to_forget``."""
+    """Delete sweeps, the trials that no other sweep has, and specs without a trial."""
     with write_database(db) as connection:
-        connection.execute(GOING, [ids])
+        connection.execute(TO_DELETE, [ids])
         for table in PLACES:
             connection.execute(
-                f"DELETE FROM {table} WHERE (trial_id, spec_hash) IN (FROM going)"  # noqa: S608 # our tables
+                f"DELETE FROM {table} WHERE (trial_id, spec_hash) IN (FROM to_delete)"  # noqa: S608 # our tables
             )
         for table in ("sweep_trials", "sweeps"):
             connection.execute(f"DELETE FROM {table} WHERE list_contains(?, sweep_id)", [ids])  # noqa: S608 # our tables
@@ -353,11 +353,11 @@ def forget(db: Path, ids: Sequence[str]) -> None:
 
 
 def _add_factors(connection: duckdb.DuckDBPyConnection, rows: Sequence[Row]) -> None:
-    """Add levels that are not stored yet."""
+    """Add the levels that are not stored yet."""
     keys = [row[:2] for row in rows]
     columns = "trial_id, spec_hash, factor"
-    there = set(rows_of_trials(connection, columns, "trial_factors", keys).fetchall())
-    append(connection, "trial_factors", (row for row in rows if row[:3] not in there))
+    stored = set(rows_of_trials(connection, columns, "trial_factors", keys).fetchall())
+    append(connection, "trial_factors", (row for row in rows if row[:3] not in stored))
 
 
 def _add_specs(connection: duckdb.DuckDBPyConnection, specs: Mapping[str, str]) -> None:
@@ -370,7 +370,7 @@ def _key(record: TrialRecord) -> TrialKey:
 
 
 def _ended(connection: duckdb.DuckDBPyConnection, keys: Sequence[TrialKey]) -> dict[TrialKey, bool]:
-    """Which of these trials are stored, and whether each ended: a failed one is played again."""
+    """Return the stored ones of these trials, and whether each ended without failure."""
     columns = "(trial_id, spec_hash), status <> 'failed'"
     return dict(rows_of_trials(connection, columns, "trials", keys).fetchall())
 
@@ -379,9 +379,9 @@ def _add_trials(
     connection: duckdb.DuckDBPyConnection,
     played: Sequence[tuple[TrialKey, str, dict[str, list[Row]]]],
 ) -> dict[str, list[str]]:
-    """Store whole trials, replacing failed ones; compare those that had ended before.
+    """Store whole trials, replacing failed ones; compare those that are already stored.
 
-    Returns the ids of those that had been stored with other values, with the columns that differ.
+    Returns the ids of trials that are stored with other values, with the differing columns.
     """
     stored = _ended(connection, [key for key, *_ in played])
     new: dict[TrialKey, dict[str, list[Row]]] = {}
@@ -400,10 +400,10 @@ def _add_trials(
         append(connection, table, chain.from_iterable(rows[table] for rows in new.values()))
     _add_factors(connection, [row for rows in again.values() for row in rows[FACTORS]])
     differing: dict[str, list[str]] = {}
-    # The levels of a study are no results: another one may name others for the same trial.
+    # Factor levels are no results: another study may have others for the same trial.
     for table in [table for table in PLACES if table != FACTORS] if again else []:
-        there = stored_rows(connection, table, list(again))
+        stored_trials = stored_rows(connection, table, list(again))
         for key, rows in again.items():
-            for difference in there.differences(key, rows[table], ignored=OF_A_RUN):
+            for difference in stored_trials.differences(key, rows[table], ignored=RUN_COLUMNS):
                 differing.setdefault(key[0], []).append(difference.name)
     return differing

@@ -424,7 +424,7 @@ def make_plan(
     if sample_set < 0:
         raise UsageError("--sample-set is a whole number from 0")
     asked = (models,) if isinstance(models, str) else tuple(models)
-    study, catalogue = load_study(sweep, asked, trust=trust, own=own)
+    study, catalogue = load_study(sweep, asked, trust=trust, registered=own)
     file = study.file
     drivers = chosen_models(file, asked)
     pairs = (dict.fromkeys(both_sides(name).values()) for name in drivers)

@@ -1,1 +1,1 @@
-"""A study: its file, its prompts and conditions, its plug-ins, and what its factors cross to."""
+"""Studies: file, plug-ins, prompts, conditions, and the full factorial design."""

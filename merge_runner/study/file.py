@@ -1,4 +1,4 @@
-"""A study's file: who drives, what varies, in which conditions, and what it may cost."""
+"""Format of a study file: drivers, factors, conditions and budget."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from merge_runner.records import MOST_REPETITIONS
 from merge_runner.scenarios.merge.conditions import Condition
 
 EVERY_PROMPT = "every prompt"
-"""Stands for a single number of repetitions in ``StudyFile.repetitions``."""
+"""Key of a single number of repetitions in ``StudyFile.repetitions``."""
 EVERY_CONDITION = "all"
-"""In the list of conditions: the scenario's own ones."""
+"""In the list of conditions: all conditions of the scenario."""
 GivenTo = Literal["both", "ego", "other"]
-"""Which drivers have a level: both, the one that is asked about, or the one that it meets."""
+"""Drivers with a level: both, the ego (the focal driver), or its opponent."""
 MEASURES = (
     "goes_first",
     "collided",
@@ -45,16 +45,16 @@ MEASURES = (
     "valid_percent",
     "cost_usd",
 )
-"""What ``StudyFile.primary`` may name beside the metrics of plug-ins: what an ``Effect`` may be on,
-and the analysis' own metrics that are tested, which the runner does not import."""
+"""Values of ``StudyFile.primary`` in addition to metrics of plug-ins: the measures of an ``Effect``
+and the tested metrics of the analysis, which the runner does not import."""
 ONE_OF_EACH = "give it a block, a text, or merge and straight"
 TEMPLATE = Path(__file__).with_name("template")
 PLUGIN = "plugin.py"
-IGNORED = "gitignore"  # with a dot it would hold for the template itself
+IGNORED = "gitignore"  # with a dot, git would apply it to the template
 
 
 def _by_name(value: object) -> object:
-    """Conditions as a table: a list holds names, and tables with a name and numbers."""
+    """Return a list of conditions (names, or tables with name and numbers) as a dict by name."""
     by_name: dict[str, object] = {}
     for row in value if isinstance(value, list) else [None]:
         numbers = dict(row) if isinstance(row, dict) else {"name": row}
@@ -70,10 +70,9 @@ def _for_every_prompt(value: object) -> object:
 
 
 class RoadTexts(Frozen):
-    """The templates of a paragraph before and after the merge point; where one is left out, none.
+    """Templates of a paragraph before and after the merge point; None: no paragraph there.
 
-    In a file a text, or the key ``text``, stands for both. What they may name in braces:
-    ``prompts.blocks``.
+    In a file, a text or the key ``text`` sets both. ``prompts.fields`` has the template variables.
     """
 
     merge: str | None = None
@@ -82,19 +81,19 @@ class RoadTexts(Frozen):
     @model_validator(mode="before")
     @classmethod
     def _of_both_roads(cls, value: object) -> object:
-        given = {"text": value} if isinstance(value, str) else value
-        if not isinstance(given, dict) or "text" not in given:
-            return given
-        if given.keys() & {"block", "merge", "straight"}:
+        table = {"text": value} if isinstance(value, str) else value
+        if not isinstance(table, dict) or "text" not in table:
+            return table
+        if table.keys() & {"block", "merge", "straight"}:
             raise ValueError(ONE_OF_EACH)
-        rest = {key: each for key, each in given.items() if key != "text"}
-        return {"merge": given["text"], "straight": given["text"], **rest}
+        rest = {key: item for key, item in table.items() if key != "text"}
+        return {"merge": table["text"], "straight": table["text"], **rest}
 
 
 class AddedText(RoadTexts):
-    """A paragraph that a prompt adds ``before`` or ``after`` a block; else it stands last.
+    """Paragraph that a prompt adds ``before`` or ``after`` a block, by default at the end.
 
-    ``block`` names a registered one, which has a place of its own.
+    ``block`` names a registered block, which has a default position.
     """
 
     block: str | None = None
@@ -111,7 +110,7 @@ class AddedText(RoadTexts):
 
 
 class StudyPrompt(Frozen):
-    """A prompt that a study makes from another one: it removes, replaces and adds, in this order.
+    """Prompt of a study, based on another one: removals, replacements, additions, in this order.
 
     Tables show the ``title``.
     """
@@ -124,9 +123,10 @@ class StudyPrompt(Frozen):
 
 
 class PlantedWords(Frozen):
-    """What the emulator, which reads no words, does where it is given them, for a rehearsal.
+    """Effect of a text on the emulator, which reads no texts, for a rehearsal.
 
-    ``own_first`` is added to its log-odds of going first, ``gap_m`` to the gap that both aim at.
+    ``own_first`` is added to its log-odds of going first, ``gap_m`` to the gap that both drivers
+    aim at.
     """
 
     own_first: Number = 0.0
@@ -134,7 +134,7 @@ class PlantedWords(Frozen):
 
 
 class StudyText(Frozen):
-    """The words of one level of a factor: what it does to any prompt, and who is given it."""
+    """Text level of a factor: its changes of any prompt, and the drivers that get them."""
 
     add: tuple[AddedText, ...] = ()
     remove: tuple[str, ...] = ()
@@ -155,7 +155,7 @@ class StudyText(Frozen):
 
 
 class StudyDriver(Frozen):
-    """A driver that a study makes of a ``program``: with other parameters, or another clock.
+    """Driver of a study: a ``program`` with other parameters or another clock.
 
     It holds each action for ``clock`` seconds. Every other key is a parameter of the program.
     """
@@ -167,10 +167,10 @@ class StudyDriver(Frozen):
 
 
 class Effect(Frozen):
-    """What a level of a factor is supposed to add, before anything is played.
+    """Assumed effect of a level of a factor, for a power analysis.
 
-    To the share of trials in which its driver goes first, to the coefficients of who merges first,
-    to the gap in m, and to the share of collisions.
+    Additions to the share of trials in which its driver goes first, to the coefficients of the
+    merge order, to the gap in m, and to the share of collisions.
     """
 
     goes_first: Annotated[float, Field(ge=-1, le=1)] = 0.0
@@ -182,22 +182,23 @@ class Effect(Frozen):
 
 
 class StudyFile(Frozen):
-    """One study. ``repetitions`` are per condition, for each prompt or for all of them.
+    """One study.
 
-    ``conditions`` are by name; one without numbers is known already.
-    ``factors`` are crossed with each other, with the ``models`` and with the conditions; ``skip``
-    leaves crossings out: each row names levels, or lists of them. Tables compare the levels of a
-    factor with its first one, or with that which ``reference`` names; ``effect`` is by factor what
-    each other level adds, for ``merge-runner power``. ``primary`` is the measure that is tested by
-    itself, one of ``MEASURES`` or a plug-in's metric: all others are corrected together.
+    ``repetitions`` are per condition, for each prompt or for all of them. ``conditions`` are by
+    name; one without numbers is registered already. ``factors``, ``models`` and conditions form a
+    full factorial design; each row of ``skip`` excludes a combination of levels, or of lists of
+    them. Tables compare the levels of a factor with the first one, or with its ``reference``;
+    ``effect`` has the assumed effects by factor, for ``merge-runner power``. ``primary`` is the
+    measure that is tested separately, one of ``MEASURES`` or a plug-in's metric: all others are
+    corrected together.
 
-    With ``mirror`` two different drivers are played both ways round. ``perception`` holds by name
-    what the levels of the factors perception, perception_left and perception_right stand for.
-    ``texts`` hold the words of a factor by level; a level without any leaves the prompt as it is.
-    ``given_to`` names the driver that has the levels of a parameter or of the perception, where not
-    both have them.
-    ``budget`` is what it may cost, in USD over all models, runs and days, ``plugins`` are Python
-    files that register drivers, prompt blocks, metrics and so on, beside the study.
+    ``mirror`` counterbalances the positions of two different drivers. ``perception`` has the
+    observation models by name, as levels of the factors perception, perception_left and
+    perception_right. ``texts`` have the text of a factor by level; a level without a text does not
+    change the prompt. ``given_to`` names the driver with the levels of a parameter or of the
+    perception, by default both. ``budget`` is the spending cap in USD over all models, runs and
+    days. ``plugins`` are Python files in the study's folder that register drivers, prompt blocks,
+    metrics and other parts.
     """
 
     description: str = ""
@@ -223,9 +224,9 @@ class StudyFile(Frozen):
 
 
 class StudySource(Frozen):
-    """The text of a study's file, with the source of its plug-ins by file name.
+    """Text of a study file, with the source of its plug-ins by file name.
 
-    One that is read from a database has no ``path``.
+    A study from a database has no ``path``.
     """
 
     name: str
@@ -235,18 +236,18 @@ class StudySource(Frozen):
 
     @cached_property
     def file(self) -> StudyFile:
-        """What the text says; raises UsageError."""
+        """Parsed text; raises UsageError."""
         return validated(StudyFile, toml_of(self.text, str(self.path)), str(self.path))
 
 
 def study_files() -> dict[str, Path]:
-    """The studies that a name stands for: those of the working directory, and those that ship."""
+    """Return the study files by name, of the working directory and shipped ones."""
     files = [file for folder in reversed(experiments()) for file in folder.glob("*.toml")]
     return {file.stem: file for file in files if file.stem != "models"}
 
 
 def read_study(name: str) -> StudySource:
-    """The study ``experiments/NAME.toml``, or that of a path; raises UsageError."""
+    """Return the study ``experiments/NAME.toml``, or that at a path; raises UsageError."""
     path = Path(name)
     if path.suffix != ".toml":
         files = study_files()
@@ -255,16 +256,16 @@ def read_study(name: str) -> StudySource:
         path = files[name]
     text, sources = read_text(path), dict[str, str]()
     study = StudySource(name=path.stem, text=text, plugins=sources, path=path)
-    for each in study.file.plugins.get("files", ()):
-        plugin = path.parent / each
+    for file_name in study.file.plugins.get("files", ()):
+        plugin = path.parent / file_name
         if not plugin.resolve().is_relative_to(path.parent.resolve()):
-            raise UsageError(f"{path}: the plug-in {each} lies outside of the study's folder")
-        sources[each] = read_text(plugin)
+            raise UsageError(f"{path}: the plug-in {file_name} lies outside of the study's folder")
+        sources[file_name] = read_text(plugin)
     return study.model_copy(update={"plugins": sources})
 
 
 def write_folder(folder: Path) -> list[Path]:
-    """Write a new folder with a study that runs; raises UsageError where it is not empty."""
+    """Write a new folder with a complete study; raises UsageError if it is not empty."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):

@@ -1,4 +1,4 @@
-"""The catalogue of a study: its plug-ins, drivers, prompts and conditions, once its user agrees."""
+"""Registration of a study's plug-ins, drivers, prompts and conditions, after the user's consent."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ from merge_runner.study.file import (
 )
 from merge_runner.text_safety import one_line, printable, say
 
-# Who answers, where, with which key, at what price: the rest is how the same model is asked.
+# Fields that identify the model, its server, key and price; the others are request parameters.
 IDENTITY = {"provider", "format", "id", "base_url", "path", "key_env", "auth", "price"}
 _importing = threading.RLock()
 _parsing = threading.Lock()  # Python 3.11 counts the depth of a tree for all threads
 STUDY_PLUGINS = "study_plugins"
-"""The package of a study's plug-ins, with a hash behind it: those of two studies are two."""
+"""Prefix of the package of a study's plug-ins; a hash follows, so that studies do not share it."""
 
 
 def load_study(
@@ -68,33 +68,33 @@ def load_study(
     models: Sequence[str] | None = None,
     *,
     trust: bool = False,
-    own: Catalogue | None = None,
+    registered: Catalogue | None = None,
 ) -> tuple[StudySource, Catalogue]:
-    """Read a study, and return it with what it adds, once the user agrees to its code.
+    """Read a study, and return it with its catalogue after the user's consent to its code.
 
-    ``own`` are parts that were registered for it. ``models`` are those that are to be asked, in
-    place of the file's own; None: nobody is asked. The user also agrees to where their keys go.
-    ``trust`` agrees. Raises UsageError.
+    ``registered`` are parts that were registered for it. ``models`` replace those of the file;
+    None: no model is called. Consent also covers the servers that get keys. ``trust`` gives
+    consent. Raises UsageError.
     """
     study = read_study(name) if isinstance(name, str) else name
     file = study.file
-    asked: set[str] = set()
+    called: set[str] = set()
     if models is not None:
         opponents = map(level_text, file.factors.get(OPPONENT, ()))
         pairs = map(both_sides, [*chosen_models(file, models), *opponents])
-        asked = {name for pair in pairs for name in pair.values()}
-    _require_agreement(study, asked, trust=trust)
-    return study, catalogue_of(file, study.text, study.plugins, own)
+        called = {name for pair in pairs for name in pair.values()}
+    _require_consent(study, called, trust=trust)
+    return study, catalogue_of(file, study.text, study.plugins, registered)
 
 
-def _require_agreement(study: StudySource, models: Iterable[str], *, trust: bool) -> None:
-    """Ask about the study's code, and about where these models' keys go: once for each content.
+def _require_consent(study: StudySource, models: Iterable[str], *, trust: bool) -> None:
+    """Ask for consent to the study's code and to the servers that get keys, once per content.
 
-    What is agreed to is kept in the user's own folder of states, where no study can write.
-    ``trust`` agrees. Raises UsageError where the user does not, and where there is no terminal.
+    Consent is stored in the user's state folder, where no study can write. ``trust`` gives consent.
+    Raises UsageError without consent, and without a terminal.
     """
     risks, code = [*_endpoints(study.path.parent, models)], study.plugins
-    # The plug-in that ``init`` writes is ours, as it writes it.
+    # The unedited plug-in of ``init`` is our own code.
     if code and code != {PLUGIN: (TEMPLATE / PLUGIN).read_text(encoding="utf-8")}:
         risks.insert(0, (study.path, f"runs code ({', '.join(code)})", [*code.items()]))
     if not risks:
@@ -103,25 +103,25 @@ def _require_agreement(study: StudySource, models: Iterable[str], *, trust: bool
         hashlib.sha256(canonical_json([words, content]).encode()).hexdigest(): (file, words)
         for file, words, content in risks
     }
-    kept = state_folder() / "agreements"
+    record = state_folder() / "agreements"
     try:
-        for line in kept.read_text("utf-8", "replace").splitlines() if kept.exists() else ():
+        for line in record.read_text("utf-8", "replace").splitlines() if record.exists() else ():
             by_digest.pop(line.partition(" ")[0], None)
         if by_digest and not trust:
             _ask(study, by_digest.values())
-        kept.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with kept.open("a", encoding="utf-8") as file:
+        record.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with record.open("a", encoding="utf-8") as file:
             file.writelines(f"{n} {one_line(str(path))}\n" for n, (path, _) in by_digest.items())
     except OSError as exc:
-        if not trust:  # a script says so again
+        if not trust:  # --trust needs no record
             raise UsageError(
-                f"the agreement cannot be kept in {kept}: {exc.strerror}; name another folder with "
-                "XDG_STATE_HOME, or add --trust"
+                f"the agreement cannot be kept in {record}: {exc.strerror}; name another folder "
+                "with XDG_STATE_HOME, or add --trust"
             ) from exc
 
 
 def _ask(study: StudySource, risks: Collection[tuple[Path, str]]) -> None:
-    """Show what files do, and code that is to run; raise UsageError unless the user agrees."""
+    """Show the risks and the code, and ask for consent; raise UsageError without it."""
     words = one_line("; ".join(f"{file} {does}" for file, does in risks))
     if not sys.stdin.isatty():
         raise UsageError(
@@ -138,22 +138,22 @@ def _ask(study: StudySource, risks: Collection[tuple[Path, str]]) -> None:
         raise UsageError("nothing was run")
 
 
-def _endpoints(beside: Path, models: Iterable[str]) -> Iterator[tuple[Path, str, object]]:
-    """The models of registries that do not ship, where their calls may not go unasked.
+def _endpoints(folder: Path, models: Iterable[str]) -> Iterator[tuple[Path, str, object]]:
+    """Yield the models whose endpoints need consent: (file, description, content to consent to).
 
-    That is where one replaces a model that ships, or where a key that is not the provider's is
-    sent, or anything to a URL that is not its own. Loopback is the provider's own where that needs
-    no key. Of each its file, what it does in words, and the content that is agreed to.
+    They are those of a models.toml that does not ship, if they replace a shipped model, send a key
+    that is not the provider's, or send anything to a URL that is not the provider's. Loopback
+    counts as the provider's if it needs no key.
     """
-    ours = SHIPPED_EXPERIMENTS / REGISTRY
-    files = [path for path in registry_files(beside) if not path.samefile(ours)]
-    shipped = read_entries(ours) if files else {}
+    own_file = SHIPPED_EXPERIMENTS / REGISTRY
+    files = [path for path in registry_files(folder) if not path.samefile(own_file)]
+    shipped = read_entries(own_file) if files else {}
     defined = {name: (path, entry) for path in files for name, entry in read_entries(path).items()}
     for name in sorted({*models} & {*defined}):
         path, entry = defined[name]
         provider = PROVIDERS.get(entry.provider)
         if provider is None:
-            continue  # refused later, unless it is a plug-in's
+            continue  # refused later, unless a plug-in registers it
         identity = entry.model_dump(include=IDENTITY)
         replaces = name in shipped and identity != shipped[name].model_dump(include=IDENTITY)
         try:
@@ -174,15 +174,17 @@ def _endpoints(beside: Path, models: Iterable[str]) -> Iterator[tuple[Path, str,
 
 
 def catalogue_of(
-    file: StudyFile, text: str, plugins: Mapping[str, str], own: Catalogue | None = None
+    file: StudyFile, text: str, plugins: Mapping[str, str], registered: Catalogue | None = None
 ) -> Catalogue:
-    """Run a study's plug-ins and return what they and its file add to its ``own`` parts.
+    """Run a study's plug-ins and return the catalogue of its parts.
 
-    The user has agreed to the code (``load_study``). Raises UsageError.
+    It has the parts of the plug-ins, of the file and those ``registered`` before. The user has
+    given consent to the code (``load_study``). Raises UsageError.
     """
     for source in plugins.values():
         _import_others(source)
-    parts = {kind: dict(things) for kind, things in own.parts.items()} if own else {}
+    known = registered.parts if registered else {}
+    parts = {kind: dict(things) for kind, things in known.items()}
     with collecting(Catalogue(text, plugins, parts)) as catalogue:
         _run_plugins(plugins)
         for name, condition in (file.conditions or {}).items():
@@ -211,19 +213,19 @@ def catalogue_of(
 
 
 def declared_catalogue(file: StudyFile) -> Catalogue:
-    """Return what a study's file declares itself; none of its plug-ins run.
+    """Return the catalogue of a study file's declarations, without its plug-ins.
 
-    It has no text, since nobody named that study: another sweep's may take its place.
-    Drivers of a program that is not here are left out. Raises UsageError.
+    It has no text: it is not the loaded study, and another study may replace it. Drivers of
+    unregistered programs are left out. Raises UsageError.
     """
-    here = {name: driver for name, driver in file.drivers.items() if driver.program in PROGRAMS}
-    return catalogue_of(file.model_copy(update={"drivers": here}), "", {})
+    known = {name: driver for name, driver in file.drivers.items() if driver.program in PROGRAMS}
+    return catalogue_of(file.model_copy(update={"drivers": known}), "", {})
 
 
 def _import_others(source: str) -> None:
-    """Import what a plug-in imports from elsewhere: what that registers is no part of the study."""
+    """Import the other modules of a plug-in first: their registrations are no part of the study."""
     names: list[str] = []
-    with suppress(*FAULTS):  # it is told, with its line, when the plug-in runs
+    with suppress(*FAULTS):  # reported, with its line, when the plug-in runs
         with _parsing:
             body = ast.parse(source).body
         for node in body:
@@ -238,7 +240,7 @@ def _import_others(source: str) -> None:
 
 @dataclass
 class _Source(InspectLoader):
-    """A module whose source is given, so that its hash and its text are known everywhere."""
+    """Loader of a module from its source text, whose hash is known."""
 
     file: str
     source: str
@@ -253,8 +255,8 @@ class _Source(InspectLoader):
 def _run_plugins(sources: Mapping[str, str]) -> None:
     """Run plug-ins, given by file name and source, as the modules of one package.
 
-    One imports from another by ``from .other import thing``. The package is called by a hash of
-    its sources, so that no study finds the modules of another one.
+    They import from each other by ``from .other import thing``. The package's name has a hash of
+    the sources, so that studies do not share modules.
     """
     digest = hashlib.sha256(canonical_json([*sources.items()]).encode()).hexdigest()
     package = f"{STUDY_PLUGINS}_{digest[:16]}"
@@ -275,7 +277,7 @@ def _run_plugin(name: str, file: str, source: str) -> None:
     spec = spec_from_loader(name, loader)
     assert spec is not None
     module = module_from_spec(spec)
-    # The one before stays until this one is complete: a driver that runs may import from it.
+    # An earlier module stays until this one is complete: a running driver may import from it.
     sys.modules.setdefault(name, module)
     try:
         loader.exec_module(module)
@@ -284,17 +286,17 @@ def _run_plugin(name: str, file: str, source: str) -> None:
         lines = [f.lineno for f in extract_tb(exc.__traceback__) if f.filename == file]
         line = lines[-1] if lines else getattr(exc, "lineno", None)
         where = f"{file}, line {line}" if line else file
-        said = str(exc) if isinstance(exc, UsageError) else f"{type(exc).__name__}: {exc}"
-        raise UsageError(f"the plug-in {where}, fails: {said}") from exc
+        reason = str(exc) if isinstance(exc, UsageError) else f"{type(exc).__name__}: {exc}"
+        raise UsageError(f"the plug-in {where}, fails: {reason}") from exc
 
 
 def _variant(name: str, prompt: StudyPrompt) -> Variant:
-    """The variant that a prompt of a study is; raises UsageError."""
+    """Return the prompt variant of a study's prompt; raises UsageError."""
     before = blocks_of(prompt.based_on)
     blocks = _changed(name, prompt, before)
     return Variant(
-        removes=frozenset(each for each, block in before.items() if blocks.get(each) != block),
-        adds=frozenset(each for each, block in blocks.items() if before.get(each) != block),
+        removes=frozenset(n for n, block in before.items() if blocks.get(n) != block),
+        adds=frozenset(n for n, block in blocks.items() if before.get(n) != block),
         title=prompt.title,
         blocks=tuple(blocks.items()),
     )
@@ -303,16 +305,16 @@ def _variant(name: str, prompt: StudyPrompt) -> Variant:
 def _changed(
     name: str, change: StudyPrompt | StudyText, before: Mapping[str, Block]
 ) -> dict[str, Block]:
-    """The blocks of a prompt that is changed to the one of this name; raises UsageError."""
+    """Return the blocks of a prompt after a change of this name; raises UsageError."""
     kind = f"block of the prompt {name}"
     blocks = dict(before)
-    earlier = [each for each, block in before.items() if block.before is not None]
-    for each in change.remove:
-        require(blocks, kind, each)
-        del blocks[each]
-    for each, texts in change.replace.items():
-        block = require(blocks, kind, each)
-        blocks[each] = replace(block, merge=texts.merge, straight=texts.straight)
+    earlier = [n for n, block in before.items() if block.before is not None]
+    for removed in change.remove:
+        require(blocks, kind, removed)
+        del blocks[removed]
+    for replaced, texts in change.replace.items():
+        block = require(blocks, kind, replaced)
+        blocks[replaced] = replace(block, merge=texts.merge, straight=texts.straight)
     for number, added in enumerate(change.add, 1):
         block_name, anchor = added.block or f"{name}.{number}", added.before or added.after
         if block_name in blocks:

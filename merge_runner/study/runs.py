@@ -1,4 +1,4 @@
-"""Which runs of a database played the trials of a study."""
+"""Runs of a study in a database."""
 
 from __future__ import annotations
 
@@ -19,21 +19,23 @@ FROM sweeps ORDER BY started_at, sweep_id
 
 
 def study_name(name: str, factors: Iterable[str]) -> str:
-    """Return ``mood (opponent, temperature)``: studies of one name but other factors are others."""
-    own = sorted({*factors} - {MODEL, PROMPT})
-    return f"{name} ({', '.join(own)})" if own else name
+    """Return ``mood (opponent, temperature)``: other factors make another study of one name."""
+    varied = sorted({*factors} - {MODEL, PROMPT})
+    return f"{name} ({', '.join(varied)})" if varied else name
 
 
 def runs_of(db: Path, study: StudySource) -> list[str]:
-    """Return the ids of a study's runs, oldest first; raises UsageError where there is none."""
+    """Return the ids of a study's runs, oldest first; raises UsageError without any."""
     with read_database(db) as connection:
         rows = connection.execute(NAMED).fetchall()
-    wanted = study_name(study.name, study.file.factors)
+    requested = study_name(study.name, study.file.factors)
     played = {
         sweep_id: study_name(name.removesuffix(seat), json.loads(levels))
         for sweep_id, name, seat, levels in rows
     }
-    if wanted not in played.values():
-        held = ", ".join(dict.fromkeys(played.values())) or "none"
-        raise UsageError(f"{db} holds no trial of the study {wanted}; it holds those of: {held}")
-    return [sweep_id for sweep_id, name in played.items() if name == wanted]
+    if requested not in played.values():
+        studies = ", ".join(dict.fromkeys(played.values())) or "none"
+        raise UsageError(
+            f"{db} holds no trial of the study {requested}; it holds those of: {studies}"
+        )
+    return [sweep_id for sweep_id, name in played.items() if name == requested]

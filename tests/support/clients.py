@@ -97,7 +97,7 @@ def make(cache):
         under_way = changes.pop("under_way", {})
         fields = {"provider": "openai", "format": "openai-chat", "id": "m-1", "price": "free"}
         entry = ModelEntry(**{**fields, "max_output_tokens": 100, **changes})
-        entry = entry.standing_at("[my-model] in models.toml")
+        entry = entry.with_place("[my-model] in models.toml")
         return LlmClient(
             name="my-model",
             entry=entry,

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from merge_runner.config import PERFECT, Perception, ScenarioConfig
 from merge_runner.drivers.registry import PROGRAMS
-from merge_runner.perception import Eyes, error_process
+from merge_runner.perception import NoisyObserver, error_process
 from merge_runner.records import FAR_BEHIND_M, SIDES
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
@@ -58,11 +58,11 @@ def drive(pairs, condition="L_4_-8", scenario=None, steps=5):
 
 
 def watched(perception, truths, seed=1, step_s=0.2):
-    """What the eyes tell at each step of what is to be seen."""
+    """Yield the observation of each step of the true ones."""
     truths = list(truths)
-    eyes = Eyes(Perception(**perception), seed, step_s, truths.__getitem__)
+    observer = NoisyObserver(Perception(**perception), seed, step_s, truths.__getitem__)
     for step in range(len(truths)):
-        yield eyes.told(step)
+        yield observer.observe(step)
 
 
 def truths(side="left", pairs=((0.4, -0.2), (-0.7, 0.9), (0.1, 0.3)), **options):
@@ -80,7 +80,7 @@ def of_the_own(seen):
 @few
 @given(names, scenarios, actions, seeds)
 def test_without_errors_delay_dropout_and_range_the_truth_is_told(condition, scenario, pairs, seed):
-    """By the eyes themselves, which a trial with such a perception does without."""
+    """By the observer itself, which a trial with such a perception has not."""
     true = truths("right", pairs, condition=condition, scenario=scenario)
     assert Perception() == PERFECT
     assert list(watched({}, true, seed)) == true
@@ -238,15 +238,15 @@ def outcome(trial):
     return trial.status, trial.merged_first, trial.end_time_s, trial.states
 
 
-def test_a_driver_whose_eyes_miss_nothing_drives_as_one_that_is_told_the_truth():
+def test_a_driver_with_a_noiseless_observer_drives_as_one_without():
     far = {"range_m": 1e6}
     trial, usual = play(perception_left=far, perception_right=far), play()
     assert outcome(trial) == outcome(usual)
     assert [row.decision for row in trial.decisions] == [row.decision for row in usual.decisions]
-    assert all(row.told and row.told.other_seen for row in trial.decisions)
+    assert all(row.observed and row.observed.other_seen for row in trial.decisions)
     foggy = play(perception_right=FOGGY)
     assert outcome(foggy) != outcome(usual)
-    assert all((row.told is None) == (row.side == "left") for row in foggy.decisions)
+    assert all((row.observed is None) == (row.side == "left") for row in foggy.decisions)
 
 
 def test_both_sides_have_errors_of_their_own_and_a_slot_keeps_its_errors():
@@ -256,7 +256,7 @@ def test_both_sides_have_errors_of_their_own_and_a_slot_keeps_its_errors():
     def errors(trial, side):
         truth = {(s.side, s.time_s): s.velocity_mps for s in trial.states}
         return [
-            row.told.other_speed_mps - truth[OTHER[side], row.time_s]
+            row.observed.other_speed_mps - truth[OTHER[side], row.time_s]
             for row in trial.decisions
             if row.side == side
         ][:4]

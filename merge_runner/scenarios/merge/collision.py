@@ -1,7 +1,7 @@
-"""When two vehicles collide: three readings of one sentence of the paper.
+"""Collision rules: three readings of one sentence of the paper.
 
-arXiv 2604.09609 has a collision where the "centre-to-centre distance" is below a vehicle length.
-Along the road alone it cannot be meant: in 7 of the 11 conditions the vehicles are closer than that
+arXiv 2604.09609 defines a collision by a "centre-to-centre distance" below a vehicle length. The
+distance along the road cannot be meant: in 7 of the 11 conditions the vehicles are closer than that
 when the drivers take control.
 """
 
@@ -14,20 +14,20 @@ Vector = tuple[float, float]
 
 
 def collided(config: ScenarioConfig, track: Track, left_m: float, right_m: float) -> bool:
-    """Whether vehicles at these travelled distances collide under the scenario's rule."""
+    """Return whether vehicles at these travelled distances collide under the scenario's rule."""
     length = config.vehicle_length_m
-    # The paper's words, in the plane; squared, since a root would decide nothing.
+    # The paper's words, in the plane; squared, since no root is needed.
     if config.collision_rule == "euclid2d":
         return squared_distance_m2(track, left_m, right_m) < length**2
-    # Or along the road, as soon as there is one road.
+    # Along the road, once one vehicle is on the common lane.
     if config.collision_rule == "shared_lane":
         return max(left_m, right_m) >= track.merge_point_m and abs(left_m - right_m) < length
-    # What the humans' simulator did (Siebinga et al., tud-hri/simple-merging-experiment).
+    # The rule of the human simulator (Siebinga et al., tud-hri/simple-merging-experiment).
     return rectangles_overlap(track, left_m, right_m, length, config.vehicle_width_m)
 
 
 def squared_distance_m2(track: Track, left_m: float, right_m: float) -> float:
-    """The squared distance between the two centres in the plane."""
+    """Return the squared distance between the two centres in the plane."""
     x_left, y_left = track.place("left", left_m)
     x_right, y_right = track.place("right", right_m)
     return (x_left - x_right) ** 2 + (y_left - y_right) ** 2
@@ -36,10 +36,10 @@ def squared_distance_m2(track: Track, left_m: float, right_m: float) -> float:
 def rectangles_overlap(
     track: Track, left_m: float, right_m: float, length_m: float, width_m: float
 ) -> bool:
-    """Whether the two oriented vehicle boxes overlap.
+    """Return whether the two oriented vehicle boxes overlap.
 
-    By the separating axis theorem (Gottschalk, Lin and Manocha 1996): two boxes are apart where
-    their shadows on one of their four axes are.
+    By the separating axis theorem (Gottschalk, Lin and Manocha 1996): two boxes are disjoint if and
+    only if their projections onto one of their four axes are.
     """
     x_left, y_left = track.place("left", left_m)
     x_right, y_right = track.place("right", right_m)
@@ -56,7 +56,7 @@ def rectangles_overlap(
 
 
 def _half_extent(ahead: Vector, axis: Vector, length_m: float, width_m: float) -> float:
-    """Half the length of a box's shadow on an axis."""
+    """Return half the length of a box's projection onto an axis."""
     across = (ahead[1], -ahead[0])
     return abs(_dot(ahead, axis)) * length_m / 2 + abs(_dot(across, axis)) * width_m / 2
 

@@ -1,4 +1,4 @@
-"""The kinematic conditions: the 11 of the human experiment, and those that others register."""
+"""Kinematic conditions: the 11 of the human experiment, and registered ones."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from merge_runner.registry import Registry
 from merge_runner.scenarios.merge.geometry import Track
 
 MEAN_SPEED_MPS = 10.0
-"""That of every condition of the human experiment."""
+"""Mean speed of every condition of the human experiment."""
 
 
 @dataclass(frozen=True)
 class Condition:
-    """How two vehicles approach the merge point; what is relative is signed left minus right.
+    """Initial condition of two vehicles; relative values are left minus right.
 
-    ``projected_headway_m`` is how far the left one would be ahead at constant speeds when the
-    first of them is at the merge point. ``mean_speed_mps`` is the mean of both initial speeds.
-    Raises UsageError where a vehicle would stand still or drive backwards.
+    ``projected_headway_m`` is the lead of the left vehicle at constant speeds when the first one is
+    at the merge point. ``mean_speed_mps`` is the mean of both initial speeds. Raises UsageError
+    unless both vehicles drive forwards.
     """
 
-    __pydantic_config__: ClassVar = ConfigDict(extra="forbid")  # of one that a study's file has
+    __pydantic_config__: ClassVar = ConfigDict(extra="forbid")  # in a study file
 
     projected_headway_m: float
     relative_velocity_mps: float
@@ -46,10 +46,10 @@ class Condition:
         return self.mean_speed_mps + half, self.mean_speed_mps - half
 
     def starts_m(self, track: Track) -> tuple[float, float]:
-        """Travelled distances (left, right) at the start of the run, inside the tunnels.
+        """Return the travelled distances (left, right) at the start of the run, in the tunnels.
 
-        The projected leader stands at the merge point, the other |h| behind; both run backwards
-        at constant speed until one of them is at 0.
+        With the projected leader at the merge point and the other |h| behind, both are moved
+        backwards at constant speed until one of them is at 0.
         """
         speed_left, speed_right = self.speeds_mps
         left = track.merge_point_m + min(self.projected_headway_m, 0.0)
@@ -58,37 +58,38 @@ class Condition:
         return left - speed_left * seconds, right - speed_right * seconds
 
     def exit_times_s(self, track: Track) -> tuple[float, float]:
-        """When (left, right) leave their tunnels at constant speed, from the start of the run."""
+        """Return the times (left, right) of the tunnel exits at constant speed from the start."""
         # In closed form: steps of 0.2 s would overshoot an exit by up to 2 m.
         (left_m, right_m), (speed_left, speed_right) = self.starts_m(track), self.speeds_mps
         exit_m = track.tunnel_exit_m
         return (exit_m - left_m) / speed_left, (exit_m - right_m) / speed_right
 
     def positions_m(self, time_s: float, track: Track) -> tuple[float, float]:
-        """Travelled distances (left, right) at constant speed, ``time_s`` into the run."""
+        """Return the distances (left, right) at constant speed, ``time_s`` after the start."""
         (left_m, right_m), speeds = self.starts_m(track), self.speeds_mps
         return left_m + speeds[0] * time_s, right_m + speeds[1] * time_s
 
 
-# A name says who has the projected headway advantage (L, R or N), the projected headway in m and
-# the relative velocity in 0.1 m/s: in ``L_4_-8`` the left vehicle would be 4 m ahead at the merge
-# point and is 0.8 m/s slower.
+# A name has the side with the projected headway advantage (L, R or N), the projected headway in m
+# and the relative velocity in 0.1 m/s: in ``L_4_-8`` the left vehicle would be 4 m ahead at the
+# merge point and is 0.8 m/s slower.
 _NAMES = "R_-4_-8 R_-4_0 R_-4_8 R_-2_8 R_0_8 N_0_0 L_0_-8 L_2_-8 L_4_-8 L_4_0 L_4_8"
 HUMAN_CONDITIONS = {
     name: Condition(float(name.split("_")[1]), int(name.split("_")[2]) / 10)
     for name in _NAMES.split()
 }
-"""Those of the human experiment (Siebinga et al., 4TU 19550377), which are the paper's, too."""
+"""Conditions of the human experiment (Siebinga et al., 4TU 19550377) and of the paper."""
 
 NUMBER = r"-?\d{1,4}(?:\.\d{1,4})?"
-"""As a pattern: that of a headway or a velocity in the name of a condition."""
+"""Pattern of a headway or a velocity in the name of a condition."""
 _COMPUTED = re.compile(f"h({NUMBER})_dv({NUMBER})", re.ASCII)
 
 
 def condition_name(headway_m: float, velocity_mps: float) -> str:
-    """The name of a condition at the usual mean speed: that of the humans' where it is theirs.
+    """Return the name of a condition at the usual mean speed.
 
-    Any other is called by its numbers, ``h2_dv-1.2``, and needs no registration.
+    A condition of the humans has their name. Any other has its numbers, ``h2_dv-1.2``, and needs no
+    registration.
     """
     for name, human in HUMAN_CONDITIONS.items():
         if (human.projected_headway_m, human.relative_velocity_mps) == (headway_m, velocity_mps):
@@ -101,20 +102,20 @@ def _plain(number: float) -> str:
 
 
 class _Conditions(Registry[Condition]):
-    """Those that are registered, and any other by the name that ``condition_name`` gives it."""
+    """Registry of conditions that also computes those named by ``condition_name``."""
 
     def __getitem__(self, name: str) -> Condition:
         known = self._all
-        if name in known or not (found := _COMPUTED.fullmatch(name)):
+        if name in known or not (match := _COMPUTED.fullmatch(name)):
             return known[name]
-        headway_m, velocity_mps = map(float, found.groups())
-        if condition_name(headway_m, velocity_mps) == name:  # each has one name
+        headway_m, velocity_mps = map(float, match.groups())
+        if condition_name(headway_m, velocity_mps) == name:  # a condition has one name
             with suppress(UsageError):
                 return Condition(headway_m, velocity_mps)
         raise KeyError(name)
 
 
 CONDITIONS = _Conditions("condition")
-"""All that a sweep can play. A stored trial holds the numbers of its own (table ``trials``)."""
+"""Conditions that a sweep can play; a stored trial has its own numbers (table ``trials``)."""
 for _name, _condition in HUMAN_CONDITIONS.items():
     CONDITIONS.register(_name, _condition)

@@ -1,7 +1,7 @@
-"""The inverse-Y track: two branches meet at the merge point, and one lane follows.
+"""Inverse-Y track: two branches meet at the merge point and continue as one lane.
 
-Positions are travelled distances s along the own branch. The start points lie apart, so that a
-branch leaves the centreline at the angle whose sine is half their distance over its length.
+Positions are travelled distances s along a vehicle's branch. The sine of a branch's angle to the
+centreline is half the distance of the two start points divided by the branch's length.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from merge_runner.records import Side
 
 @dataclass(frozen=True)
 class Track:
-    """Where a run leads, in m; the defaults are the human experiment's.
+    """Dimensions of the track in m; the defaults are those of the human experiment.
 
     ``tunnel_exit_m``, ``merge_point_m`` and ``end_m`` are travelled distances. The measures in SQL
-    know no other numbers (measures.sql).
+    have the same numbers (measures.sql).
     """
 
     tunnel_exit_m: float = 50.0
@@ -28,37 +28,37 @@ class Track:
 
     @cached_property
     def branch_sine(self) -> float:
-        """How far a branch leads across the centreline, by metre."""
+        """Lateral distance of a branch per metre."""
         return self.start_distance_m / 2 / self.merge_point_m
 
     @cached_property
     def branch_cosine(self) -> float:
-        """How far a branch leads along the centreline, by metre."""
+        """Distance of a branch along the centreline per metre."""
         return sqrt(1 - self.branch_sine**2)
 
     @cached_property
     def merge_y_m(self) -> float:
-        """How far along the centreline the merge point is."""
+        """Position of the merge point along the centreline."""
         return self.merge_point_m * self.branch_cosine
 
     @cached_property
     def end_y_m(self) -> float:
-        """How far along the centreline the track ends."""
+        """Position of the track's end along the centreline."""
         return self.merge_y_m + self.end_m - self.merge_point_m
 
     def place(self, side: Side, position_m: float) -> tuple[float, float]:
-        """The point (x, y) in m of a vehicle's centre; x is negative on the left branch."""
+        """Return the centre (x, y) of a vehicle in m; x is negative on the left branch."""
         if position_m >= self.merge_point_m:
             return 0.0, self.merge_y_m + position_m - self.merge_point_m
         offset = (self.merge_point_m - position_m) * self.branch_sine
         return (-offset if side == "left" else offset), position_m * self.branch_cosine
 
     def heading(self, side: Side, position_m: float) -> tuple[float, float]:
-        """The unit vector of travel at a position."""
+        """Return the unit vector of travel at a position."""
         if position_m > self.merge_point_m:
             return 0.0, 1.0
         return (self.branch_sine if side == "left" else -self.branch_sine), self.branch_cosine
 
 
 TRACK = Track()
-"""The human experiment's."""
+"""Track of the human experiment."""

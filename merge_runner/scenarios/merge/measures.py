@@ -1,4 +1,4 @@
-"""The measures in SQL (measures.sql), and the program's own numbers that they start from."""
+"""Measures in SQL (measures.sql) with the program's constants."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from merge_runner.scenarios.merge.conditions import MEAN_SPEED_MPS
 from merge_runner.scenarios.merge.geometry import TRACK
 
 NO_CONFLICT_MPS = 0.01
-"""Vehicles that close in no faster are in no conflict: equal speeds differ by a rounding."""
+"""Closing speed below which there is no conflict: equal speeds differ by rounding."""
 
 
 def measures_sql() -> str:
-    """Definitions that replace older ones, and a macro that says which version they are."""
+    """Return definitions that replace older ones, with a macro of their version."""
     version = f"CREATE OR REPLACE MACRO measures_version() AS '{measures_version()}';"
     return f"{_definitions()}\n{version}\n"
 
 
 def measures_version() -> str:
-    """A hash of the definitions without their comments."""
+    """Return a hash of the definitions without their comments."""
     statements = re.sub(r"(?m)^[ \t]*--.*\n", "", _definitions()).rstrip("\n").split(";\n")
     defined = [text for text in statements if not text.lstrip().startswith("COMMENT ON")]
     return hashlib.sha256("\n".join(defined).encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""One trial's world: both vehicles, their trace, what each driver sees, and when it ends."""
+"""World of one trial: both vehicles with their trace, observations, and the end of the trial."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from merge_runner.scenarios.merge.vehicle import Vehicle
 class World:
     """Two vehicles on the track, from the start of control to the end of the trial.
 
-    ``status`` is None while the trial runs. Time 0 is the start of control. With ``starts`` (in m
-    and m/s) the vehicles start elsewhere than the condition says. Raises UsageError where one would
-    be at the merge point before that.
+    ``status`` is None while the trial runs. Time 0 is the start of control. ``starts`` (in m and
+    m/s) replace the start of the condition. Raises UsageError if a vehicle of the condition is at
+    the merge point before control starts.
     """
 
     def __init__(
@@ -46,11 +46,11 @@ class World:
 
     @property
     def time_s(self) -> float:
-        """The time since the start of control."""
+        """Time since the start of control."""
         return _time(self.step, self._config.step_s)
 
     def in_control(self, side: Side) -> bool:
-        """Whether the vehicle has left its tunnel; until then it cruises by itself."""
+        """Return whether the vehicle has left its tunnel; until then it cruises by itself."""
         return self._vehicles[side].positions[-1] > self._track.tunnel_exit_m - 1e-9
 
     def advance(self, actions: Mapping[Side, float | None]) -> None:
@@ -73,10 +73,10 @@ class World:
             elif self.step >= config.timeout_steps:
                 self.status = "timeout"
             if self.status is not None:
-                return  # what the vehicles drove beyond this step is of no trial
+                return  # samples beyond this step are not part of the trial
 
     def merged_first(self) -> Side | None:
-        """Who reached the merge point first; None after a collision or if nobody did."""
+        """Return the side that reached the merge point first; None for neither or a collision."""
         merged = {side: vehicle.merged for side, vehicle in self._vehicles.items()}
         step_s = self._config.step_s
         times = {s: _time(at, step_s) + on for s, (at, on) in merged.items() if at < self.step}
@@ -85,7 +85,7 @@ class World:
         return min(times, key=times.__getitem__)
 
     def observe(self, side: Side, step: int | None = None) -> Observation:
-        """What the driver of ``side`` sees, itself as ego, now or at an earlier step."""
+        """Return the true observation of the driver of ``side``, now or at an earlier step."""
         own, other = self._vehicles["left"], self._vehicles["right"]
         if side == "right":
             own, other = other, own
@@ -107,7 +107,7 @@ class World:
         )
 
     def states(self) -> tuple[StateRow, ...]:
-        """The trace, one row per vehicle and sample."""
+        """Return the trace as one row per vehicle and sample."""
         rows = []
         for step in range(self.step + 1):
             time_s = _time(step, self._config.step_s)
@@ -124,11 +124,11 @@ class World:
         return tuple(rows)
 
     def _history(self, samples: list[float], before: float) -> tuple[float, ...]:
-        wanted = self._config.memory_samples
-        lacking = wanted - len(samples) if self._config.history_start == "cruise" else 0
-        return (before,) * lacking + tuple(samples[-wanted:])
+        length = self._config.memory_samples
+        missing = length - len(samples) if self._config.history_start == "cruise" else 0
+        return (before,) * missing + tuple(samples[-length:])
 
 
 def _time(step: float, step_s: float) -> float:
-    """The time of a step, without the binary dust of a product like 3 * 0.2."""
+    """Return the time of a step, rounded: 3 * 0.2 is not 0.6 in binary."""
     return round(step * step_s, 9)

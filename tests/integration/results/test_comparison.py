@@ -4,7 +4,7 @@ import pytest
 
 from merge_runner.results.database import in_memory, schema_sql
 from merge_runner.results.rows import PLACES, rows_of, stored_rows
-from merge_runner.results.store import OF_A_RUN
+from merge_runner.results.store import RUN_COLUMNS
 from tests.support.studies import Drive, Said, played
 
 ANOTHER = {
@@ -66,8 +66,8 @@ def test_every_second_column_that_is_changed_is_found_and_no_other(stored, first
     change(stored, changed)
     names = [f"{table}.{column}" for table, column, _ in changed]
     assert sorted(differing(stored)) == sorted(names)
-    lasting = [name for name in names if name.partition(".")[2] not in OF_A_RUN]
-    assert sorted(differing(stored, ignored=OF_A_RUN)) == sorted(lasting)
+    lasting = [name for name in names if name.partition(".")[2] not in RUN_COLUMNS]
+    assert sorted(differing(stored, ignored=RUN_COLUMNS)) == sorted(lasting)
 
 
 @pytest.mark.parametrize("place", [each for each in COLUMNS if each[1] in PLACES[each[0]]])

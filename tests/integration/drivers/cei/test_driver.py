@@ -115,6 +115,6 @@ def test_the_usual_set_suits_the_resistance_unless_one_is_chosen(resistance):
 def test_a_driver_that_never_sees_the_other_drives_at_the_speed_that_it_desires(set_):
     blind = {f"perception_{side}": Perception(view_from_m=1e-9, delay_s=20.0) for side in SIDES}
     trial = played("L_4_-8", 1, scenario(**blind), cei(set=set_))
-    assert not any(row.told.other_seen for row in trial.decisions)
+    assert not any(row.observed.other_seen for row in trial.decisions)
     own = [row.velocity_mps for row in trial.states if row.side == "left"]
     assert own == pytest.approx([own[0]] * len(own), abs=0.3)
