@@ -13,6 +13,7 @@ from tests.support.crossed_study import MODEL
 from tests.support.harness import FAST, RECORDING, watched
 
 DB = "results/merge.duckdb"
+DIGEST = "c25fea54ec083b0c0270edb5f331192cf023a2bfb786a8e6078f2242b7eb6bf2"
 POINT = ("--conditions", "N_0_0,h2_dv-1.2")  # one of a grid
 # A reply of 1000 tokens costs 1 USD at most.
 FIRST = ("sweep", "baseline", "--first")
@@ -90,6 +91,7 @@ async def test_replayed_imported_and_forgotten_situations_are_the_same_without_a
         run = await merge_runner(*ask, "--replay", *places, **away)
         assert (run.code, run.summary["calls"]) == (0, {"live": 0, "cached": 6}), run.err
     digests = {results_digest(tmp_path / name) for name in (DB, "file.duckdb", "cache.duckdb")}
+    assert digests == {(DIGEST, 3)}, "as in databases of schema 9"
     assert (await merge_runner("forget", "*", "--yes")).code == 0
     assert results_digest(tmp_path / DB)[1] == 0
     assert (await merge_runner(*ask)).summary["calls"] == {"live": 0, "cached": 6}
