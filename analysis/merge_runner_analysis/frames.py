@@ -16,7 +16,8 @@ import pandas as pd
 from merge_runner.audit.checks import ASKED_DECISIONS
 from merge_runner.paths import DEFAULT_DB
 from merge_runner.results import frames
-from merge_runner.results.database import limit_memory, read_database
+from merge_runner.results.database import read_database
+from merge_runner.results.instance import limit_memory
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.served_model import other_models, sql_of
 from merge_runner.study.runs import study_name

@@ -17,8 +17,8 @@ import pandas as pd
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
-from merge_runner.results.database import SETTINGS
 from merge_runner.results.frames import frame
+from merge_runner.results.instance import SETTINGS
 from merge_runner.scenarios.merge.collision import rectangles_overlap
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.vehicle import advance

@@ -19,16 +19,10 @@ import duckdb
 from merge_runner.errors import RecordingError, StoreError
 from merge_runner.llm.cache import CachedCall
 from merge_runner.records import ANSWERED_FIELD, SIDES, canonical_json
-from merge_runner.results.database import (
-    SETTINGS,
-    append,
-    by_name,
-    in_memory,
-    limit_memory,
-    read_database,
-    schema_sql,
-)
-from merge_runner.results.recording import described_sweeps, read_provenance, read_recording
+from merge_runner.results.database import append, by_name, read_database, schema_sql
+from merge_runner.results.instance import SETTINGS, in_memory, limit_memory
+from merge_runner.results.recorded_sweeps import described_sweeps
+from merge_runner.results.recording import read_provenance, read_recording
 from merge_runner.results.rows import Row, TrialKey, call_row
 from merge_runner.served_model import other_models
 from merge_runner.text_safety import first_line

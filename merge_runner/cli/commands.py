@@ -369,16 +369,17 @@ def forget(
 
     Example: merge-runner forget "baseline-*"
     """
-    from merge_runner.results import store
+    from merge_runner.results.sweeps import forget as forget_sweeps
+    from merge_runner.results.sweeps import to_forget
     from merge_runner.run.progress_file import running
 
     for busy in running(db):
         raise UsageError(
             f"the sweep {busy.sweep_id} is running into {db}: stop it, or wait for its end"
         )
-    ids, going = store.to_forget(db, sweeps)
+    ids, going = to_forget(db, sweeps)
     agree(f"these go from {db}: {going}", "Remove them?", otherwise="nothing was removed", yes=yes)
-    store.forget(db, ids)
+    forget_sweeps(db, ids)
     say(
         f"removed: {going}. Their replies stay in the cache: the same `merge-runner sweep` plays "
         "the trials again without a call"
@@ -398,8 +399,9 @@ def recording_export(
     Example: merge-runner recording export mine.parquet
     """
     from merge_runner.llm.cache import ResponseCache
-    from merge_runner.results.recording import carried_plugins, export_recording, provenance_of
-    from merge_runner.results.store import recorded_sweeps, sweeps_with_calls
+    from merge_runner.results.recorded_sweeps import carried_plugins, provenance_of
+    from merge_runner.results.recording import export_recording
+    from merge_runner.results.sweeps import recorded_sweeps, sweeps_with_calls
 
     if sweeps and study is not None:
         raise UsageError(NOT_BOTH)
@@ -445,7 +447,7 @@ def recording_verify(file: RecordingFile) -> None:
 
     Example: merge-runner recording verify theirs.parquet
     """
-    from merge_runner.results.recording import summarise
+    from merge_runner.results.recording_summary import summarise
 
     found = summarise(file)
     say(f"{file} is whole: {found['calls']} calls, as they were exported")
@@ -460,7 +462,7 @@ def recording_info(
 
     Example: merge-runner recording info theirs.parquet
     """
-    from merge_runner.results.recording import summarise, summary_lines
+    from merge_runner.results.recording_summary import summarise, summary_lines
 
     found = summarise(file)
     as_text = json.dumps(found, indent=2, ensure_ascii=False) if as_json else ""

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import atexit
 import contextlib
 import logging
 import os
 import re
-import shutil
-import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -23,6 +20,7 @@ from typing import Any, TypeVar
 import duckdb
 
 from merge_runner.errors import StoreError, StoreLocked, UsageError
+from merge_runner.results.instance import SETTINGS, Instance
 from merge_runner.scenarios.merge.measures import measures_sql, measures_version
 from merge_runner.text_safety import first_line, quoted
 
@@ -34,26 +32,8 @@ PATIENCE_S = 60.0
 ROWS_AT_ONCE = 100
 ROWS_OF_A_GROUP = 4_096
 """Size of written row groups: each transaction rewrites a group in memory until it is full."""
-BYTES_OF_A_CALL, MERGED_BYTES = 3_000, 2**26
-"""Compressed bytes of a call with short replies and its share of the states; and the excess of the
-file's size up to which its row groups are merged."""
-SIZES = """
-SELECT greatest(max(stats(request).max_string_length), max(stats(reply).max_string_length), 0),
-    (SELECT count(*) FROM calls)
-FROM (SELECT request, reply FROM calls LIMIT 1)
-"""
 LOG = logging.getLogger(__name__)
 ResultT = TypeVar("ResultT")
-Settings = dict[str, str | bool | int | float | list[str]]
-SETTINGS: Settings = {
-    # DuckDB's defaults are shares of the machine's memory, mostly spent on caching the file. A
-    # thread unpacks the texts of 2,048 rows at once: 128 MB for replies of 64 KB.
-    "memory_limit": "1GB",  # limit_memory lowers it
-    "threads": 2,
-    "max_vacuum_tasks": 0,  # merge_small_groups raises it
-    # The oldest DuckDB that can open new files.
-    "storage_compatibility_version": "v1.2.0",
-}
 REBUILD = (
     "move it away, or name another with --db, and run the same sweep again: it is rebuilt from the "
     "cache without a call"
@@ -78,57 +58,6 @@ def warn_of_other_measures(path: Path) -> None:
         "and they are read as they are; `merge-runner sweep` into it brings them up to date",
         path,
     )
-
-
-@cache
-def _spill_folder(pid: int) -> str:
-    """Create the private spill folder of a process, removed at its exit.
-
-    Another user could own a folder with a predictable name.
-    """
-    folder = tempfile.mkdtemp(prefix="merge-runner-")
-
-    def remove() -> None:
-        if os.getpid() == pid:  # not in a fork
-            shutil.rmtree(folder, ignore_errors=True)
-
-    atexit.register(remove)
-    return folder
-
-
-def in_memory(settings: Settings) -> duckdb.DuckDBPyConnection:
-    """Return a new in-memory database that spills into a private folder."""
-    spilling: Settings = {"temp_directory": _spill_folder(os.getpid())}
-    connection = duckdb.connect(config=settings | spilling)
-    # DuckDB takes `python -c` for an interactive prompt and would draw a progress bar for a slow
-    # query. In a notebook without ipywidgets it refuses this setting.
-    with contextlib.suppress(duckdb.InvalidInputException):
-        connection.execute("SET enable_progress_bar = false")
-    return connection
-
-
-class Instance:
-    """DuckDB instance; attaching a file takes the file's lock, detaching releases it.
-
-    Creating an instance takes longer than most queries, so that one is shared. After an error it
-    may be unusable and is replaced.
-    """
-
-    def __init__(self) -> None:
-        self._connection: duckdb.DuckDBPyConnection | None = None
-
-    def cursor(self) -> duckdb.DuckDBPyConnection:
-        """Return a separate connection to the instance."""
-        if self._connection is None:
-            self._connection = in_memory(SETTINGS)
-        return self._connection.cursor()
-
-    def drop(self) -> None:
-        """Create a new instance at the next use; this one ends with its last connection.
-
-        Closing it would close the connections of other threads.
-        """
-        self._connection = None
 
 
 class Reading:
@@ -265,32 +194,6 @@ def _holder(exc: duckdb.Error) -> str:
     """Return the program and process id that hold the file, from DuckDB's message."""
     match = re.search(r"lock is held in (.+) \(PID (\d+)\)", str(exc))
     return f"{Path(match[1]).name} (PID {match[2]})" if match else "another program"
-
-
-def limit_memory(connection: duckdb.DuckDBPyConnection, longest: int = 0) -> None:
-    """Limit DuckDB to little memory and one thread for short texts and few calls.
-
-    The limit holds until the instance opens a database again. ``longest`` is the length of the
-    longest text to store. A row group of such calls takes 64 MB, an audit of 200,000 calls 110 MB;
-    more memory would only cache the file.
-    """
-    [(stored, calls)] = connection.execute(SIZES).fetchall()
-    is_little = bool(max(stored, longest) < 8_192 and calls < 210_000)
-    limit = f"{110 + calls // 7_000}MB" if is_little else SETTINGS["memory_limit"]
-    connection.execute(f"SET memory_limit = '{limit}'; SET threads = {2 - is_little}")
-
-
-def merge_small_groups(connection: duckdb.DuckDBPyConnection) -> None:
-    """Let the next write merge small row groups, unless the rows have long texts.
-
-    Merging takes as much memory as the texts of a full group, and rewrites the group each time.
-    """
-    [(calls, path)] = connection.execute(
-        "SELECT estimated_size, path FROM duckdb_tables() JOIN duckdb_databases() "
-        "USING (database_name) WHERE table_name = 'calls' AND database_name = current_database()"
-    ).fetchall()
-    most_bytes = calls * BYTES_OF_A_CALL + MERGED_BYTES
-    connection.execute(f"SET max_vacuum_tasks = {100 * (Path(path).stat().st_size <= most_bytes)}")
 
 
 def of_sweeps(sweep_ids: Iterable[str]) -> str:

@@ -13,20 +13,16 @@ import hashlib
 import json
 import os
 import re
-import shlex
 import sqlite3
-from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
-from itertools import islice, zip_longest
-from operator import attrgetter
+from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import duckdb
-from pydantic import BaseModel, ConfigDict, JsonValue, field_validator
 
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import ATTEMPTS, CachedCall, Overlay, ResponseCache
@@ -40,19 +36,17 @@ from merge_runner.records import (
     canonical_json,
     check_body,
     check_call,
-    is_scripted,
 )
-from merge_runner.results import database
-from merge_runner.results.database import Settings, append, fetched, in_memory
+from merge_runner.results import instance
+from merge_runner.results.database import append, fetched
+from merge_runner.results.instance import Settings, in_memory
 from merge_runner.results.parquet import group_bytes
 from merge_runner.results.rows import Row
-from merge_runner.text_safety import first_line, one_line, quoted
+from merge_runner.text_safety import first_line, quoted
 
 FORMAT = "merge-runner recording 2"
 """Stays readable for ever: a model cannot be asked again after its shutdown."""
 PROVENANCE_HASH = "provenance_sha256"
-SWEEPS = "sweeps"
-"""Metadata key of the rows of several sweeps; one sweep has a key for each column instead."""
 COLUMNS = {
     "call_key": "VARCHAR",
     "provider": "VARCHAR",
@@ -77,40 +71,12 @@ BLOCK, MOST_BLOCK_BYTES = 2048, 2**28
 MOST_GROUP_BYTES = 2 * MOST_BLOCK_BYTES
 """Maximum bytes to decode a row group; an export writes about BLOCK rows into one."""
 WRITTEN_AT_ONCE = 16
-SHOWN = 70
-# Misses that differ only in numbers have one cause.
-_NUMBER = re.compile(r"-?\d+(\.\d+)?")
 SETTINGS: Settings = {
-    **database.SETTINGS,
+    **instance.SETTINGS,
     "autoinstall_known_extensions": False,
     "autoload_known_extensions": False,
     "threads": 1,
 }
-
-
-class RecordedSweep(BaseModel):
-    """Sweep in a recording, read from the configuration of any version of the program.
-
-    ``repetitions`` are by prompt variant, for each condition. ``arms`` has the labels of the arms
-    of a study; recordings of plain sweeps may have none.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
-    name: str
-    model: str
-    repetitions: Counter[str]
-    conditions: tuple[str, ...]
-    sample_set: int
-    arms: frozenset[str] = frozenset()
-    models: dict[str, JsonValue] = {}
-
-    @field_validator("arms", mode="before")
-    @classmethod
-    def _labels(cls, stored: object) -> object:
-        if not isinstance(stored, list):
-            return stored
-        return [arm.get("label") if isinstance(arm, dict) else arm for arm in stored]
 
 
 def export_recording(
@@ -271,57 +237,6 @@ def import_recording(file: Path, cache: ResponseCache) -> tuple[int, int]:
     return cache.add_missing(read_recording(file))
 
 
-def summarise(file: Path) -> dict[str, Any]:
-    """Verify a recording and count its calls by model, endpoint and outcome.
-
-    ``scripted`` is the number of calls that a mock model answered, ``cost_usd`` the cost of the
-    replies when they were made. ``plugins`` are the files whose source the recording has.
-    """
-    names = ("models_requested", "models_served", "endpoints", "outcomes")
-    counts = {name: Counter[str]() for name in names}
-    numbers = Counter(calls=0, scripted=0, attempts=0)
-    cost_usd, provenance = 0.0, read_provenance(file)
-    for entry in read_recording(file):
-        request, last = entry.request, entry.attempts[-1]
-        numbers.update(calls=1, scripted=is_scripted(request, last), attempts=len(entry.attempts))
-        cost_usd += sum(attempt.cost_usd or 0.0 for attempt in entry.attempts)
-        values = (request.model, last.model_served or "unknown", request.endpoint, last.outcome)
-        for count, value in zip(counts.values(), values, strict=True):
-            count[value] += 1
-    origin = {"plugins": carried_plugins(provenance), "provenance": provenance}
-    return {**numbers, "cost_usd": round(cost_usd, 6), **counts, **origin}
-
-
-def summary_lines(file: Path, summary: dict[str, Any]) -> Iterator[str]:
-    """Yield the summary of a recording (``summarise``) as lines of text."""
-    for row in sweep_rows(summary["provenance"]):
-        study, trials, models = "unknown", "unknown", ""
-        with suppress(*DAMAGED):
-            study, config = row["name"], json.loads(row["config"])
-            models = config["model"]
-            arms = config.get("arms") or [
-                {"repetitions": n} for n in config["repetitions"].values()
-            ]
-            planned = sum(arm["repetitions"] for arm in arms) * len(config["conditions"])
-            trials = f"{planned} of {models}"
-        times = (str(row.get(name) or "?")[:16] for name in ("started_at", "ended_at"))
-        yield one_line(f"study    {study}")
-        yield one_line(f"trials   {trials}")
-        yield f"played   {' to '.join(times)} UTC"
-    for model, calls in summary["models_requested"].items():
-        yield f"model    {model}: {calls} calls"
-    scripted, calls = summary["scripted"], summary["calls"]
-    if scripted:
-        yield f"         {scripted} of {calls} calls were answered by a scripted stand-in"
-    outcomes = ", ".join(f"{number} {outcome}" for outcome, number in summary["outcomes"].items())
-    usd = f"{summary['cost_usd']:.2f} USD"
-    yield f"calls    {calls} ({outcomes}), {summary['attempts']} attempts, {usd}"
-    if summary["plugins"]:
-        yield f"code     {', '.join(summary['plugins'])}: runs where the study is played again"
-    yield f"digest   {summary['provenance']['content_sha256']} (of its replies)"
-    yield f"again    merge-runner replay {shlex.quote(str(file))}"
-
-
 def _fingerprint(key: str, attempts: str) -> bytes:
     """Return the part of a row that the recording's hash covers; the key covers the rest."""
     return f"{key} {attempts}\n".encode()
@@ -415,151 +330,3 @@ def read_provenance(file: Path) -> dict[str, str]:
     """Return a recording's metadata, not verified; raises RecordingError."""
     with opened(file) as (_, metadata):
         return metadata
-
-
-def provenance_of(sweeps: list[dict[str, Any]]) -> dict[str, str]:
-    """Return the metadata of the sweeps of a recording.
-
-    The command line is left out: its paths may name people and machines.
-    """
-    rows = [
-        {name: str(value) for name, value in row.items() if value is not None} for row in sweeps
-    ]
-    for row in rows:
-        with suppress(*DAMAGED):
-            config = dict(json.loads(row["config"]))
-            row["config"] = canonical_json({k: v for k, v in config.items() if k != "typed"})
-    return rows[0] if len(rows) == 1 else {SWEEPS: canonical_json(rows)}
-
-
-def carried_plugins(provenance: dict[str, str]) -> list[str]:
-    """Return the names of the plug-ins in a recording's metadata, not verified."""
-    names = set[str]()
-    for row in sweep_rows(provenance):
-        with suppress(*DAMAGED):
-            names.update(map(str, json.loads(row["config"])["study"]["plugins"]))
-    return sorted(names)
-
-
-def described_sweeps(provenance: dict[str, str]) -> list[RecordedSweep]:
-    """Return the sweeps in a recording's metadata, without those with invalid configurations."""
-    sweeps = []
-    for row in sweep_rows(provenance):
-        with suppress(*DAMAGED):
-            sweeps.append(RecordedSweep(**{**json.loads(row["config"]), "name": row["name"]}))
-    return sweeps
-
-
-def sweep_rows(provenance: dict[str, str]) -> list[Any]:
-    """Return the rows of sweeps in a recording's metadata, not verified."""
-    with suppress(*DAMAGED):
-        return [row for row in json.loads(provenance[SWEEPS]) if isinstance(row, dict)]
-    return [provenance]
-
-
-def recorded_part(
-    files: Iterable[Path], names: Collection[str], model: str, sample_set: int
-) -> RecordedSweep | None:
-    """Return the recorded part of a sweep, merged over recordings and runs; None without any.
-
-    The sweep may have several ``names``. Repetitions and conditions without a recorded call are
-    left out. Raises RecordingError.
-    """
-    part = None
-    for file in files:
-        with opened(file) as (connection, provenance):
-            counts = "SELECT condition, max(repetition) FROM recording GROUP BY ALL"
-            recorded = dict(connection.execute(counts).fetchall())
-        for sweep in described_sweeps(provenance):
-            if sweep.name not in names or (sweep.model, sweep.sample_set) != (model, sample_set):
-                continue
-            most = max((recorded.get(name, 0) for name in sweep.conditions), default=0)
-            repetitions = Counter({name: min(n, most) for name, n in sweep.repetitions.items()})
-            conditions = tuple(name for name in sweep.conditions if name in recorded)
-            if part is not None:
-                repetitions |= part.repetitions  # the larger number of each
-                conditions = tuple(dict.fromkeys([*part.conditions, *conditions]))
-            changes = {"repetitions": repetitions, "conditions": conditions}
-            arms = sweep.arms | (part.arms if part else frozenset())
-            part = sweep.model_copy(update={**changes, "arms": arms})
-    return part
-
-
-def described(files: Sequence[Path], entries: Iterable[CachedCall]) -> str:
-    """Return in words how many calls of each model the recordings (or the cache) hold."""
-    models = Counter(entry.request.model for entry in entries)
-    counts = ", ".join(f"{calls} calls of {model}" for model, calls in sorted(models.items()))
-    named = ", ".join(map(str, files)) or "the cache"
-    return one_line(f"{named} holds {counts or 'no call at all'}")
-
-
-@dataclass(frozen=True, slots=True)
-class Miss:
-    """Call without a recorded reply, and the trial that needed it."""
-
-    trial_id: str
-    request: ChatRequest
-
-
-def explain(misses: list[Miss], recorded: Iterable[CachedCall]) -> list[str]:
-    """Return how misses differ from the nearest recorded request, one text per kind of difference.
-
-    The text names the first trial, side and decision, and the number of further ones. The nearest
-    request has the same slot, else the same condition, side and decision, else it is any; among
-    several of one slot, it is the one with the fewest differences.
-    """
-    place = attrgetter("condition", "side", "decision")
-    slots = {miss.request.slot for miss in misses}
-    known: dict[object, list[ChatRequest]] = {}  # by slot, the first by place, the first of all
-    for request in (entry.request for entry in recorded):
-        if request.slot in slots:
-            known.setdefault(request.slot, []).append(request)
-        for key in (place(request.slot), None):
-            known.setdefault(key, [request])
-    alike: dict[str, list[tuple[Miss, str]]] = {}
-    for miss in misses:
-        keys = (miss.request.slot, place(miss.request.slot), None)
-        near = next((known[key] for key in keys if key in known), [])
-        fields = min((_differences(other, miss.request) for other in near), key=len, default=[])
-        text = f"the nearest recorded request differs in {'; '.join(fields)}"
-        text = text if fields else "nothing is recorded at all"
-        alike.setdefault(_NUMBER.sub("0", text), []).append((miss, text))
-    lines = []
-    for group in alike.values():
-        first, text = group[0]
-        slot, trials = first.request.slot, {miss.trial_id for miss, _ in group}
-        line = f"{first.trial_id}, {slot.side}, decision {slot.decision}: {text}"
-        more = f"; {len(group)} calls of {len(trials)} trials differ like this"
-        lines.append(line + more * (len(group) > 1))
-    return lines
-
-
-def _differences(recorded: ChatRequest, expected: ChatRequest) -> list[str]:
-    """Return the differing fields with both values; for texts the first differing lines."""
-    old, new, texts = _fields(recorded), _fields(expected), []
-    for name in sorted(old.keys() | new.keys()):
-        before, after = old.get(name), new.get(name)
-        if isinstance(before, str) and isinstance(after, str):
-            lines = zip_longest(before.split("\n"), after.split("\n"))
-            before, after = next((pair for pair in lines if pair[0] != pair[1]), (None, None))
-        if before != after:
-            values = ("nothing" if value is None else repr(value) for value in (before, after))
-            was, now = (v if len(v) <= SHOWN else v[:SHOWN] + "..." for v in values)
-            texts.append(f"{name} (recorded {was}, wanted {now})")
-    return texts
-
-
-def _fields(request: ChatRequest) -> dict[str, object]:
-    """Return the values that a request's key covers, by the path of each."""
-    parts = {"endpoint": request.endpoint, "path": request.path, "headers": request.headers}
-    body = json.loads(request.body)
-    return dict(leaves({**asdict(request.slot), **parts, "body": body}))
-
-
-def leaves(value: object, name: str = "") -> Iterator[tuple[str, object]]:
-    """Yield (path, value) for each scalar within a JSON value."""
-    if isinstance(value, dict | list):
-        for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from leaves(inner, f"{name}.{key}".lstrip("."))
-    else:
-        yield name, value

@@ -7,7 +7,6 @@ import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
-from fnmatch import fnmatchcase
 from itertools import chain, groupby
 from operator import itemgetter
 from pathlib import Path
@@ -15,21 +14,15 @@ from typing import Any
 
 import duckdb
 
-from merge_runner.errors import UsageError, unknown_name
+from merge_runner.errors import UsageError
 from merge_runner.records import TrialRecord, TrialSpec
-from merge_runner.registry import require
 from merge_runner.results.database import (
     PATIENCE_S,
     SCHEMA_VERSION,
-    SETTINGS,
-    Instance,
     append,
-    by_name,
     check_schema,
     fetched,
     has_these_measures,
-    limit_memory,
-    merge_small_groups,
     names_of,
     only,
     read_database,
@@ -37,6 +30,7 @@ from merge_runner.results.database import (
     unreadable_is_usage,
     write_database,
 )
+from merge_runner.results.instance import SETTINGS, Instance, limit_memory, merge_small_groups
 from merge_runner.results.rows import (
     FACTORS,
     PLACES,
@@ -48,30 +42,9 @@ from merge_runner.results.rows import (
     stored_rows,
 )
 from merge_runner.scenarios.merge.measures import measures_sql
-from merge_runner.served_model import other_models
 
 # Columns that depend on the run: whether it made an attempt itself, and when.
 RUN_COLUMNS = frozenset({"cached", "started_at", "latency_s"})
-FACTS = Path(__file__).with_name("facts.sql")
-SWEEPS = "FROM sweeps ORDER BY started_at"
-# Trials that only the sweeps to delete have.
-TO_DELETE = """
-CREATE OR REPLACE TEMP TABLE to_delete AS
-SELECT trial_id, spec_hash FROM sweep_trials
-GROUP BY ALL HAVING bool_and(list_contains(?, sweep_id))
-"""
-# Sorted by slot.
-CALLS_OF = """
-SELECT DISTINCT condition, rep, side, decision, sample_set, call_key
-FROM decisions JOIN trials USING (trial_id, spec_hash)
-SEMI JOIN (FROM sweep_trials WHERE list_contains(?, sweep_id)) USING (trial_id, spec_hash)
-WHERE call_key IS NOT NULL ORDER BY ALL
-"""
-THAT_ASKED = """
-SELECT sweep_id FROM sweeps SEMI JOIN (
-    FROM sweep_trials SEMI JOIN calls USING (trial_id, spec_hash)
-) USING (sweep_id) ORDER BY started_at
-"""
 # The first and the third column order the rows of a trial. A digest has the value that the source
 # of a first decision had in schema 9.
 DIGEST_COLUMNS = {
@@ -283,73 +256,6 @@ def results_digest(path: Path, sweep_ids: Sequence[str] | None = None) -> tuple[
                     digest.update(json.dumps(values[2:]).encode())
     whole = hashlib.sha256("".join(sorted(d.hexdigest() for d in digests.values())).encode())
     return whole.hexdigest(), len(digests)
-
-
-def recorded_sweeps(path: Path, sweep_ids: Sequence[str]) -> tuple[list[dict[str, Any]], list[str]]:
-    """Return the rows of these sweeps, or of the newest, and the keys of their calls.
-
-    Raises UsageError.
-    """
-    with read_database(path) as connection:
-        sweeps = {row["sweep_id"]: row for row in by_name(connection.execute(SWEEPS))}
-        ids = list(dict.fromkeys(sweep_ids)) or [*sweeps][-1:] or [""]
-        rows = [require(sweeps, "sweep", sweep_id, f"in {path}") for sweep_id in ids]
-        keys = connection.execute(CALLS_OF, [ids]).fetchall()
-    return rows, [key for *_, key in keys]
-
-
-def sweeps_with_calls(path: Path) -> list[str]:
-    """Return the ids of the sweeps with calls, oldest first; raises UsageError."""
-    with read_database(path) as connection:
-        return [sweep_id for (sweep_id,) in connection.execute(THAT_ASKED).fetchall()]
-
-
-def sweep_facts(path: Path, sweep_id: str) -> dict[str, Any]:
-    """Count a sweep's trials, decisions and replies, by the views of facts.sql."""
-    with read_database(path) as connection:
-        limit_memory(connection)
-        connection.execute("SET VARIABLE sweep_id = ?", [sweep_id])
-        connection.execute(FACTS.read_text(encoding="utf-8"))
-        append(connection, "other_models", other_models(connection))
-        facts = next(by_name(connection.execute("FROM decided")))
-        for name in ("outcomes", "failed", "others", "stand_ins", "same_prompts"):
-            facts[name] = connection.execute(f"FROM {name}").fetchall()
-        for name in ("levels", "first_looks"):
-            facts[name] = list(by_name(connection.execute(f"FROM {name}")))
-        return facts
-
-
-def to_forget(db: Path, patterns: Sequence[str]) -> tuple[list[str], str]:
-    """Return the ids of the sweeps that match the patterns, and a description of the deletion.
-
-    Raises UsageError for a pattern without a match.
-    """
-    with read_database(db) as connection:
-        rows = connection.execute("SELECT sweep_id FROM sweeps ORDER BY ALL").fetchall()
-        known, ids = [sweep_id for (sweep_id,) in rows], []
-        for pattern in patterns:
-            matching = [sweep_id for sweep_id in known if fnmatchcase(sweep_id, pattern)]
-            if not matching:
-                raise unknown_name("sweep", pattern, known, f"in {db}; * stands for anything")
-            ids += [sweep_id for sweep_id in matching if sweep_id not in ids]
-        connection.execute(TO_DELETE, [ids])
-        ((trials,),) = connection.execute("SELECT count(*) FROM to_delete").fetchall()
-    return ids, f"{len(ids)} sweeps ({', '.join(ids)}) and the {trials} trials of no other one"
-
-
-def forget(db: Path, ids: Sequence[str]) -> None:
-    """Delete sweeps, the trials that no other sweep has, and specs without a trial."""
-    with write_database(db) as connection:
-        connection.execute(TO_DELETE, [ids])
-        for table in PLACES:
-            connection.execute(
-                f"DELETE FROM {table} WHERE (trial_id, spec_hash) IN (FROM to_delete)"  # noqa: S608 # our tables
-            )
-        for table in ("sweep_trials", "sweeps"):
-            connection.execute(f"DELETE FROM {table} WHERE list_contains(?, sweep_id)", [ids])  # noqa: S608 # our tables
-        connection.execute(
-            "DELETE FROM specs WHERE spec_hash NOT IN (SELECT spec_hash FROM trials)"
-        )
 
 
 def _add_factors(connection: duckdb.DuckDBPyConnection, rows: Sequence[Row]) -> None:

@@ -10,7 +10,8 @@ from pathlib import Path
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.records import DAMAGED
 from merge_runner.results.database import read_database
-from merge_runner.results.recording import read_provenance, sweep_rows
+from merge_runner.results.recorded_sweeps import sweep_rows
+from merge_runner.results.recording import read_provenance
 from merge_runner.run.plan import Plan, find_parts, make_plan
 from merge_runner.study.crossing import MOST_TRIALS
 from merge_runner.study.file import study_files

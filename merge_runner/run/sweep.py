@@ -47,8 +47,11 @@ from merge_runner.records import ReplayMiss, TrialRecord, TrialSpec, canonical_j
 from merge_runner.registry import using
 from merge_runner.results.database import in_thread, unreadable_is_usage
 from merge_runner.results.provenance import git_state, versions
-from merge_runner.results.recording import Miss, described, explain, recorded_part, spilled
-from merge_runner.results.store import Store, sweep_facts
+from merge_runner.results.recorded_sweeps import recorded_part
+from merge_runner.results.recording import spilled
+from merge_runner.results.replay_misses import Miss, described, explain
+from merge_runner.results.store import Store
+from merge_runner.results.sweeps import sweep_facts
 from merge_runner.run.clients import check_batches, live_clients, open_rounds
 from merge_runner.run.cluster import DaskTasks, connected
 from merge_runner.run.estimate import Estimate, earlier_answers, estimate, usual_latencies_s

@@ -11,7 +11,8 @@ import pytest
 from merge_runner.config import driver_name
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.records import SCRIPTED_FIELD, Attempt, Slot, is_scripted, make_request
-from merge_runner.results.database import in_memory, schema_sql
+from merge_runner.results.database import schema_sql
+from merge_runner.results.instance import in_memory
 from merge_runner.results.recording import export_recording, read_recording
 from merge_runner.results.store import query, results_digest
 from merge_runner.run.estimate import earlier_answers, usual_latencies_s

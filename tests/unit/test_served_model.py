@@ -6,7 +6,7 @@ import duckdb
 import pytest
 
 from merge_runner.audit.checks import audit_sweep
-from merge_runner.results.store import sweep_facts
+from merge_runner.results.sweeps import sweep_facts
 from merge_runner.served_model import others_among
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.provenance import provenance, tally

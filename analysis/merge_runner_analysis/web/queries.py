@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import duckdb
 
 from merge_runner.errors import MergeRunnerError, UsageError
-from merge_runner.results.database import SETTINGS, fetched, in_memory
+from merge_runner.results.database import fetched
+from merge_runner.results.instance import SETTINGS, in_memory
 from merge_runner.results.store import answering
 from merge_runner.text_safety import csv_writer, in_spreadsheet
 from merge_runner_analysis.web.database_copy import Copies

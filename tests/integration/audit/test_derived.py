@@ -7,7 +7,8 @@ import pytest
 
 from merge_runner.drivers.registry import Program
 from merge_runner.prompts.blocks import Prompt
-from merge_runner.results.database import in_memory, schema_sql
+from merge_runner.results.database import schema_sql
+from merge_runner.results.instance import in_memory
 from merge_runner.results.store import query
 from merge_runner.run.stored_replay import NOT_REPLAYED, audit_database
 from tests.support.harness import PROJECT, RECORDING

@@ -7,17 +7,19 @@ import pytest
 
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.results.database import (
-    BYTES_OF_A_CALL,
     MERGED_BYTES,
     ROWS_OF_A_GROUP,
-    SETTINGS,
     append,
-    in_memory,
-    limit_memory,
-    merge_small_groups,
     open_database,
     read_database,
     schema_sql,
+)
+from merge_runner.results.instance import (
+    BYTES_OF_A_CALL,
+    SETTINGS,
+    in_memory,
+    limit_memory,
+    merge_small_groups,
 )
 from merge_runner.results.recording import export_recording, read_recording
 from merge_runner.results.store import Store

@@ -2,7 +2,8 @@
 
 import pytest
 
-from merge_runner.results.database import in_memory, schema_sql
+from merge_runner.results.database import schema_sql
+from merge_runner.results.instance import in_memory
 from merge_runner.results.rows import PLACES, rows_of, stored_rows
 from merge_runner.results.store import RUN_COLUMNS
 from tests.support.studies import Drive, Said, played

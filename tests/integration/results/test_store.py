@@ -17,14 +17,10 @@ from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import StoreLocked, UsageError
 from merge_runner.records import TrialRecord
-from merge_runner.results.database import Instance, in_thread, open_database
-from merge_runner.results.store import (
-    Store,
-    query,
-    recorded_sweeps,
-    results_digest,
-    sweep_facts,
-)
+from merge_runner.results.database import in_thread, open_database
+from merge_runner.results.instance import Instance
+from merge_runner.results.store import Store, query, results_digest
+from merge_runner.results.sweeps import recorded_sweeps, sweep_facts
 from merge_runner.run.writer import Flusher
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.trial import Trial, play_trial
@@ -39,7 +35,7 @@ SWEEP |= {"config": "{}", "versions": "{}"}
 # DuckDB takes -c for a person at a prompt, whom it would show a bar.
 SPILL = """
 import os, stat, sys
-from merge_runner.results.database import SETTINGS, in_memory
+from merge_runner.results.instance import SETTINGS, in_memory
 asked = "SELECT current_setting('temp_directory'), current_setting('enable_progress_bar')"
 with in_memory({**SETTINGS, "memory_limit": "50MB"}) as connection:
     [(folder, bar)] = connection.execute(asked).fetchall()

@@ -15,14 +15,9 @@ import pytest
 
 from merge_runner.errors import RecordingError
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.results.recording import (
-    carried_plugins,
-    export_recording,
-    import_recording,
-    provenance_of,
-    read_recording,
-    summarise,
-)
+from merge_runner.results.recorded_sweeps import carried_plugins, provenance_of
+from merge_runner.results.recording import export_recording, import_recording, read_recording
+from merge_runner.results.recording_summary import summarise
 from merge_runner.results.store import results_digest
 from merge_runner.text_safety import quoted
 from tests.support.cases import cases

@@ -21,9 +21,8 @@ from merge_runner.results.recording import (
     export_recording,
     import_recording,
     read_recording,
-    summarise,
-    summary_lines,
 )
+from merge_runner.results.recording_summary import summarise, summary_lines
 from merge_runner.run.recorded_plans import recorded_plans
 from tests.support.raw_server import a_request
 

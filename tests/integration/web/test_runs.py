@@ -14,7 +14,8 @@ import pytest
 from merge_runner.errors import UsageError
 from merge_runner.records import ANSWERS
 from merge_runner.results.database import write_database
-from merge_runner.results.store import Store, query, sweep_facts
+from merge_runner.results.store import Store, query
+from merge_runner.results.sweeps import sweep_facts
 from merge_runner.run.progress_file import remove_snapshot, write_snapshot
 from merge_runner.run.stored_replay import audit_database
 from merge_runner.scenarios.merge.conditions import CONDITIONS
