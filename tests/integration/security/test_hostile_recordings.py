@@ -282,7 +282,7 @@ PEAK_MB = """
 import sys
 from pathlib import Path
 from merge_runner.errors import RecordingError
-from merge_runner.results.recording import summarise
+from merge_runner.results.recording_summary import summarise
 
 def peak():
     status = Path("/proc/self/status").read_text()
