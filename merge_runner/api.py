@@ -24,7 +24,7 @@ from merge_runner.run.estimate_lines import estimate_lines
 from merge_runner.run.plan import Options, Plan, make_plan
 from merge_runner.run.summary import as_lines
 from merge_runner.run.sweep import on_event, play, unsent
-from merge_runner.study.crossing import level_text
+from merge_runner.study.arms import level_text
 from merge_runner.text_safety import say
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from merge_runner.registry import require
 from merge_runner.run.estimate import typical_prompt
 from merge_runner.run.plan import Plan
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.study.crossing import MODEL, PROMPT, Arm
+from merge_runner.study.arms import MODEL, PROMPT, Arm
 from merge_runner.study.file import Effect, PlantedWords
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.published import HUMAN_GAP_SD_M, human_outcomes, published

@@ -9,13 +9,14 @@ from pathlib import Path
 
 import pandas as pd
 
-from merge_runner.config import without_endpoint
+from merge_runner.driver_names import without_endpoint
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_DB
 from merge_runner.prompts.blocks import BASELINE
 from merge_runner.registry import require
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
-from merge_runner.study.crossing import MODEL, PROMPT, listed_levels
+from merge_runner.study.arms import MODEL, PROMPT
+from merge_runner.study.crossing import listed_levels
 from merge_runner.study.file import StudySource, read_study
 from merge_runner.study.runs import study_name
 from merge_runner_analysis.cache import present_state, remembered

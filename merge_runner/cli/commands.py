@@ -539,10 +539,10 @@ def models(as_json: cli.JsonOption = False) -> None:
 
     Example: merge-runner models --json
     """
-    from merge_runner.config import Price, key_status
     from merge_runner.drivers.registry import PROGRAMS
     from merge_runner.llm.models import load_models, shutdown_notes
     from merge_runner.llm.prices import cost_usd
+    from merge_runner.providers import Price, key_status
     from merge_runner.records import Usage
     from merge_runner.run.summary import as_table
 

@@ -10,7 +10,7 @@ from datetime import UTC, datetime, timedelta
 from functools import partial
 from typing import TYPE_CHECKING
 
-from merge_runner.config import ModelEntry, driver_name
+from merge_runner.driver_names import driver_name
 from merge_runner.errors import (
     EndpointRefused,
     MergeRunnerError,
@@ -41,6 +41,7 @@ from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger
 from merge_runner.llm.limiter import Limiter
 from merge_runner.llm.prices import cost_usd, underpriced_tiers
 from merge_runner.llm.recorded import RecordedReplies
+from merge_runner.providers import ModelEntry
 from merge_runner.records import (
     SCRIPTED_HEADER,
     Attempt,

@@ -13,8 +13,8 @@ from typing import Any, ClassVar
 
 from pydantic import JsonValue
 
-from merge_runner.config import ModelEntry
 from merge_runner.llm.reasoning import split_reasoning
+from merge_runner.providers import ModelEntry
 from merge_runner.records import Usage
 from merge_runner.registry import Registry
 

@@ -23,10 +23,10 @@ import aiohttp
 import httpx
 from httpx_aiohttp import AiohttpTransport
 
-from merge_runner.config import LOOPBACK, SHORTEST_SECRET, Endpoint, http_url
 from merge_runner.errors import UsageError
 from merge_runner.llm.formats import as_dict, as_dicts, as_text
 from merge_runner.llm.http_outcome import Action, RawReply, TransportFailure
+from merge_runner.providers import LOOPBACK, SHORTEST_SECRET, Endpoint, http_url
 from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, ChatRequest, canonical_json
 
 if TYPE_CHECKING:

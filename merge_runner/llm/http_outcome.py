@@ -18,7 +18,6 @@ from math import inf
 from typing import TYPE_CHECKING, Literal
 from urllib.parse import urlsplit
 
-from merge_runner.config import PROVIDERS, ModelEntry
 from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.formats import (
     BROKEN_OFF,
@@ -35,6 +34,7 @@ from merge_runner.llm.formats import (
     read_error,
     read_reply,
 )
+from merge_runner.providers import PROVIDERS, ModelEntry
 
 if TYPE_CHECKING:
     from tenacity import RetryCallState

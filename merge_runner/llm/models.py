@@ -10,18 +10,10 @@ from typing import Any
 
 from pydantic import JsonValue
 
-from merge_runner.config import (
-    PROVIDERS,
-    ModelEntry,
-    endpoint_identity,
-    experiments,
-    model_id,
-    read_text,
-    toml_of,
-    validated,
-)
+from merge_runner.config import experiments, read_text, toml_of, validated
 from merge_runner.errors import UsageError, unknown_name
 from merge_runner.llm.formats import FORMATS
+from merge_runner.providers import PROVIDERS, ModelEntry, endpoint_identity, model_id
 from merge_runner.registry import load_plugins
 from merge_runner.text_safety import one_line
 

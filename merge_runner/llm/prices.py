@@ -6,7 +6,7 @@ import contextlib
 from decimal import Decimal
 from functools import partial
 
-from merge_runner.config import ModelEntry, Price
+from merge_runner.providers import ModelEntry, Price
 from merge_runner.records import Usage
 
 # The provider names of genai-prices where they differ from ours.

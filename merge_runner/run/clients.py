@@ -8,7 +8,6 @@ from contextlib import AsyncExitStack
 from resource import RLIM_INFINITY, RLIMIT_NOFILE, getrlimit, setrlimit
 from typing import TYPE_CHECKING
 
-from merge_runner.config import resolve_endpoint
 from merge_runner.errors import UsageError
 from merge_runner.llm.batch.providers import SERVICES, batch_terms
 from merge_runner.llm.batch.rounds import Rounds
@@ -20,6 +19,7 @@ from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.llm.models import load_models
 from merge_runner.llm.prices import cost_usd
+from merge_runner.providers import resolve_endpoint
 from merge_runner.records import Usage
 from merge_runner.run.estimate import trial_costs
 from merge_runner.run.plan import Options, Plan

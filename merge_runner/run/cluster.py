@@ -32,7 +32,6 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import merge_runner
-from merge_runner.config import base_urls
 from merge_runner.errors import (
     MergeRunnerError,
     RecordingError,
@@ -45,6 +44,7 @@ from merge_runner.llm.call import Meter, Wait
 from merge_runner.llm.durable import Rows
 from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.llm.limiter import Limiter
+from merge_runner.providers import base_urls
 from merge_runner.records import Attempt, TrialRecord, TrialSpec, Usage
 from merge_runner.registry import plugin_sources, using
 from merge_runner.run.clients import live_clients

@@ -9,17 +9,17 @@ from dataclasses import dataclass, field
 from itertools import chain
 from statistics import median
 
-from merge_runner.config import ModelEntry
 from merge_runner.llm.batch.providers import batch_terms
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.kinds import Answers, counted, kinds_of
 from merge_runner.llm.prices import cost_usd
 from merge_runner.prompts.blocks import render_prompt
+from merge_runner.providers import ModelEntry
 from merge_runner.records import SIDES, Usage, canonical_json
 from merge_runner.run.plan import Options, Plan, usual_prompts
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
-from merge_runner.study.crossing import Arm
+from merge_runner.study.arms import Arm
 
 # A reply's JSON around the prompt, and later prompts with longer histories and numbers.
 PROMPT_MARGIN = 1.25

@@ -15,20 +15,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, InstanceOf, computed_field
 
-from merge_runner.config import (
-    ModelEntry,
-    ScenarioConfig,
-    both_sides,
-    endpoint_identity,
-    pair_name,
-    validated,
-)
+from merge_runner.config import ScenarioConfig, validated
+from merge_runner.driver_names import both_sides, pair_name
 from merge_runner.drivers.pace import model_pace
 from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError
 from merge_runner.llm.formats import FORMATS, WireFormat
 from merge_runner.llm.models import load_models
 from merge_runner.prompts.blocks import VARIANTS, Prompt, blocks_of, decomposed, prompt_of
+from merge_runner.providers import ModelEntry, endpoint_identity
 from merge_runner.records import (
     MOST_REPETITIONS,
     SIDES,
@@ -50,16 +45,8 @@ from merge_runner.scenarios.merge.conditions import (
 )
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
-from merge_runner.study.crossing import (
-    FOCAL,
-    OPPONENT,
-    PROMPT,
-    Arm,
-    chosen_models,
-    cross,
-    file_prompts,
-    listed_levels,
-)
+from merge_runner.study.arms import FOCAL, OPPONENT, PROMPT, Arm
+from merge_runner.study.crossing import chosen_models, cross, file_prompts, listed_levels
 from merge_runner.study.file import (
     EVERY_CONDITION,
     EVERY_PROMPT,

@@ -40,7 +40,7 @@ from merge_runner.results.replay_misses import leaves
 from merge_runner.results.rows import Stored, in_order, rows_of
 from merge_runner.run.plan import Plan, find_parts
 from merge_runner.run.replay import Replay
-from merge_runner.study.crossing import Arm
+from merge_runner.study.arms import Arm
 from merge_runner.study.parts import declared_catalogue
 from merge_runner.text_safety import one_line
 

@@ -20,14 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from merge_runner.audit.checks import Audit, audit_sweep
-from merge_runner.config import (
-    PROVIDERS,
-    UNNAMED,
-    ModelEntry,
-    driver_name,
-    model_id,
-    resolve_endpoint,
-)
+from merge_runner.driver_names import driver_name
 from merge_runner.errors import (
     MergeRunnerError,
     NoValidDecision,
@@ -43,6 +36,7 @@ from merge_runner.llm.http_outcome import TransportFailure, if_nobody, set_base_
 from merge_runner.llm.kinds import counted, recorded_values
 from merge_runner.llm.ledger import Ledger, scopes
 from merge_runner.paths import DEFAULT_DB, SHIPPED_RECORDINGS, command_at
+from merge_runner.providers import PROVIDERS, UNNAMED, ModelEntry, model_id, resolve_endpoint
 from merge_runner.records import ReplayMiss, TrialRecord, TrialSpec, canonical_json
 from merge_runner.registry import using
 from merge_runner.results.database import in_thread, unreadable_is_usage

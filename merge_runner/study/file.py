@@ -72,7 +72,7 @@ def _for_every_prompt(value: object) -> object:
 class RoadTexts(Frozen):
     """Templates of a paragraph before and after the merge point; None: no paragraph there.
 
-    In a file, a text or the key ``text`` sets both. ``prompts.fields`` has the template variables.
+    In a file, a text or the key ``text`` sets both. ``prompts.blocks`` has the template variables.
     """
 
     merge: str | None = None

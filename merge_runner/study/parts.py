@@ -19,14 +19,8 @@ from traceback import extract_tb
 from types import CodeType, ModuleType
 from urllib.parse import urlsplit
 
-from merge_runner.config import (
-    LOOPBACK,
-    PROVIDERS,
-    both_sides,
-    endpoint_url,
-    state_folder,
-    url_origin,
-)
+from merge_runner.config import state_folder
+from merge_runner.driver_names import both_sides
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
 from merge_runner.llm.models import REGISTRY, read_entries, registry_files
@@ -40,10 +34,12 @@ from merge_runner.prompts.blocks import (
     blocks_of,
     with_block,
 )
+from merge_runner.providers import LOOPBACK, PROVIDERS, endpoint_url, url_origin
 from merge_runner.records import canonical_json
 from merge_runner.registry import FAULTS, NAME, Catalogue, collecting, installing, require
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.study.crossing import OPPONENT, chosen_models, level_text
+from merge_runner.study.arms import OPPONENT, level_text
+from merge_runner.study.crossing import chosen_models
 from merge_runner.study.file import (
     PLUGIN,
     TEMPLATE,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from merge_runner.errors import UsageError
 from merge_runner.results.database import read_database
-from merge_runner.study.crossing import MODEL, PROMPT
+from merge_runner.study.arms import MODEL, PROMPT
 from merge_runner.study.file import StudySource
 
 NAMED = """

@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 import duckdb
 import pytest
 
-from merge_runner.config import driver_name
+from merge_runner.driver_names import driver_name
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.records import SCRIPTED_FIELD, Attempt, Slot, is_scripted, make_request
 from merge_runner.results.database import schema_sql

@@ -3,11 +3,12 @@
 import pytest
 from aiohttp import web
 
-from merge_runner.config import Endpoint, ModelEntry, ScenarioConfig
+from merge_runner.config import ScenarioConfig
 from merge_runner.llm.batch.providers import SERVICES
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import HttpTransport
 from merge_runner.prompts.blocks import prompt_of, render_prompt
+from merge_runner.providers import Endpoint, ModelEntry
 from merge_runner.records import Slot, make_request
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK

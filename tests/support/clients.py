@@ -6,13 +6,13 @@ import sqlite3
 
 import pytest
 
-from merge_runner.config import ModelEntry, Price
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.http_outcome import RawReply
 from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import Limiter
+from merge_runner.providers import ModelEntry, Price
 from merge_runner.records import Slot
 from tests.support.virtual_time import now_s
 

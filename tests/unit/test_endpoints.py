@@ -4,7 +4,12 @@ from datetime import date
 
 import pytest
 
-from merge_runner.config import (
+from merge_runner.errors import UsageError
+from merge_runner.llm.formats import FORMATS
+from merge_runner.llm.http import url_of
+from merge_runner.llm.http_outcome import if_nobody
+from merge_runner.llm.models import read_models, shutdown_notes, with_parameter
+from merge_runner.providers import (
     PROVIDERS,
     ModelEntry,
     endpoint_identity,
@@ -12,11 +17,6 @@ from merge_runner.config import (
     normalised_url,
     resolve_endpoint,
 )
-from merge_runner.errors import UsageError
-from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.http import url_of
-from merge_runner.llm.http_outcome import if_nobody
-from merge_runner.llm.models import read_models, shutdown_notes, with_parameter
 from tests.support.harness import PROJECT
 
 REGISTRY = PROJECT / "experiments/models.toml"

@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from merge_runner.study.crossing import MODEL
+from merge_runner.study.arms import MODEL
 from merge_runner_analysis.figures.style import (
     GREY,
     LINE_IN,

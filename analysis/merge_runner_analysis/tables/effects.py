@@ -7,7 +7,7 @@ from dataclasses import replace
 from itertools import chain
 from math import isinf
 
-from merge_runner.study.crossing import PROMPT
+from merge_runner.study.arms import PROMPT
 from merge_runner_analysis.metrics import (
     INTERVALS,
     JUDGED,

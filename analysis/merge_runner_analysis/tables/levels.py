@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import product
 
-from merge_runner.study.crossing import MODEL, OPPONENT
+from merge_runner.study.arms import MODEL, OPPONENT
 from merge_runner_analysis.metrics import COLLISIONS, GAP, LEFT_FIRST, RMSE, Metric
 from merge_runner_analysis.stats.effects import primary
 from merge_runner_analysis.stats.levels import Level, crossing, levels_by_factor

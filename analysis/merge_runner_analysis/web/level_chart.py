@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from math import ceil, floor, log10
 
 from merge_runner.prompts.blocks import title_of
-from merge_runner.study.crossing import MODEL, PROMPT
+from merge_runner.study.arms import MODEL, PROMPT
 from merge_runner_analysis.metrics import LEFT_FIRST
 from merge_runner_analysis.tables.model import Row
 from merge_runner_analysis.web.effect_rows import interval_of, value_of

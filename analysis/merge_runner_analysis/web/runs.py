@@ -10,7 +10,7 @@ from datetime import UTC
 from typing import Any
 
 from merge_runner.audit.checks import not_judged
-from merge_runner.config import both_sides, pair_name
+from merge_runner.driver_names import both_sides, pair_name
 from merge_runner.paths import DEFAULT_DB, command_at
 from merge_runner.run.progress_file import ProgressSnapshot, read_snapshot
 from merge_runner_analysis.web.catalogue import Catalogue, Wanted

@@ -11,13 +11,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from urllib.parse import quote, urlsplit
 from uuid import uuid4
 
-from merge_runner.config import (
-    PROVIDERS,
-    BatchTerms,
-    Endpoint,
-    ModelEntry,
-    endpoint_identity,
-)
 from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.formats import (
     ServerError,
@@ -36,6 +29,7 @@ from merge_runner.llm.http_outcome import (
     may_be_charged,
     status_within,
 )
+from merge_runner.providers import PROVIDERS, BatchTerms, Endpoint, ModelEntry, endpoint_identity
 from merge_runner.records import LARGEST_STATUS, SLOT_HEADER, ChatRequest, canonical_json
 
 if TYPE_CHECKING:

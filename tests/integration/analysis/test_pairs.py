@@ -9,7 +9,7 @@ import json
 import duckdb
 import pytest
 
-from merge_runner.config import ego_side
+from merge_runner.driver_names import ego_side
 from merge_runner_analysis.frames import load, load_trials
 from merge_runner_analysis.stats.indicators import fits
 from merge_runner_analysis.stats.regressions import who_first_logit

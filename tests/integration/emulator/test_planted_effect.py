@@ -7,11 +7,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from merge_runner.config import PROVIDERS, ScenarioConfig
+from merge_runner.config import ScenarioConfig
 from merge_runner.emulator.driver import answer
 from merge_runner.planted_effect import PARAMETERS, PlantedEffect, planted_fields
 from merge_runner.prompts.blocks import prompt_of, render_prompt
 from merge_runner.prompts.parse import parse_reply
+from merge_runner.providers import PROVIDERS
 from merge_runner.records import SIDES, Slot
 from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK

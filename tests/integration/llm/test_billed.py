@@ -12,7 +12,6 @@ import json
 import pytest
 from aiohttp import web
 
-from merge_runner.config import Endpoint, ModelEntry, Price
 from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
@@ -22,6 +21,7 @@ from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import Limiter
 from merge_runner.llm.prices import cost_usd
+from merge_runner.providers import Endpoint, ModelEntry, Price
 from merge_runner.records import Slot, Usage, canonical_json
 from tests.integration.llm.test_scenarios import (  # noqa: F401 # fixtures
     GEMINI,

@@ -10,10 +10,10 @@ from urllib.parse import unquote
 import pytest
 from aiohttp import web
 
-from merge_runner.config import Endpoint, ModelEntry, resolve_endpoint
 from merge_runner.errors import UsageError
 from merge_runner.llm.http import Connections, HttpTransport
 from merge_runner.llm.http_outcome import TransportFailure
+from merge_runner.providers import Endpoint, ModelEntry, resolve_endpoint
 from merge_runner.records import Slot, call_key, canonical_json, make_request
 from tests.support.harness import listening
 from tests.support.mock_server import FaultPlan

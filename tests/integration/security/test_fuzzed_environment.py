@@ -9,10 +9,10 @@ import pytest
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
-from merge_runner.config import ModelEntry, resolve_endpoint
 from merge_runner.errors import UsageError
 from merge_runner.llm.http import Connections, HttpTransport
 from merge_runner.llm.http_outcome import TransportFailure
+from merge_runner.providers import ModelEntry, resolve_endpoint
 from tests.support.raw_server import a_request
 
 ENTRY = ModelEntry(provider="openai", format="openai-chat", id="m", max_output_tokens=10)

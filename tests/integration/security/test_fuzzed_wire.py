@@ -7,7 +7,6 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from merge_runner.config import Endpoint
 from merge_runner.llm.formats import FORMATS, read_error
 from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.http_outcome import (
@@ -17,6 +16,7 @@ from merge_runner.llm.http_outcome import (
     may_be_charged,
     server_delay_s,
 )
+from merge_runner.providers import Endpoint
 from tests.support.cases import table
 from tests.support.raw_server import CHAT, a_request, raw_server
 

@@ -11,9 +11,9 @@ import zlib
 
 import pytest
 
-from merge_runner.config import Endpoint
 from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.http_outcome import TransportFailure
+from merge_runner.providers import Endpoint
 from tests.support.harness import FAST
 from tests.support.raw_server import CHAT, a_request, head, ok, raw_server
 

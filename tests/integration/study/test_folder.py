@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from merge_runner import Study
-from merge_runner.config import ModelEntry
 from merge_runner.paths import DEFAULT_DB, home_of
+from merge_runner.providers import ModelEntry
 from merge_runner.results.store import query, results_digest
 from merge_runner.study.file import TEMPLATE, write_folder
 from tests.support.harness import PROJECT, a_model

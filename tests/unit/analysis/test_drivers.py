@@ -2,7 +2,7 @@
 
 import pytest
 
-from merge_runner.config import both_sides
+from merge_runner.driver_names import both_sides
 from merge_runner_analysis.drivers import stand_in
 from tests.support.cases import table
 

@@ -6,9 +6,9 @@ import re
 import httpx
 import pytest
 
-from merge_runner.config import ModelEntry
 from merge_runner.emulator.handler import Emulator
 from merge_runner.llm.formats import FORMATS
+from merge_runner.providers import ModelEntry
 from merge_runner.records import ANSWERED_FIELD, SCRIPTED_FIELD, SCRIPTED_HEADER
 
 PATHS = {

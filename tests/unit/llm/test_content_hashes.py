@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from merge_runner import records
-from merge_runner.config import ModelEntry
 from merge_runner.llm.formats import FORMATS
+from merge_runner.providers import ModelEntry
 from merge_runner.records import Slot, call_key, canonical_json, make_request
 from tests.support.cases import table
 from tests.support.json_values import paths, replaced

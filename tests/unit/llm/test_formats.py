@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from merge_runner.config import ModelEntry
 from merge_runner.llm.formats import FORMATS
+from merge_runner.providers import ModelEntry
 from merge_runner.records import Usage
 from tests.support.cases import by_format, table
 from tests.support.json_values import paths, replaced

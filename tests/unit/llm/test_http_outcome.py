@@ -7,7 +7,6 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from merge_runner.config import ModelEntry
 from merge_runner.llm.formats import FORMATS, Reading, WireFormat, WireRequest
 from merge_runner.llm.http_outcome import (
     RawReply,
@@ -17,6 +16,7 @@ from merge_runner.llm.http_outcome import (
     server_delay_s,
     why_refused,
 )
+from merge_runner.providers import ModelEntry
 from merge_runner.records import Usage
 from tests.support.cases import by_format, cases, table
 from tests.support.json_values import paths

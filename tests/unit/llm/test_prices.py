@@ -2,8 +2,8 @@
 
 import pytest
 
-from merge_runner.config import ModelEntry, Price
 from merge_runner.llm.prices import cost_usd, underpriced_tiers
+from merge_runner.providers import ModelEntry, Price
 from merge_runner.records import Usage
 from tests.support.cases import cases, table
 

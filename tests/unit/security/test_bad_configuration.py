@@ -5,9 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from merge_runner.config import ModelEntry, Price, ScenarioConfig
+from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
 from merge_runner.llm.models import read_models
+from merge_runner.providers import ModelEntry, Price
 from merge_runner.run.plan import make_plan
 from merge_runner.study.file import StudyFile
 from tests.support.harness import PROJECT

@@ -14,11 +14,11 @@ from typing import NamedTuple
 import pytest
 from aiohttp import web
 
-from merge_runner.config import resolve_endpoint
 from merge_runner.llm.batch.providers import SERVICES
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.models import read_models
+from merge_runner.providers import resolve_endpoint
 from merge_runner.records import Slot, make_request
 from tests.support.harness import PROJECT, listening, watched
 from tests.weekly.emulator.test_sdks import (

@@ -5,12 +5,12 @@ import asyncio
 import pytest
 from llmock.scenarios import Delay, Fail, Match, Reply
 
-from merge_runner.config import Endpoint, ModelEntry
 from merge_runner.errors import EndpointRefused
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.limiter import Limiter
+from merge_runner.providers import Endpoint, ModelEntry
 from merge_runner.records import CallFailed, Slot
 from tests.weekly.foreign.conftest import PROVIDERS
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from merge_runner.prompts.blocks import decomposed
-from merge_runner.study.crossing import OPPONENT
+from merge_runner.study.arms import OPPONENT
 from merge_runner_analysis.tables import TABLES
 from merge_runner_analysis.web.catalogue import PAGE, SORTS, Wanted
 from merge_runner_analysis.web.computed import awaited, computed

@@ -4,10 +4,10 @@ import re
 
 import pytest
 
-from merge_runner.config import PROVIDERS, BatchTerms
 from merge_runner.llm.batch.providers import SERVICES, batch_terms
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.models import load_models
+from merge_runner.providers import PROVIDERS, BatchTerms
 from tests.support.batch_fixtures import entry_of, lines
 
 OWN = BatchTerms(price_factor=0.6, source="contract, 2026-11")

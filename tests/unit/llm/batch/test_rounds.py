@@ -13,7 +13,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from merge_runner.config import ModelEntry, Price
 from merge_runner.errors import CacheFailed, EndpointRefused, ProviderDown, QuotaExhausted
 from merge_runner.llm.batch.providers import BatchFailed, BatchStatus
 from merge_runner.llm.batch.rounds import Rounds
@@ -23,6 +22,7 @@ from merge_runner.llm.client import LlmClient
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import Limiter
+from merge_runner.providers import ModelEntry, Price
 from merge_runner.records import CallFailed, Slot
 from tests.support.clients import answer, error
 from tests.support.virtual_time import in_virtual_time, now_s
