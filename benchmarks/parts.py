@@ -17,13 +17,14 @@ from merge_runner.drivers.language_model import Question
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.limiter import BURST_S, Limiter
 from merge_runner.llm.models import load_models
-from merge_runner.records import Attempt, ChatReply, Decision, TrialRecord, make_request
+from merge_runner.records import Attempt, ChatReply, Decision, make_request
 from merge_runner.results.database import schema_sql
 from merge_runner.results.rows import rows_of
 from merge_runner.results.store import Store
 from merge_runner.run.plan import make_plan
 from merge_runner.run.trials import TrialMaker
 from merge_runner.trial import play_trial
+from merge_runner.trial_records import TrialRecord
 
 WAITERS, LIMIT, WINDOW_S = 2_000, 500, 1.0
 BATCHES, TRIALS = 10, 60

@@ -18,25 +18,12 @@ import duckdb
 import numpy as np
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.records import (
-    SIDES,
-    Attempt,
-    ChatReply,
-    ChatRequest,
-    Decision,
-    DecisionRow,
-    FailedCall,
-    Side,
-    Slot,
-    StateRow,
-    TrialRecord,
-    TrialSpec,
-    Usage,
-)
+from merge_runner.records import SIDES, Attempt, ChatReply, ChatRequest, Decision, Side, Slot, Usage
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS, Condition
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
+from merge_runner.trial_records import DecisionRow, FailedCall, StateRow, TrialRecord, TrialSpec
 from merge_runner_analysis.humans.record import SPEC, SPEC_HASH
 from merge_runner_analysis.published import PAIRS
 

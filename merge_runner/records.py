@@ -13,18 +13,15 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime
 from functools import lru_cache
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, JsonValue
 
 from merge_runner.errors import MergeRunnerError
 from merge_runner.registry import NAME
 
-if TYPE_CHECKING:
-    from merge_runner.scenarios.merge.conditions import Condition
 
 KEY_VERSION = 1
-SPEC_VERSION = 2  # since then one valid array in a reply is enough
 # Errors of reading foreign content; RecursionError for deeply nested JSON.
 DAMAGED = (ValueError, TypeError, KeyError, RecursionError)
 LARGEST_STATUS = 999
@@ -38,7 +35,6 @@ Side = Literal["left", "right"]
 Road = Literal["merge", "straight"]
 ROADS: tuple[Road, Road] = ("merge", "straight")
 Tactical = Literal["M", "Y"]
-Status = Literal["finished", "collided", "timeout", "failed"]
 
 # Outcomes of an attempt that count as a reply.
 ANSWERS = ("ok", "refusal", "truncated", "empty")
@@ -246,106 +242,6 @@ class Decision:
         return self.plan is not None
 
 
-@dataclass(frozen=True, slots=True)
-class TrialSpec:
-    """One trial to play, or one that humans drove.
-
-    A trial with the source ``first_decision`` ends before its drivers decide again. ``order`` is
-    its place in the sweep, lowest first. ``scripted`` is true if the emulator takes part, a mock
-    model. Humans have a ``pair`` and no ``variant``. ``factors`` are the levels of the study's
-    factors, including the text factors in ``words``; ``arm`` is their combination. ``focal`` is the
-    ego's side if the two drivers have different texts, parameters or perceptions. ``prompts`` are
-    by side if not both have the ``variant``. ``kinematics`` are the numbers of its condition.
-    """
-
-    trial_id: str
-    spec_hash: str
-    source: Literal["llm", "driver", "human", "first_decision"]
-    model_left: str
-    model_right: str
-    variant: str | None
-    condition: str
-    repetition: int
-    sample_set: int
-    order: int
-    scripted: bool = False
-    pair: str | None = None
-    factors: tuple[tuple[str, str], ...] = ()
-    words: frozenset[str] = frozenset()
-    arm: str = ""
-    focal: Side | None = None
-    prompts: dict[Side, str] = field(default_factory=dict)
-    kinematics: Condition = field(kw_only=True)
-
-
-@dataclass(frozen=True, slots=True)
-class StateRow:
-    """One vehicle at one sample; the acceleration is that realised over the step before it."""
-
-    step: int
-    time_s: float
-    side: Side
-    position_m: float
-    velocity_mps: float
-    acceleration_mps2: float
-
-
-@dataclass(frozen=True, slots=True)
-class DecisionRow:
-    """One decision of one driver, with its number and time in the trial.
-
-    ``observed`` is the driver's observation under imperfect perception, None if it was noise-free.
-    """
-
-    number: int
-    time_s: float
-    side: Side
-    decision: Decision
-    observed: Observation | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class FailedCall:
-    """Call without a reply; the first ``earlier`` of its attempts were made by earlier runs.
-
-    ``missed`` means that a replay had no recorded reply and made no attempt.
-    """
-
-    number: int
-    side: Side
-    request: ChatRequest
-    attempts: tuple[Attempt, ...]
-    earlier: int = 0
-    missed: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class TrialRecord:
-    """Played trial with its trace."""
-
-    spec: TrialSpec
-    status: Status
-    merged_first: Side | None
-    end_time_s: float
-    error: str | None
-    states: tuple[StateRow, ...]
-    decisions: tuple[DecisionRow, ...]
-    failed_calls: tuple[FailedCall, ...] = ()
-
-    @property
-    def calls(self) -> list[ChatReply | FailedCall]:
-        """Calls of both drivers."""
-        replies = [row.decision.reply for row in self.decisions if row.decision.reply]
-        return [*replies, *self.failed_calls]
-
-    @property
-    def scripted(self) -> bool:
-        """True if a mock model drove either side or answered any call."""
-        return self.spec.scripted or any(
-            is_scripted(call.request, attempt) for call in self.calls for attempt in call.attempts
-        )
-
-
 def is_scripted(request: ChatRequest, attempt: Attempt) -> bool:
     """Return whether a mock model answered, whatever base URL or model name was used.
 
@@ -367,11 +263,6 @@ def says_scripted(body: str) -> bool:
 def canonical_json(value: object) -> str:
     """Return a JSON value as canonical text: sorted keys, no spaces; raises ValueError for NaN."""
     return _CANONICAL.encode(value)
-
-
-def spec_hash(text: str) -> str:
-    """Return the short hash of the canonical JSON that defines a trial."""
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def make_request(

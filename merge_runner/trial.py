@@ -15,20 +15,10 @@ from merge_runner.drivers.base import Driver
 from merge_runner.drivers.language_model import LlmDriver, Question
 from merge_runner.errors import UsageError
 from merge_runner.perception import NoisyObserver
-from merge_runner.records import (
-    SIDES,
-    CallFailed,
-    Decision,
-    DecisionRow,
-    FailedCall,
-    Observation,
-    ReplayMiss,
-    Side,
-    TrialRecord,
-    TrialSpec,
-)
+from merge_runner.records import SIDES, CallFailed, Decision, Observation, ReplayMiss, Side
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
+from merge_runner.trial_records import DecisionRow, FailedCall, TrialRecord, TrialSpec
 
 
 class Trial:

@@ -16,9 +16,10 @@ import pandas as pd
 from merge_runner.audit.checks import not_judged
 from merge_runner.planted_effect import PARAMETERS as PLANTED
 from merge_runner.prompts.blocks import BASELINE
-from merge_runner.records import SIDES, Side, canonical_json, spec_hash
+from merge_runner.records import SIDES, Side, canonical_json
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.study.arms import DEFAULT, MODEL, PROMPT, SELF
+from merge_runner.trial_records import spec_hash
 from merge_runner_analysis.drivers import (
     has_chance,
     language_models,

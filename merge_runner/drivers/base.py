@@ -10,10 +10,8 @@ from typing import Any, Protocol
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.pace import Pace
 from merge_runner.errors import UsageError
-from merge_runner.records import Decision, Observation, Side, TrialSpec, other_side
-from merge_runner.scenarios.merge.vehicle import net_acceleration
-
-Parameter = float | str
+from merge_runner.records import Decision, Observation, Side
+from merge_runner.trial_records import TrialSpec
 
 
 @dataclass(frozen=True, slots=True)

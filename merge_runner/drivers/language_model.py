@@ -11,16 +11,8 @@ from merge_runner.drivers.base import DriverContext, make_context
 from merge_runner.drivers.pace import model_pace
 from merge_runner.prompts.blocks import Prompt, render_prompt
 from merge_runner.prompts.parse import ParsedReply, parse_reply
-from merge_runner.records import (
-    NO_DECISION,
-    ChatReply,
-    Decision,
-    Observation,
-    Road,
-    Side,
-    Slot,
-    TrialSpec,
-)
+from merge_runner.records import NO_DECISION, ChatReply, Decision, Observation, Road, Side, Slot
+from merge_runner.trial_records import TrialSpec
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,18 +15,9 @@ from typing import Any, NamedTuple
 
 import duckdb
 
-from merge_runner.records import (
-    ANSWERS,
-    Attempt,
-    ChatRequest,
-    Observation,
-    StateRow,
-    TrialRecord,
-    TrialSpec,
-    Usage,
-    is_scripted,
-)
+from merge_runner.records import ANSWERS, Attempt, ChatRequest, Observation, Usage, is_scripted
 from merge_runner.results.database import names_of
+from merge_runner.trial_records import StateRow, TrialRecord, TrialSpec
 
 Row = tuple[Any, ...]
 TrialKey = tuple[str, str]

@@ -15,7 +15,6 @@ from typing import Any
 import duckdb
 
 from merge_runner.errors import UsageError
-from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.results.database import (
     PATIENCE_S,
     SCHEMA_VERSION,
@@ -42,6 +41,7 @@ from merge_runner.results.rows import (
     stored_rows,
 )
 from merge_runner.scenarios.merge.measures import measures_sql
+from merge_runner.trial_records import TrialRecord, TrialSpec
 
 # Columns that depend on the run: whether it made an attempt itself, and when.
 RUN_COLUMNS = frozenset({"cached", "started_at", "latency_s"})

@@ -45,7 +45,7 @@ from merge_runner.llm.durable import Rows
 from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.llm.limiter import Limiter
 from merge_runner.providers import base_urls
-from merge_runner.records import Attempt, TrialRecord, TrialSpec, Usage
+from merge_runner.records import Attempt, Usage
 from merge_runner.registry import plugin_sources, using
 from merge_runner.run.clients import live_clients
 from merge_runner.run.guard import FirstDecisions
@@ -54,6 +54,7 @@ from merge_runner.run.plan import Options, Plan
 from merge_runner.run.replay import Replay
 from merge_runner.run.trials import Ended, Room
 from merge_runner.study.parts import catalogue_of
+from merge_runner.trial_records import TrialRecord, TrialSpec
 
 if TYPE_CHECKING:
     from distributed import Client, Worker

@@ -13,11 +13,12 @@ from merge_runner.errors import ProviderDown, TrialSuspended
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.call import Wait
 from merge_runner.llm.client import LlmClient
-from merge_runner.records import CallFailed, Decision, Side, TrialRecord, TrialSpec
+from merge_runner.records import CallFailed, Decision, Side
 from merge_runner.run.guard import FirstDecisions
 from merge_runner.run.plan import Plan
 from merge_runner.run.trials import Ended, Room, TrialMaker
 from merge_runner.trial import Trial
+from merge_runner.trial_records import TrialRecord, TrialSpec
 
 # More than bad luck explains, since nothing is answered between them; few enough to stop early.
 FAILURES_IN_A_ROW = 10

@@ -24,15 +24,7 @@ from merge_runner.llm.formats import FORMATS, WireFormat
 from merge_runner.llm.models import load_models
 from merge_runner.prompts.blocks import VARIANTS, Prompt, blocks_of, decomposed, prompt_of
 from merge_runner.providers import ModelEntry, endpoint_identity
-from merge_runner.records import (
-    MOST_REPETITIONS,
-    SIDES,
-    SPEC_VERSION,
-    Side,
-    TrialSpec,
-    canonical_json,
-    spec_hash,
-)
+from merge_runner.records import MOST_REPETITIONS, SIDES, Side, canonical_json
 from merge_runner.registry import Catalogue, Registry, require, using
 from merge_runner.results.database import read_database
 from merge_runner.scenarios.merge.conditions import (
@@ -56,6 +48,7 @@ from merge_runner.study.file import (
 )
 from merge_runner.study.parts import load_study
 from merge_runner.text_safety import in_a_name
+from merge_runner.trial_records import SPEC_VERSION, TrialSpec, spec_hash
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

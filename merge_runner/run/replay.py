@@ -9,11 +9,12 @@ from dataclasses import dataclass, field
 from merge_runner.drivers.language_model import Question
 from merge_runner.llm.call import Wait
 from merge_runner.llm.recorded import Calls, RecordedReplies
-from merge_runner.records import Decision, TrialRecord, TrialSpec
+from merge_runner.records import Decision
 from merge_runner.run.guard import FirstDecisions
 from merge_runner.run.plan import Plan
 from merge_runner.run.trials import Room, TrialMaker
 from merge_runner.trial import play_trial
+from merge_runner.trial_records import TrialRecord, TrialSpec
 
 
 @dataclass

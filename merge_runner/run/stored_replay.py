@@ -29,8 +29,6 @@ from merge_runner.records import (
     CallFailed,
     ChatRequest,
     Slot,
-    TrialRecord,
-    TrialSpec,
     Usage,
     make_request,
 )
@@ -43,6 +41,7 @@ from merge_runner.run.replay import Replay
 from merge_runner.study.arms import Arm
 from merge_runner.study.parts import declared_catalogue
 from merge_runner.text_safety import one_line
+from merge_runner.trial_records import TrialRecord, TrialSpec
 
 TOLERANCE = 1e-9
 """Numbers may differ by this much, as between the arithmetic of two machines."""

@@ -11,11 +11,12 @@ from merge_runner.audit.checks import Audit
 from merge_runner.drivers.registry import EMULATOR
 from merge_runner.llm.ledger import APART
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, command_at
-from merge_runner.records import ReplayMiss, Status
+from merge_runner.records import ReplayMiss
 from merge_runner.results.export import write_table
 from merge_runner.run.estimate import Estimate, usd_text
 from merge_runner.run.plan import Options
 from merge_runner.text_safety import first_of
+from merge_runner.trial_records import Status
 
 if TYPE_CHECKING:
     from merge_runner.run.progress import Progress

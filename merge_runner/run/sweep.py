@@ -37,7 +37,7 @@ from merge_runner.llm.kinds import counted, recorded_values
 from merge_runner.llm.ledger import Ledger, scopes
 from merge_runner.paths import DEFAULT_DB, SHIPPED_RECORDINGS, command_at
 from merge_runner.providers import PROVIDERS, UNNAMED, ModelEntry, model_id, resolve_endpoint
-from merge_runner.records import ReplayMiss, TrialRecord, TrialSpec, canonical_json
+from merge_runner.records import ReplayMiss, canonical_json
 from merge_runner.registry import using
 from merge_runner.results.database import in_thread, unreadable_is_usage
 from merge_runner.results.provenance import git_state, versions
@@ -60,6 +60,7 @@ from merge_runner.run.summary import as_dict
 from merge_runner.run.trials import Player
 from merge_runner.run.writer import AGAIN, BATCH, Flusher
 from merge_runner.text_safety import first_of
+from merge_runner.trial_records import TrialRecord, TrialSpec
 
 INTERRUPTED = 130
 GO_ON = "Run the same command again to go on."

@@ -9,10 +9,11 @@ from merge_runner.drivers.base import MakeDriver
 from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.errors import TrialSuspended
 from merge_runner.llm.call import Meter, Wait
-from merge_runner.records import SIDES, TrialRecord, TrialSpec
+from merge_runner.records import SIDES
 from merge_runner.run.guard import FirstDecisions
 from merge_runner.run.plan import Plan
 from merge_runner.trial import Trial
+from merge_runner.trial_records import TrialRecord, TrialSpec
 
 # Called with each trial that ends, or is suspended for lack of money.
 Ended = Callable[[TrialSpec, TrialRecord | TrialSuspended], None]

@@ -11,9 +11,9 @@ from itertools import accumulate
 from pathlib import Path
 
 from merge_runner.errors import StoreError, StoreLocked
-from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.results.store import Store
 from merge_runner.text_safety import one_line
+from merge_runner.trial_records import TrialRecord, TrialSpec
 
 EVERY_S, POLL_S = 1.0, 0.05
 # Trials in one transaction, which costs as much as storing dozens of them; and in memory while

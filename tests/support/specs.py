@@ -2,8 +2,8 @@
 
 from dataclasses import replace
 
-from merge_runner.records import TrialSpec
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.trial_records import TrialSpec
 
 
 def spec_of(condition: str = "L_4_0", **changes: object) -> TrialSpec:

@@ -11,23 +11,12 @@ from tempfile import TemporaryDirectory
 import duckdb
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.records import (
-    SIDES,
-    Attempt,
-    ChatReply,
-    ChatRequest,
-    Decision,
-    DecisionRow,
-    FailedCall,
-    Side,
-    Slot,
-    TrialRecord,
-    TrialSpec,
-)
+from merge_runner.records import SIDES, Attempt, ChatReply, ChatRequest, Decision, Side, Slot
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
+from merge_runner.trial_records import DecisionRow, FailedCall, TrialRecord, TrialSpec
 from merge_runner_analysis.study import Study
 
 SCENARIO = ScenarioConfig()

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import PurePath
 
-from merge_runner.records import TrialRecord
 from merge_runner.results.store import Store, query
+from merge_runner.trial_records import TrialRecord
 from merge_runner_analysis.humans.archive import File, Unreadable, refuse_bombs
 from merge_runner_analysis.humans.record import (
     SPECS,

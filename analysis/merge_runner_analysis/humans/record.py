@@ -24,19 +24,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from merge_runner.records import (
-    SIDES,
-    Side,
-    StateRow,
-    Status,
-    TrialRecord,
-    TrialSpec,
-    canonical_json,
-    spec_hash,
-)
+from merge_runner.records import SIDES, Side, canonical_json
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.text_safety import one_line
+from merge_runner.trial_records import StateRow, Status, TrialRecord, TrialSpec, spec_hash
 from merge_runner_analysis.humans.archive import Unreadable
 from merge_runner_analysis.humans.imported import VELOCITY_PAGES
 from merge_runner_analysis.published import HUMAN_DOI, PAIRS

@@ -6,11 +6,12 @@ from collections.abc import Mapping, Sequence
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
-from merge_runner.records import SIDES, Observation, Side, StateRow, Status
+from merge_runner.records import SIDES, Observation, Side
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.conditions import Condition
 from merge_runner.scenarios.merge.geometry import Track
 from merge_runner.scenarios.merge.vehicle import Vehicle
+from merge_runner.trial_records import StateRow, Status
 
 
 class World:

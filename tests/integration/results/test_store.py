@@ -16,7 +16,6 @@ import pytest
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import StoreLocked, UsageError
-from merge_runner.records import TrialRecord
 from merge_runner.results.database import in_thread, open_database
 from merge_runner.results.instance import Instance
 from merge_runner.results.store import Store, query, results_digest
@@ -24,6 +23,7 @@ from merge_runner.results.sweeps import recorded_sweeps, sweep_facts
 from merge_runner.run.writer import Flusher
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.trial import Trial, play_trial
+from merge_runner.trial_records import TrialRecord
 from tests.support.driven_trials import ask_nobody
 from tests.support.gate import HANGS_S
 from tests.support.harness import environment

@@ -7,8 +7,9 @@ from dataclasses import replace
 import pytest
 
 from merge_runner.errors import StoreError, StoreLocked
-from merge_runner.records import Attempt, ChatReply, Decision, DecisionRow, TrialRecord
+from merge_runner.records import Attempt, ChatReply, Decision
 from merge_runner.run.writer import MOST_PENDING, MOST_PENDING_BYTES, Flusher
+from merge_runner.trial_records import DecisionRow, TrialRecord
 from tests.support.gate import HANGS_S
 from tests.support.specs import spec_of
 

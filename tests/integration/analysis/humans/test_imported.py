@@ -5,9 +5,9 @@ from dataclasses import replace
 import pandas as pd
 import pytest
 
-from merge_runner.records import StateRow, TrialRecord, TrialSpec
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
+from merge_runner.trial_records import StateRow, TrialRecord, TrialSpec
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.frames import load
 from merge_runner_analysis.humans.imported import by_condition, by_pair, findings, human_trials
