@@ -20,7 +20,6 @@ from pydantic import Field, JsonValue
 from merge_runner.errors import MergeRunnerError
 from merge_runner.registry import NAME
 
-
 KEY_VERSION = 1
 # Errors of reading foreign content; RecursionError for deeply nested JSON.
 DAMAGED = (ValueError, TypeError, KeyError, RecursionError)
