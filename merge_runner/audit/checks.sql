@@ -1,6 +1,6 @@
--- What a replay cannot see, and what the states alone tell of a trial. The views read the tables of a
--- database and these: the sweep that is audited, its trials as planned (with planned.known) and as
--- stored, the trials that were audited before, and the pairs in which another model answered.
+-- Checks that a replay cannot make, and checks of trials by their states alone. The views read the
+-- tables of a database and these: the audited sweep, its planned trials (if subject.known), its stored
+-- trials, the trials that were audited before, and pairs of models that do not match.
 CREATE OR REPLACE TEMP TABLE subject (sweep_id VARCHAR, finished BOOLEAN, known BOOLEAN);
 CREATE OR REPLACE TEMP TABLE planned (trial_id VARCHAR, spec_hash VARCHAR);
 CREATE OR REPLACE TEMP TABLE audited AS SELECT trial_id, spec_hash FROM trials LIMIT 0;
@@ -13,7 +13,7 @@ CREATE OR REPLACE TEMP VIEW linked AS
 SELECT trial_id, spec_hash, count(*) AS links FROM sweep_trials SEMI JOIN subject USING (sweep_id)
 GROUP BY ALL;
 
--- Another sweep may have gone on where this one stopped: what it has played is not missing.
+-- Trials that another sweep played after this one stopped are not missing.
 CREATE OR REPLACE TEMP VIEW unplayed AS
 SELECT trial_id, trials.status IS NOT NULL AS elsewhere
 FROM planned ANTI JOIN linked USING (trial_id)
@@ -38,7 +38,7 @@ FROM sweeps SEMI JOIN subject USING (sweep_id)
 WHERE json_valid(config) AND sweep_id <> concat_ws(
     '-', name, config->>'$.model', strftime(started_at, '%Y%m%dT%H%M%S%f'));
 
--- Rows that belong to nothing, in the whole database; a spec's hash is that of its text.
+-- Orphan rows of the whole database; the hash of a spec is that of its text.
 CREATE OR REPLACE TEMP VIEW orphans AS
 SELECT 'orphan' AS kind, trial_id, 'no sweep has this trial' AS text FROM trials
 ANTI JOIN sweep_trials USING (trial_id, spec_hash) WHERE source <> 'human'
@@ -56,8 +56,8 @@ FROM (
 UNION ALL SELECT 'spec', NULL, format('the spec stored as {} has another hash', spec_hash)
 FROM specs WHERE left(sha256(spec::VARCHAR), 16) <> spec_hash;
 
--- What the states tell, by the inverse Y of the experiment: two branches of 100 m whose starts lie
--- 25 m apart, and one lane of 50 m.
+-- Checks of the states on the inverse Y of the experiment: two branches of 100 m whose starts are 25 m
+-- apart, and one lane of 50 m.
 
 CREATE OR REPLACE TEMP VIEW rules AS
 SELECT spec_hash, scenario->>'$.collision_rule' AS rule,
@@ -86,8 +86,8 @@ WITH samples AS (
         abs(left_x * right_y - left_y * right_x) AS across
     FROM placed
 )
--- How deep the vehicles are within each other; below 0 they are apart. Two boxes are apart where
--- their shadows along or across either of them are.
+-- Depth of the overlap of the vehicles; below 0 they are disjoint. Two boxes are disjoint if their
+-- projections along or across either of them are.
 SELECT trial_id, spec_hash, step, time_s, vehicles, left_m, right_m, left_before_m, right_before_m,
     length_m, timeout_steps, CASE rule
         WHEN 'euclid2d' THEN length_m - sqrt(x ** 2 + y ** 2)
@@ -156,12 +156,12 @@ UNION ALL SELECT 'gap', trial_id, format('it is {} m in trial_metrics, and by it
 FROM judged WHERE gap_m IS DISTINCT FROM view_gap_m
     AND NOT coalesce(abs(view_gap_m - gap_m) <= 1e-6, false);
 
--- The calls and their answers. Replies are read one by one, since each may be many megabytes long:
--- the id of each, a hash of its answer, and which request it answers, if it says so.
+-- Calls and their replies. Replies are read in chunks, since each may have many megabytes: the id of
+-- each, a hash of its answer, and the request that it answers, if it names one.
 CREATE OR REPLACE TEMP TABLE reply_contents (place BIGINT, reply_id VARCHAR, content VARCHAR, answered JSON);
 
 CREATE OR REPLACE TEMP VIEW served_findings AS
--- One finding for each pair of models, at its first answer.
+-- One finding for each pair of models, at its first reply.
 SELECT 'served' AS kind, arg_min(trial_id, (trial_id, decision, side)) AS trial_id,
     arg_min(side, (trial_id, decision, side)) AS side,
     arg_min(decision, (trial_id, decision, side)) AS decision,
@@ -171,7 +171,7 @@ FROM calls SEMI JOIN audited USING (trial_id, spec_hash)
 SEMI JOIN other_models USING (model_requested, model_served)
 WHERE http_status = 200 GROUP BY model_requested, model_served;
 
--- An empty answer may be asked for again; any other is the last attempt.
+-- An empty reply may be requested again; any other reply is the last attempt.
 CREATE OR REPLACE TEMP VIEW attempt_findings AS
 SELECT 'attempt' AS kind, trial_id, side, decision, text FROM (
     SELECT trial_id, side, decision, CASE
@@ -183,7 +183,7 @@ SELECT 'attempt' AS kind, trial_id, side, decision, text FROM (
     GROUP BY trial_id, spec_hash, side, decision, call_key
 ) WHERE text IS NOT NULL;
 
--- The emulator says in each reply what it answers.
+-- Each reply of the emulator names the request that it answers.
 CREATE OR REPLACE TEMP VIEW exchanged_findings AS
 SELECT 'exchanged' AS kind, trial_id, side, decision,
     'its reply is, as the server says in it, the answer to another request' AS text
@@ -197,7 +197,7 @@ FROM (
         <> [condition, rep::VARCHAR, side, decision::VARCHAR, sample_set::VARCHAR]
     AND json_type(answered, '$.slot') = 'OBJECT';
 
--- Ids are compared within an endpoint: two emulators give equal questions equal ids.
+-- Ids are compared within an endpoint: two emulators give equal requests equal ids.
 CREATE OR REPLACE TEMP VIEW identified AS
 SELECT calls.trial_id, calls.spec_hash, calls.side, decision, call_key, provider, model_requested,
     coalesce(json_extract_string(spec, '$.' || side || '.endpoint'), '') AS endpoint, reply_id,
@@ -206,9 +206,9 @@ FROM calls JOIN reply_contents ON calls.rowid = place LEFT JOIN specs USING (spe
 WHERE http_status = 200 AND reply_id IS NOT NULL;
 CREATE OR REPLACE TEMP TABLE reply_ids AS FROM identified LIMIT 0;
 
--- Some servers draw ids out of a thousand, or have but one. An id that came with different answers
--- proves nothing; neither does any other one of a server most of whose repeated ids are such, nor one
--- of a server of one's own, whose ids nobody promises to be unique.
+-- Some servers draw ids out of a thousand, or have only one. An id with different answers proves
+-- nothing; neither does an id of a server most of whose repeated ids are such, nor an id of a local
+-- server, which need not be unique.
 CREATE OR REPLACE TEMP VIEW repeated_ids AS
 SELECT endpoint, model_requested, reply_id, same AND provider <> 'local'
     AND count(*) FILTER (same) OVER server >= count(*) FILTER (NOT same) OVER server AS telling
@@ -218,9 +218,9 @@ FROM (
     FROM reply_ids GROUP BY ALL HAVING min(call_key) <> max(call_key)
 ) WINDOW server AS (PARTITION BY endpoint, model_requested);
 
--- Two slots of one spec with one call, and two calls of any spec with one reply: a proxy that caches
--- answers a repetition, or a fresh set of samples, with an old reply. Drivers of a study may ask the
--- same in the same slot: that is no fault.
+-- Two slots of one spec with one call, and two calls of any spec with one reply: a caching proxy
+-- answers a repetition, or a new sample set, with an old reply. Drivers of a study may make the same
+-- request in the same slot: that is no finding.
 CREATE OR REPLACE TEMP VIEW shared AS
 SELECT 'its call is also that of' AS text,
     list(DISTINCT (trial_id, side, decision) ORDER BY (trial_id, side, decision)) AS places,
@@ -246,11 +246,11 @@ FROM shared WHERE len(places) > 1
     AND list_has_any(trials, (SELECT list((trial_id, spec_hash)) FROM audited))
     AND NOT coalesce(list_has_any(trials, (SELECT list((trial_id, spec_hash)) FROM done)), false);
 
--- What is no fault.
+-- Notes, no findings.
 
--- How many answers to prompts that were asked before are word for word as before, if all are, and
--- there are a few. A model that samples never gives only answers that it has given before. A proxy that caches and gives each
--- reply a new id does, and so does a model at temperature 0: in both cases they are no samples.
+-- Number of replies to repeated prompts, if all of them are identical and there are at least five. A
+-- model that samples does not only repeat replies. A caching proxy with new ids does, and so does a
+-- model at temperature 0: in both cases the replies are no samples.
 CREATE OR REPLACE TEMP VIEW alike AS
 SELECT if(count(*) FILTER (different > 1) = 0 AND sum(times - 1) >= 5, sum(times - 1), 0)::BIGINT
     AS answers
@@ -294,8 +294,8 @@ FROM (SELECT count(*) AS stored FROM linked SEMI JOIN trials USING (trial_id, sp
     (SELECT count(DISTINCT reply_id) AS "reply ids"
     FROM reply_ids SEMI JOIN audited USING (trial_id, spec_hash));
 
--- Trials that a run did not play, since earlier ones had: its own, of the same name and drivers, which
--- it goes on from, or those of other sweeps.
+-- Trials of a run that earlier runs played: those of the same name and drivers, which it resumes, or
+-- those of other sweeps.
 CREATE OR REPLACE TEMP VIEW played_before AS
 SELECT DISTINCT trial_id, spec_hash, own.sweep_id, earlier.sweep_id AS earlier,
     earlier.started_at AS began_at,
@@ -319,7 +319,7 @@ UNION ALL FROM (
 )
 UNION ALL SELECT format('{} of its trials were played by another sweep', count(*))
 FROM unplayed WHERE elsewhere HAVING count(*) > 0
--- A later run of the same study goes on from it, and says so itself.
+-- A later run of the same study resumes it, with a note of its own.
 UNION ALL SELECT format('{} of its trials are checked with a later sweep that has them too', count(*))
 FROM linked SEMI JOIN done USING (trial_id, spec_hash) ANTI JOIN (
     sweep_trials JOIN sweeps AS later USING (sweep_id)
@@ -332,7 +332,7 @@ UNION ALL SELECT format('{} replies of {} at {} have an id that the server gave 
 FROM reply_ids SEMI JOIN audited USING (trial_id, spec_hash)
 JOIN repeated_ids USING (endpoint, model_requested, reply_id)
 WHERE NOT telling GROUP BY model_requested, endpoint
--- The emulator has a few phrases.
+-- Without replies of the emulator, which has only a few phrases.
 UNION ALL SELECT format('all {} answers to prompts that were asked before are word for word as before: '
     'are they samples?', answers)
 FROM alike, counts WHERE answers > 0 AND "attempts answered by a scripted stand-in" = 0;

@@ -123,6 +123,7 @@ def open_database(
     mode = "READ_ONLY" if read_only else f"READ_WRITE, ROW_GROUP_SIZE {ROWS_OF_A_GROUP}"
     # As an absolute path, since DuckDB gives names such as md:x or :memory: another meaning.
     _attach(connection, f"{quoted(path.absolute())} AS {name} ({mode})", path, patience_s, instance)
+    is_detached = False
     try:
         if reading is not None:
             reading.uses(connection)
@@ -132,20 +133,23 @@ def open_database(
             f"SET threads = {SETTINGS['threads']}"
         )
         yield connection
-    except BaseException:
-        instance.drop()
-        raise
-    else:
-        try:
-            connection.execute(f"USE memory; DETACH {name}")
-        except duckdb.Error as exc:
-            # As on a full disk: committed data stay in the write-ahead log of the file.
-            LOG.warning("the database was not closed in order: %s", first_line(exc))
-            instance.drop()
+        is_detached = _detach(connection, name)
     finally:
+        if not is_detached:  # as after any error of the block
+            instance.drop()
         if reading is not None:
             reading.uses(None)
         connection.close()
+
+
+def _detach(connection: duckdb.DuckDBPyConnection, name: str) -> bool:
+    """Return whether a file was detached; as on a full disk, its write-ahead log may remain."""
+    try:
+        connection.execute(f"USE memory; DETACH {name}")
+    except duckdb.Error as exc:
+        LOG.warning("the database was not closed in order: %s", first_line(exc))
+        return False
+    return True
 
 
 def _attach(

@@ -1,12 +1,12 @@
--- What a sweep's summary says. The views read the trials of the sweep in the variable sweep_id, and
--- the pairs in which another model answered than was asked for.
+-- Facts of a sweep's summary. The views read the trials of the sweep in the variable sweep_id, and the
+-- pairs of models (requested, served) that do not match.
 CREATE OR REPLACE TEMP TABLE other_models (model_requested VARCHAR, model_served VARCHAR);
 
 CREATE OR REPLACE TEMP TABLE played AS
 FROM trials SEMI JOIN (FROM sweep_trials WHERE sweep_id = getvariable('sweep_id'))
     USING (trial_id, spec_hash);
 
--- Their attempts, with the name of the driver that was asked.
+-- Attempts of these trials, with the name of the called driver.
 CREATE OR REPLACE TEMP VIEW tried AS
 SELECT *, driver_name(model, spec->>('$.' || side || '.endpoint')) AS driver
 FROM attempts LEFT JOIN specs USING (spec_hash) SEMI JOIN played USING (trial_id, spec_hash);
@@ -14,7 +14,7 @@ FROM attempts LEFT JOIN specs USING (spec_hash) SEMI JOIN played USING (trial_id
 CREATE OR REPLACE TEMP VIEW outcomes AS
 SELECT status, count(*) AS trials FROM played GROUP BY ALL ORDER BY ALL;
 
--- Outcomes in each condition, in all, and at each level of each factor.
+-- Outcomes by condition, in total, and by level of each factor.
 CREATE OR REPLACE TEMP VIEW levels AS
 SELECT factor, value AS level, count(*) AS trials,
     count(*) FILTER (status = 'finished' AND merged_first = 'left') AS "left first",
@@ -32,19 +32,19 @@ GROUP BY ALL ORDER BY ALL;
 CREATE OR REPLACE TEMP VIEW failed AS
 SELECT trial_id, error FROM played WHERE status = 'failed' ORDER BY ALL;
 
--- Answers of another model than was asked for.
+-- Replies of another model than requested.
 CREATE OR REPLACE TEMP VIEW others AS
 SELECT model_requested, model_served, count(*) AS answers FROM calls
 SEMI JOIN played USING (trial_id, spec_hash) SEMI JOIN other_models USING (model_requested, model_served)
 WHERE http_status = 200 GROUP BY ALL ORDER BY ALL;
 
--- Where a mock model answered: its answers, and all answers.
+-- Drivers with replies of a mock model: these replies, and all replies.
 CREATE OR REPLACE TEMP VIEW stand_ins AS
 SELECT driver, model, provider, count(*) FILTER (scripted) AS scripted, count(*) AS answers
 FROM tried WHERE fate IN ('driven', 'fallback')
 GROUP BY driver, model, provider HAVING bool_or(tried.scripted) ORDER BY ALL;
 
--- Prompts with which stand-ins drove the same trials: they read nothing of what sets these apart.
+-- Prompt variants with identical trials of mock models, which read nothing that differs.
 CREATE OR REPLACE TEMP VIEW same_prompts AS
 WITH driven AS (
     SELECT trial_id, spec_hash, sum(hash(step, side, position_m)) AS trace
@@ -68,9 +68,9 @@ SELECT count(*) AS decisions, count(*) FILTER (NOT valid) AS invalid,
     count(*) FILTER (failure = 'no_decision') AS no_decision
 FROM decisions SEMI JOIN played USING (trial_id, spec_hash);
 
--- What was done first where drivers were only asked. The velocity is the driver's own, minus the
--- other's; the action is the net acceleration over the first step, of the fallback where the reply
--- was invalid; the share of M is that among answers with a tactical word.
+-- First decisions without the closed loop. The velocity is the driver's minus the other's. The action
+-- is the net acceleration over the first step, that of the fallback for an invalid reply. The share of
+-- M is that among replies with a tactical decision.
 CREATE OR REPLACE TEMP VIEW first_looks AS
 WITH asked AS (FROM played WHERE source = 'first_decision' AND status <> 'failed')
 SELECT driver, variant, if(side = 'left', model_left, model_right) AS model, side,

@@ -1,5 +1,5 @@
 -- All times in s, lengths in m, speeds in m/s, accelerations in m/s^2; clock times are UTC.
--- A column without a comment means what the first of its name does.
+-- A column without a comment has the meaning of the first column with its name.
 
 CREATE TABLE meta (
     schema_version INTEGER NOT NULL
@@ -239,7 +239,7 @@ COMMENT ON COLUMN calls.reply IS 'body that was received';
 COMMENT ON COLUMN calls.scripted IS 'whether a mock model answered, whatever model was requested';
 COMMENT ON COLUMN calls.batch_id IS 'provider''s batch of the request; NULL: sent alone';
 
--- How a driver is named: by its model, and by its endpoint where that is not the provider's own.
+-- Name of a driver: its model, with its endpoint unless that is the provider's own.
 CREATE MACRO driver_name(model, endpoint) AS
     model || coalesce(' at ' || nullif(regexp_extract(endpoint, '://([^/]+)', 1), ''), '');
 

@@ -1,1 +1,1 @@
-"""The driving task: the simplified merge."""
+"""Driving task: the simplified merge."""

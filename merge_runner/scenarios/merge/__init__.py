@@ -1,1 +1,1 @@
-"""The simplified merge: pure functions of positions and speeds, without I/O."""
+"""Simplified merge: pure functions of positions and speeds, without I/O."""

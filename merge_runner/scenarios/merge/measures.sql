@@ -1,14 +1,15 @@
--- The measures of a trial. The numbers of the human experiment are macros such as merge_point_m(),
--- which measures.py writes before this.
+-- Measures of a trial. The numbers of the human experiment are macros such as merge_point_m(), which
+-- measures.py writes before this text.
 
--- Where boxes overlap: with half lengths l, half widths w and each branch at the angle phi from the
--- centreline, the four separating axes are along and across either vehicle. Two vehicles u and v
--- before the merge point are apart in their sums
+-- Overlap of boxes: with half lengths l, half widths w and each branch at the angle phi from the
+-- centreline, the four separating axes are along and across either vehicle. Two vehicles at the
+-- distances u and v before the merge point overlap if
 --     |v - u cos 2phi|, |u - v cos 2phi| < along2 = l (1 + cos 2phi) + w sin 2phi
 --     u sin 2phi, v sin 2phi < across2 = w (1 + cos 2phi) + l sin 2phi
--- and one u before it, the other d behind it, with along and across likewise of phi, in
+-- and one at u before it, the other at d behind it, with along and across likewise of phi, if
 --     u + d cos phi, u cos phi + d < along;  u sin phi, d sin phi < across
--- The contact point is the first at which two vehicles touch that are both before the merge point.
+-- The contact point is the first point at which two vehicles touch that are both before the merge
+-- point.
 CREATE OR REPLACE VIEW geometry AS
 WITH sizes AS (
     SELECT spec_hash,
@@ -59,13 +60,13 @@ COMMENT ON COLUMN geometry.contact_high_m IS 'see contact_m';
 COMMENT ON COLUMN geometry.merge_low_m IS 'see contact_m';
 COMMENT ON COLUMN geometry.merge_high_m IS 'see contact_m';
 
--- On a collision course for a point: when a vehicle will be there at its present speed, the other
--- will be within the bounds in which their boxes overlap (Siebinga et al., conflict_signal.py).
+-- True on a collision course for a point: when a vehicle reaches it at its present speed, the other is
+-- within the bounds of an overlap of their boxes (Siebinga et al., conflict_signal.py).
 CREATE OR REPLACE MACRO on_course(at_m, low_m, high_m, own_m, own_mps, other_m, other_mps) AS
     coalesce(own_m < at_m AND own_mps > 0
         AND other_m + other_mps * (at_m - own_m) / own_mps BETWEEN low_m AND high_m, false);
 
--- When a vehicle passes a level: linear within the step in which it does, else NULL.
+-- Time at which a vehicle passes a level, linear within the step; NULL in other steps.
 CREATE OR REPLACE MACRO passing_s(level_m, before_m, now_m, before_s, now_s) AS
     CASE WHEN before_m < level_m AND now_m >= level_m
     THEN before_s + (now_s - before_s) * (level_m - before_m) / (now_m - before_m) END;
@@ -100,8 +101,8 @@ COMMENT ON COLUMN vehicle_pairs.right_before_m IS 'right position at the sample 
 COMMENT ON COLUMN vehicle_pairs.left_first_mps IS 'left speed at the first sample';
 COMMENT ON COLUMN vehicle_pairs.right_first_mps IS 'right speed at the first sample';
 
--- What takes the name of samples or times: trial_metrics makes its samples once, as that is most of its
--- work.
+-- Macros with the names of samples or times as parameters: trial_metrics computes its samples once,
+-- which is most of its work.
 CREATE OR REPLACE MACRO merge_times_in(pairs) AS TABLE
 SELECT *,
     least(left_s, right_s) AS first_s,
@@ -128,7 +129,7 @@ COMMENT ON COLUMN merge_times.right_rear_s IS 'when the right vehicle''s rear pa
 COMMENT ON COLUMN merge_times.first_s IS 'when the first centre passes it';
 COMMENT ON COLUMN merge_times.both_s IS 'when the second centre passes it';
 
--- Squares are added in the order of time: threads would add them in any, and round differently.
+-- Squares are added in the order of time: threads would add them in any order, and round differently.
 CREATE OR REPLACE MACRO speed_deviations_in(pairs, times) AS TABLE
 SELECT *,
     (rmse_left_mps + rmse_right_mps) / 2 AS rmse_mps,
@@ -164,7 +165,7 @@ COMMENT ON COLUMN speed_deviations.rmse_right_mps IS 'RMSE of the right vehicle'
 
 CREATE OR REPLACE VIEW trial_metrics AS
 WITH pairs AS MATERIALIZED (FROM vehicle_pairs),
--- Were these kept as well, the samples of all trials would be read for one of them.
+-- Not materialized: else a query of one trial would read the samples of all.
 times AS NOT MATERIALIZED (FROM merge_times_in('pairs')),
 distances AS (
     SELECT trial_id, spec_hash,
@@ -219,7 +220,7 @@ SELECT
     joint,
     first_s AS time_to_merge_s,
     CASE WHEN finished THEN abs(left_s - right_s) END AS merge_interval_s,
-    -- The front of the second vehicle may be there at the end, and its centre not yet.
+    -- At the end, the front of the second vehicle may have arrived and its centre not.
     CASE WHEN finished AND (left_s < right_s OR right_s IS NULL) THEN right_front_s - left_rear_s
         WHEN finished THEN left_front_s - right_rear_s END AS post_encroachment_s,
     min_ttc_s,

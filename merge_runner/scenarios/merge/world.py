@@ -87,21 +87,21 @@ class World:
 
     def observe(self, side: Side, step: int | None = None) -> Observation:
         """Return the true observation of the driver of ``side``, now or at an earlier step."""
-        own, other = self._vehicles["left"], self._vehicles["right"]
+        ego, other = self._vehicles["left"], self._vehicles["right"]
         if side == "right":
-            own, other = other, own
+            ego, other = other, ego
         now = self.step if step is None else step
-        position, other_position = own.positions[now], other.positions[now]
+        position, other_position = ego.positions[now], other.positions[now]
         by_own = self._config.straight_after == "own"
         farthest_back = position if by_own else min(position, other_position)
         straight = farthest_back >= self._track.merge_point_m
         return Observation(
             road="straight" if straight else "merge",
-            own_speed_mps=own.velocities[now],
+            own_speed_mps=ego.velocities[now],
             other_speed_mps=other.velocities[now],
             relative_distance_m=other_position - position,
             distance_to_merge_m=None if straight else self._track.merge_point_m - position,
-            own_accelerations_mps2=self._history(own.accelerations[1 : now + 1], 0.0),
+            own_accelerations_mps2=self._history(ego.accelerations[1 : now + 1], 0.0),
             other_speeds_mps=self._history(other.velocities[:now], other.velocities[0]),
             own_position_m=position,
             other_acceleration_mps2=other.accelerations[now],

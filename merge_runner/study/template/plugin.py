@@ -1,4 +1,4 @@
-"""What this study adds. Raise a driver's revision when you edit its rule: it is played anew."""
+"""Parts of this study. Raise a driver's revision when you edit its rule: it is played anew."""
 
 from merge_runner.plugin import PROGRAMS, Decision, DriverContext, Observation, Program
 from merge_runner_analysis.metrics import Metric, register
