@@ -39,7 +39,8 @@ def test_what_a_person_reads_is_short_and_in_plain_words():
     assert sum(words.values()) <= 20_000, words
     assert len(words) <= 22
     assert len((PROJECT / "README.md").read_text().split()) <= 900
-    for page in WRITTEN:
+    assert len((PROJECT / "CONTRIBUTING.md").read_text().split()) <= 700
+    for page in [*WRITTEN, PROJECT / "CONTRIBUTING.md", PROJECT / "SECURITY.md"]:
         assert not REFUSED.search(page.read_text()), (page.name, REFUSED.search(page.read_text()))
 
 
