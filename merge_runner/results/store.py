@@ -206,7 +206,7 @@ def answering(
 
     The connection's whole instance stays restricted. Raises UsageError.
     """
-    # Without the file system, COPY ... TO could still write the database's own files.
+    # With external access disabled alone, COPY ... TO could still write the database's own files.
     connection.execute(
         "SET temp_directory = ''; SET enable_external_access = false; "
         "SET disabled_filesystems = 'LocalFileSystem'; SET lock_configuration = true"

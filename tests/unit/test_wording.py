@@ -94,7 +94,7 @@ def test_the_checked_sources_exist():
 
 
 @pytest.mark.parametrize(
-    "path", filter(is_checked, SOURCES), ids=lambda path: str(path.relative_to(PROJECT))
+    "path", [*filter(is_checked, SOURCES)], ids=lambda path: str(path.relative_to(PROJECT))
 )
 def test_a_source_uses_plain_words(path):
     assert [*faults(path)] == []
