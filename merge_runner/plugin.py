@@ -3,7 +3,6 @@
 Metrics are registered by ``merge_runner_analysis.metrics``.
 """
 
-from merge_runner.config import PROVIDERS, ModelEntry, Provider
 from merge_runner.drivers.base import Driver, DriverContext
 from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError
@@ -18,6 +17,7 @@ from merge_runner.llm.formats import (
     outcome_of,
 )
 from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Block, Variant
+from merge_runner.providers import PROVIDERS, ModelEntry, Provider
 from merge_runner.records import Decision, Observation, Usage
 from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
 

@@ -141,7 +141,9 @@ class _DriverState:
         perception, self._observer = scenario.perception(side), None
         if perception != PERFECT:
             observe = partial(world.observe, side)
-            self._observer = NoisyObserver(perception, driver.seat.seed, scenario.step_s, observe)
+            self._observer = NoisyObserver(
+                perception, driver.context.seed, scenario.step_s, observe
+            )
         self.number = 0  # of the last decision step, counted from the start of the trial
         self.observed: Observation | None = None
         self._driven: list[float] | None = None  # by step since the decision

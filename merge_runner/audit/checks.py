@@ -33,7 +33,7 @@ SELECT trial_id, spec_hash FROM linked SEMI JOIN trials USING (trial_id, spec_ha
 ANTI JOIN done USING (trial_id, spec_hash)
 """
 # Members of a reply that hold the model's answer, over all wire formats.
-ANSWERS = ("choices", "output", "candidates", "content")
+ANSWER_MEMBERS = ("choices", "output", "candidates", "content")
 MOST_INVALID_SHARE = 0.2
 # One row per ended trial and called model. An invalid decision is a fallback.
 ASKED_DECISIONS = """
@@ -55,13 +55,13 @@ AUDITED_CALLS = """
 calls WHERE ($sweep_id IS NULL OR (trial_id, spec_hash) IN
     (SELECT (trial_id, spec_hash) FROM sweep_trials WHERE sweep_id = $sweep_id))
 """
-PLACES = f"SELECT rowid FROM {AUDITED_CALLS} ORDER BY rowid"  # noqa: S608 # constants
-REPLIES = f"""
+CALL_ROWIDS = f"SELECT rowid FROM {AUDITED_CALLS} ORDER BY rowid"  # noqa: S608 # constants
+REPLIES_BETWEEN = f"""
 SELECT rowid, reply::VARCHAR FROM {AUDITED_CALLS} AND rowid BETWEEN $first AND $last
 """  # noqa: S608 # constants
 CALL_FINDINGS = ("served_findings", "attempt_findings", "exchanged_findings", "shared_findings")
 ENTRIES_AT_ONCE = 100
-SHOWN = 20
+FINDINGS_SHOWN = 20
 REPLIES_AT_ONCE = 4_000
 NEVER = datetime(1970, 1, 1)  # noqa: DTZ001 # times of the database have no zone
 
@@ -111,9 +111,9 @@ class Audit:
         yield f"{self.subject}: " + (f"{number} findings" if number else "all holds")
         yield "  checked: " + ", ".join(f"{n} {name}" for name, n in self.counts.items())
         yield from (f"  note: {text}" for text in self.notes)
-        yield from (f"  {finding}" for finding in self.findings[:SHOWN])
-        if number > SHOWN:
-            yield f"  and {number - SHOWN} more, all of them with --json"
+        yield from (f"  {finding}" for finding in self.findings[:FINDINGS_SHOWN])
+        if number > FINDINGS_SHOWN:
+            yield f"  and {number - FINDINGS_SHOWN} more, all of them with --json"
 
 
 @contextmanager
@@ -138,17 +138,17 @@ def prepare(connection: duckdb.DuckDBPyConnection, sweep_id: str | None = None) 
     make_views(connection)
     append(connection, "other_models", other_models(connection))
     parameters = {"sweep_id": sweep_id}
-    places = [place for (place,) in connection.execute(PLACES, parameters).fetchall()]
-    for first in range(0, len(places), REPLIES_AT_ONCE):  # a chunk is in memory at once
-        last = min(first + REPLIES_AT_ONCE, len(places)) - 1
-        span = {**parameters, "first": places[first], "last": places[last]}
-        replies = connection.execute(REPLIES, span).fetchall()
-        rows = [row for place, reply in replies if (row := _reply_contents(place, reply))]
+    rowids = [rowid for (rowid,) in connection.execute(CALL_ROWIDS, parameters).fetchall()]
+    for first in range(0, len(rowids), REPLIES_AT_ONCE):  # a chunk is in memory at once
+        last = min(first + REPLIES_AT_ONCE, len(rowids)) - 1
+        span = {**parameters, "first": rowids[first], "last": rowids[last]}
+        replies = connection.execute(REPLIES_BETWEEN, span).fetchall()
+        rows = [row for rowid, reply in replies if (row := _reply_contents(rowid, reply))]
         append(connection, "reply_contents", rows)
     connection.execute("INSERT INTO reply_ids FROM identified")
 
 
-def _reply_contents(place: int, reply: str | None) -> tuple[int, str | None, str, str] | None:
+def _reply_contents(rowid: int, reply: str | None) -> tuple[int, str | None, str, str] | None:
     """Return a row of ``reply_contents``: the reply's id, a hash of its answer, its request.
 
     Members other than the answer, such as a time, may differ in a copy. In an unknown format the
@@ -162,10 +162,10 @@ def _reply_contents(place: int, reply: str | None) -> tuple[int, str | None, str
         return None
     member = body.get("id") or body.get("responseId")
     reply_id = member.encode(errors="replace").decode() if isinstance(member, str) else None
-    known = (body[name] for name in ANSWERS if body.get(name) is not None)
+    known = (body[name] for name in ANSWER_MEMBERS if body.get(name) is not None)
     answer = json.dumps(next(known, body)).encode()
     content = hashlib.blake2b(answer, digest_size=16).hexdigest()
-    return place, reply_id, content, json.dumps(body.get(ANSWERED_FIELD))
+    return rowid, reply_id, content, json.dumps(body.get(ANSWERED_FIELD))
 
 
 def make_views(connection: duckdb.DuckDBPyConnection) -> None:

@@ -158,7 +158,7 @@ FROM judged WHERE gap_m IS DISTINCT FROM view_gap_m
 
 -- Calls and their replies. Replies are read in chunks, since each may have many megabytes: the id of
 -- each, a hash of its answer, and the request that it answers, if it names one.
-CREATE OR REPLACE TEMP TABLE reply_contents (place BIGINT, reply_id VARCHAR, content VARCHAR, answered JSON);
+CREATE OR REPLACE TEMP TABLE reply_contents (call_rowid BIGINT, reply_id VARCHAR, content VARCHAR, answered JSON);
 
 CREATE OR REPLACE TEMP VIEW served_findings AS
 -- One finding for each pair of models, at its first reply.
@@ -190,7 +190,7 @@ SELECT 'exchanged' AS kind, trial_id, side, decision,
 FROM (
     SELECT trial_id, calls.side, calls.decision, condition, rep, sample_set, request, answered
     FROM calls SEMI JOIN audited USING (trial_id, spec_hash)
-    JOIN trials USING (trial_id, spec_hash) JOIN reply_contents ON calls.rowid = place
+    JOIN trials USING (trial_id, spec_hash) JOIN reply_contents ON calls.rowid = call_rowid
 ) WHERE answered->>'$.body_sha256' <> sha256(request::VARCHAR)
     OR [answered->>'$.slot.condition', answered->>'$.slot.repetition', answered->>'$.slot.side',
         answered->>'$.slot.decision', answered->>'$.slot.sample_set']
@@ -202,7 +202,7 @@ CREATE OR REPLACE TEMP VIEW identified AS
 SELECT calls.trial_id, calls.spec_hash, calls.side, decision, call_key, provider, model_requested,
     coalesce(json_extract_string(spec, '$.' || side || '.endpoint'), '') AS endpoint, reply_id,
     content
-FROM calls JOIN reply_contents ON calls.rowid = place LEFT JOIN specs USING (spec_hash)
+FROM calls JOIN reply_contents ON calls.rowid = call_rowid LEFT JOIN specs USING (spec_hash)
 WHERE http_status = 200 AND reply_id IS NOT NULL;
 CREATE OR REPLACE TEMP TABLE reply_ids AS FROM identified LIMIT 0;
 

@@ -10,8 +10,11 @@ from typing import Any, Protocol
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.pace import Pace
 from merge_runner.errors import UsageError
-from merge_runner.records import Decision, Observation, Side
+from merge_runner.records import Decision, Observation, Side, other_side
+from merge_runner.scenarios.merge.vehicle import net_acceleration
 from merge_runner.trial_records import TrialSpec
+
+Parameter = float | str
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Driver, DriverContext, Parameter, make_context
 from merge_runner.drivers.pace import program_pace
 from merge_runner.errors import UsageError
-from merge_runner.records import SIDES, Side, other_side
+from merge_runner.records import Side
 from merge_runner.registry import Registry, require
 from merge_runner.trial_records import TrialSpec
 

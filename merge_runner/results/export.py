@@ -44,7 +44,7 @@ FROM relations JOIN columns ON oid = table_oid AND relations.database_name = col
 GROUP BY oid, name, is_view, relations.comment ORDER BY is_view, oid
 """
 # Each factor with the common type of its levels, which are written by ``level_text``.
-FACTORS = """
+FACTOR_TYPES = """
 SELECT factor, CASE
     WHEN bool_and(kind = 'BOOLEAN') THEN 'BOOLEAN'
     WHEN bool_and(kind LIKE '%BIGINT' AND try_cast(value AS BIGINT) IS NOT NULL) THEN 'BIGINT'
@@ -56,7 +56,7 @@ FROM (
 )
 GROUP BY factor ORDER BY factor
 """
-WIDE = """
+WIDE_QUERY = """
 SELECT trials.*, trial_drivers.* EXCLUDE (trial_id, spec_hash),
     trial_metrics.* EXCLUDE (trial_id, spec_hash), levels.* EXCLUDE (trial_id, spec_hash)
 FROM trials {only}
@@ -66,8 +66,10 @@ LEFT JOIN (SELECT trial_id, spec_hash{levels} FROM trial_factors GROUP BY ALL) A
     USING (trial_id, spec_hash)
 ORDER BY trial_id, spec_hash
 """
-NAME = "trials_wide"
-COMMENT = "One row a trial: trials, trial_drivers, trial_metrics, and a column for each factor."
+WIDE_NAME = "trials_wide"
+WIDE_COMMENT = (
+    "One row a trial: trials, trial_drivers, trial_metrics, and a column for each factor."
+)
 DICTIONARY = "dictionary.csv"
 LEVEL_MEANING = "the level of a factor of the study"  # of columns that no other table has
 HEADINGS = ["table", "column", "type", "meaning"]
@@ -114,7 +116,7 @@ def units() -> str:
 
 
 def wide_trials(factors: Iterable[tuple[str, str]], sweep_ids: Sequence[str] | None = None) -> str:
-    """Return the SQL of the trials with their FACTORS as columns; of some sweeps, or of all.
+    """Return the SQL of the trials with their FACTOR_TYPES as columns; of some sweeps, or of all.
 
     A factor with the name of another column gets the prefix ``factor_``.
     """
@@ -125,7 +127,7 @@ def wide_trials(factors: Iterable[tuple[str, str]], sweep_ids: Sequence[str] | N
         name = f"factor_{factor}" if factor.lower() in taken else factor
         column = '"' + name.replace('"', '""') + '"'
         levels += f", max(value) FILTER (factor = {quoted(factor)})::{kind} AS {column}"
-    return WIDE.format(levels=levels, only=only(sweep_ids))
+    return WIDE_QUERY.format(levels=levels, only=only(sweep_ids))
 
 
 def export_tables(db: Path, folder: Path, sweep_ids: Sequence[str] | None = None) -> None:
@@ -140,13 +142,13 @@ def export_tables(db: Path, folder: Path, sweep_ids: Sequence[str] | None = None
         raise UsageError(f"{folder} is there and no earlier export: name another folder")
     try:
         with read_database(db) as connection:
-            factors = connection.execute(FACTORS.format(only=only(sweep_ids))).fetchall()
+            factors = connection.execute(FACTOR_TYPES.format(only=only(sweep_ids))).fetchall()
             wide = wide_trials(factors, sweep_ids)
-            connection.execute(f"CREATE OR REPLACE TEMP VIEW {NAME} AS {wide}")
-            connection.execute(f"COMMENT ON VIEW {NAME} IS {quoted(COMMENT)}")
+            connection.execute(f"CREATE OR REPLACE TEMP VIEW {WIDE_NAME} AS {wide}")
+            connection.execute(f"COMMENT ON VIEW {WIDE_NAME} IS {quoted(WIDE_COMMENT)}")
             tables = described(connection)
             levels = {
-                (NAME, name): LEVEL_MEANING
+                (WIDE_NAME, name): LEVEL_MEANING
                 for factor, _ in factors
                 for name in (factor, f"factor_{factor}")
             }

@@ -10,8 +10,8 @@ import numpy as np
 import pandas as pd
 
 from merge_runner.results.database import only
-from merge_runner.results.export import FACTORS, wide_trials
-from merge_runner.results.rows import PLACES
+from merge_runner.results.export import FACTOR_TYPES, wide_trials
+from merge_runner.results.rows import KEY_COLUMNS
 from merge_runner.results.store import answer
 
 TEXT = pd.StringDtype(na_value=np.nan)  # pandas' str since version 3
@@ -35,13 +35,13 @@ def load(db: Path, sql: str) -> pd.DataFrame:
 
 def load_of_sweep(db: Path, sweep_id: str, table: str) -> pd.DataFrame:
     """Return the rows of a table for the trials of a sweep, sorted by trial id."""
-    places = ", ".join(("trial_id", *PLACES[table]))
+    places = ", ".join(("trial_id", *KEY_COLUMNS[table]))
     return load(db, f"FROM {table} {only([sweep_id])} ORDER BY {places}")
 
 
 def load_trials(db: Path, sweep_id: str) -> pd.DataFrame:
     """Return the trials of a sweep with their measures and factor levels."""
-    factors = load(db, FACTORS.format(only=only([sweep_id])))
+    factors = load(db, FACTOR_TYPES.format(only=only([sweep_id])))
     return load(db, wide_trials(factors.itertuples(index=False, name=None), [sweep_id]))
 
 

@@ -17,7 +17,7 @@ from merge_runner.records import (
 )
 from merge_runner.results.recording import opened
 
-SWEEPS = "sweeps"
+SWEEPS_KEY = "sweeps"
 """Metadata key of the rows of several sweeps; one sweep has a key for each column instead."""
 
 
@@ -58,7 +58,7 @@ def provenance_of(sweeps: list[dict[str, Any]]) -> dict[str, str]:
         with suppress(*DAMAGED):
             config = dict(json.loads(row["config"]))
             row["config"] = canonical_json({k: v for k, v in config.items() if k != "typed"})
-    return rows[0] if len(rows) == 1 else {SWEEPS: canonical_json(rows)}
+    return rows[0] if len(rows) == 1 else {SWEEPS_KEY: canonical_json(rows)}
 
 
 def carried_plugins(provenance: dict[str, str]) -> list[str]:
@@ -82,7 +82,7 @@ def described_sweeps(provenance: dict[str, str]) -> list[RecordedSweep]:
 def sweep_rows(provenance: dict[str, str]) -> list[Any]:
     """Return the rows of sweeps in a recording's metadata, not verified."""
     with suppress(*DAMAGED):
-        return [row for row in json.loads(provenance[SWEEPS]) if isinstance(row, dict)]
+        return [row for row in json.loads(provenance[SWEEPS_KEY]) if isinstance(row, dict)]
     return [provenance]
 
 

@@ -71,7 +71,7 @@ BLOCK, MOST_BLOCK_BYTES = 2048, 2**28
 MOST_GROUP_BYTES = 2 * MOST_BLOCK_BYTES
 """Maximum bytes to decode a row group; an export writes about BLOCK rows into one."""
 WRITTEN_AT_ONCE = 16
-SETTINGS: Settings = {
+READER_SETTINGS: Settings = {
     **instance.SETTINGS,
     "autoinstall_known_extensions": False,
     "autoload_known_extensions": False,
@@ -95,7 +95,7 @@ def export_recording(
         file.parent.mkdir(parents=True, exist_ok=True)
         with (
             TemporaryDirectory(prefix=".recording-", dir=file.parent) as folder,
-            in_memory(SETTINGS) as connection,
+            in_memory(READER_SETTINGS) as connection,
         ):
             connection.execute(f"ATTACH {quoted(f'{folder}/calls.duckdb')} AS file; USE file")
             columns = ", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())
@@ -270,7 +270,7 @@ def opened(file: Path) -> Iterator[tuple[duckdb.DuckDBPyConnection, dict[str, st
         raise UsageError(f"there is no recording {file}")
     # Escaped, so that the pattern matches this file only.
     pattern = quoted(re.sub(r"([*?\[])", r"[\1]", str(file.resolve())))
-    with in_memory(SETTINGS) as connection:
+    with in_memory(READER_SETTINGS) as connection:
         try:
             connection.execute(
                 "CREATE VIEW recording AS FROM "

@@ -17,7 +17,7 @@ from merge_runner.records import (
 )
 from merge_runner.text_safety import one_line
 
-SHOWN = 70
+MOST_SHOWN = 70
 # Misses that differ only in numbers have one cause.
 _NUMBER = re.compile(r"-?\d+(\.\d+)?")
 
@@ -81,7 +81,7 @@ def _differences(recorded: ChatRequest, expected: ChatRequest) -> list[str]:
             before, after = next((pair for pair in lines if pair[0] != pair[1]), (None, None))
         if before != after:
             values = ("nothing" if value is None else repr(value) for value in (before, after))
-            was, now = (v if len(v) <= SHOWN else v[:SHOWN] + "..." for v in values)
+            was, now = (v if len(v) <= MOST_SHOWN else v[:MOST_SHOWN] + "..." for v in values)
             texts.append(f"{name} (recorded {was}, wanted {now})")
     return texts
 

@@ -23,7 +23,7 @@ Row = tuple[Any, ...]
 TrialKey = tuple[str, str]
 """(trial_id, spec_hash)"""
 
-SHOWN = 60
+MOST_SHOWN = 60
 """Maximum characters of a differing value in a message."""
 TRIALS_AT_ONCE = 32
 """Number of trials whose rows are in memory together."""
@@ -34,11 +34,11 @@ _OF_TRIALS = (
 _SPANS = (
     "SELECT (trial_id, spec_hash), (min(rowid), max(rowid)) FROM {} GROUP BY trial_id, spec_hash"
 )
-FACTORS = "trial_factors"
+FACTOR_TABLE = "trial_factors"
 # Key columns of a row within a trial.
-PLACES: dict[str, tuple[str, ...]] = {
+KEY_COLUMNS: dict[str, tuple[str, ...]] = {
     "trials": (),
-    FACTORS: ("factor",),
+    FACTOR_TABLE: ("factor",),
     "states": ("step", "side"),
     "decisions": ("decision", "side"),
     "calls": ("decision", "side", "attempt"),
@@ -172,12 +172,12 @@ class Stored:
         tolerance: float = 0.0,
     ) -> Iterator[Difference]:
         """Yield the differences between a trial's stored and expected rows."""
-        names, stored = PLACES[self.table], self.rows.get(key, [])
+        names, stored = KEY_COLUMNS[self.table], self.rows.get(key, [])
         at = [self.names.index(name) for name in names]
         old = {tuple(row[i] for i in at): row for row in stored}
         new = {tuple(row[i] for i in at): row for row in expected}
         unmatched = new.keys() ^ old.keys()
-        if self.table == FACTORS:  # another study may have other factors for the same trial
+        if self.table == FACTOR_TABLE:  # another study may have other factors for the same trial
             unmatched -= old.keys()
         if number := len(unmatched) + len(stored) - len(old):
             yield self._difference(
@@ -189,12 +189,12 @@ class Stored:
             if places and name not in ignored:
                 values = (rows[places[0]][index] for rows in (old, new))
                 texts = ("NULL" if value is None else str(value) for value in values)
-                was, now = (text[:SHOWN] + "..." * (len(text) > SHOWN) for text in texts)
+                was, now = (text[:MOST_SHOWN] + "..." * (len(text) > MOST_SHOWN) for text in texts)
                 text = f"is {was}, and {now} replayed"
                 yield self._difference(f"{self.table}.{name}", places[0], len(places), text)
 
     def _difference(self, name: str, first: Row, rows: int, text: str) -> Difference:
-        place = dict(zip(PLACES[self.table], first, strict=True))
+        place = dict(zip(KEY_COLUMNS[self.table], first, strict=True))
         at = f" at step {place['step']}" if "step" in place else ""
         more = f", and {rows - 1} more in the trial" if rows > 1 else ""
         return Difference(name, place, f"{name}{at} {text}{more}")
@@ -245,7 +245,7 @@ def in_order(
     The rows of TRIALS_AT_ONCE trials are read together: one range of row ids in each table.
     """
     spans: dict[str, dict[TrialKey, tuple[int, int]]] = {
-        table: dict(connection.execute(_SPANS.format(table)).fetchall()) for table in PLACES
+        table: dict(connection.execute(_SPANS.format(table)).fetchall()) for table in KEY_COLUMNS
     }
     stored = sorted(keys & spans["trials"].keys(), key=spans["trials"].__getitem__)
     for first in range(0, len(stored), TRIALS_AT_ONCE):

@@ -31,8 +31,8 @@ from merge_runner.results.database import (
 )
 from merge_runner.results.instance import SETTINGS, Instance, limit_memory, merge_small_groups
 from merge_runner.results.rows import (
-    FACTORS,
-    PLACES,
+    FACTOR_TABLE,
+    KEY_COLUMNS,
     Row,
     TrialKey,
     factor_rows,
@@ -297,17 +297,17 @@ def _add_trials(
             new[key] = rows
         elif status != "failed":
             again[key] = rows
-    for table in PLACES:
+    for table in KEY_COLUMNS:
         for key in new.keys() & stored.keys():
             connection.execute(
                 f"DELETE FROM {table} WHERE trial_id = ? AND spec_hash = ?",  # noqa: S608 # constants
                 key,
             )
         append(connection, table, chain.from_iterable(rows[table] for rows in new.values()))
-    _add_factors(connection, [row for rows in again.values() for row in rows[FACTORS]])
+    _add_factors(connection, [row for rows in again.values() for row in rows[FACTOR_TABLE]])
     differing: dict[str, list[str]] = {}
     # Factor levels are no results: another study may have others for the same trial.
-    for table in [table for table in PLACES if table != FACTORS] if again else []:
+    for table in [table for table in KEY_COLUMNS if table != FACTOR_TABLE] if again else []:
         stored_trials = stored_rows(connection, table, list(again))
         for key, rows in again.items():
             for difference in stored_trials.differences(key, rows[table], ignored=RUN_COLUMNS):

@@ -12,12 +12,12 @@ from merge_runner.registry import require
 from merge_runner.results.database import append, by_name, read_database, write_database
 from merge_runner.results.instance import limit_memory
 from merge_runner.results.rows import (
-    PLACES,
+    KEY_COLUMNS,
 )
 from merge_runner.served_model import other_models
 
 FACTS = Path(__file__).with_name("facts.sql")
-SWEEPS = "FROM sweeps ORDER BY started_at"
+ALL_SWEEPS = "FROM sweeps ORDER BY started_at"
 # Trials that only the sweeps to delete have.
 TO_DELETE = """
 CREATE OR REPLACE TEMP TABLE to_delete AS
@@ -44,7 +44,7 @@ def recorded_sweeps(path: Path, sweep_ids: Sequence[str]) -> tuple[list[dict[str
     Raises UsageError.
     """
     with read_database(path) as connection:
-        sweeps = {row["sweep_id"]: row for row in by_name(connection.execute(SWEEPS))}
+        sweeps = {row["sweep_id"]: row for row in by_name(connection.execute(ALL_SWEEPS))}
         ids = list(dict.fromkeys(sweep_ids)) or [*sweeps][-1:] or [""]
         rows = [require(sweeps, "sweep", sweep_id, f"in {path}") for sweep_id in ids]
         keys = connection.execute(CALLS_OF, [ids]).fetchall()
@@ -94,7 +94,7 @@ def forget(db: Path, ids: Sequence[str]) -> None:
     """Delete sweeps, the trials that no other sweep has, and specs without a trial."""
     with write_database(db) as connection:
         connection.execute(TO_DELETE, [ids])
-        for table in PLACES:
+        for table in KEY_COLUMNS:
             connection.execute(
                 f"DELETE FROM {table} WHERE (trial_id, spec_hash) IN (FROM to_delete)"  # noqa: S608 # our tables
             )

@@ -12,10 +12,6 @@ from merge_runner.records import Side
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.trial_records import TrialSpec
-from merge_runner_cei.agents import Model
-from merge_runner_cei.batch import Trial
-from merge_runner_cei.motion import task_of
-from merge_runner_cei.parameters import OFFSETS, TICK_S, Habits, ThresholdSet, offsets_of
 
 # As often as each human pair drove each condition.
 TRIALS_OF_A_PAIR = 10

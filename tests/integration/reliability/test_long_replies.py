@@ -7,7 +7,6 @@ import pytest
 
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.results.database import (
-    MERGED_BYTES,
     ROWS_OF_A_GROUP,
     append,
     open_database,
@@ -16,6 +15,7 @@ from merge_runner.results.database import (
 )
 from merge_runner.results.instance import (
     BYTES_OF_A_CALL,
+    MERGED_BYTES,
     SETTINGS,
     in_memory,
     limit_memory,

@@ -4,7 +4,7 @@ import pytest
 
 from merge_runner.results.database import schema_sql
 from merge_runner.results.instance import in_memory
-from merge_runner.results.rows import PLACES, rows_of, stored_rows
+from merge_runner.results.rows import KEY_COLUMNS, rows_of, stored_rows
 from merge_runner.results.store import RUN_COLUMNS
 from tests.support.studies import Drive, Said, played
 
@@ -39,7 +39,7 @@ def differing(connection, **how) -> list[str]:
     made = rows_of(RECORD)
     return [
         difference.name
-        for table in PLACES
+        for table in KEY_COLUMNS
         for difference in stored_rows(connection, table, [KEY]).differences(KEY, made[table], **how)
     ]
 
@@ -63,7 +63,7 @@ def change(stored, columns) -> None:
 
 @pytest.mark.parametrize("first", [0, 1])
 def test_every_second_column_that_is_changed_is_found_and_no_other(stored, first):
-    changed = [each for each in COLUMNS if each[1] not in PLACES[each[0]]][first::2]
+    changed = [each for each in COLUMNS if each[1] not in KEY_COLUMNS[each[0]]][first::2]
     change(stored, changed)
     names = [f"{table}.{column}" for table, column, _ in changed]
     assert sorted(differing(stored)) == sorted(names)
@@ -71,7 +71,7 @@ def test_every_second_column_that_is_changed_is_found_and_no_other(stored, first
     assert sorted(differing(stored, ignored=RUN_COLUMNS)) == sorted(lasting)
 
 
-@pytest.mark.parametrize("place", [each for each in COLUMNS if each[1] in PLACES[each[0]]])
+@pytest.mark.parametrize("place", [each for each in COLUMNS if each[1] in KEY_COLUMNS[each[0]]])
 def test_a_row_at_another_place_is_another_row(stored, place):
     assert differing(stored) == []
     change(stored, [place])

@@ -5,7 +5,7 @@ import csv
 import duckdb
 import pytest
 
-from merge_runner.results.export import FACTORS, tables
+from merge_runner.results.export import FACTOR_TYPES, tables
 from merge_runner.results.recording import COLUMNS
 from merge_runner.results.store import query
 from tests.support import cases
@@ -72,7 +72,7 @@ def test_a_factor_has_the_type_that_all_its_levels_have():
     with duckdb.connect() as connection:
         connection.execute("CREATE TABLE trial_factors (factor VARCHAR, value VARCHAR)")
         connection.executemany("INSERT INTO trial_factors VALUES (?, ?)", rows)
-        found = connection.execute(FACTORS.format(only="")).fetchall()
+        found = connection.execute(FACTOR_TYPES.format(only="")).fetchall()
     assert dict(found) == {name: case["kind"] for name, case in factors.items()}
 
 

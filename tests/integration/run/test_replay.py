@@ -153,8 +153,8 @@ async def test_missing_replies_are_counted_with_what_differs_and_the_rest_finish
 async def test_one_changed_letter_of_a_prompt_is_one_explanation(merge_runner, small, tmp_path):
     for folder in ("merge_runner", "experiments"):
         shutil.copytree(PROJECT / folder, tmp_path / "edited" / folder)
-    blocks = tmp_path / "edited/merge_runner/prompts/blocks.py"
-    blocks.write_text(blocks.read_text().replace("- Your speed:", "- Your spead:"))
+    texts = tmp_path / "edited/merge_runner/prompts/texts.py"
+    texts.write_text(texts.read_text().replace("- Your speed:", "- Your spead:"))
     part = ("--recording", small, "--reps", 1, "--conditions", "N_0_0", "--json")
     run = await merge_runner("replay", "baseline", *part, PYTHONPATH=str(tmp_path / "edited"))
     told, held = run.summary["messages"]

@@ -52,10 +52,7 @@ def test_every_example_can_be_played(example, arms, tmp_path):
 async def test_the_study_of_the_readme_fits_its_cap_with_models_that_answer_in_2027(tmp_path):
     readme = (PROJECT / "README.md").read_text()
     ((text, trials, usd),) = re.findall(
-        r"^```toml\n(.*?)^```\n\n"
-        r"This study has (\d+) trials. `--dry-run` estimates about (\d+) USD",
-        readme,
-        re.DOTALL | re.MULTILINE,
+        r"^```toml\n(.*?)^```\n\n(\d+) trials, about (\d+) USD", readme, re.DOTALL | re.MULTILINE
     )
     (tmp_path / "study.toml").write_text(text)
     plan = make_plan(str(tmp_path / "study.toml"))
