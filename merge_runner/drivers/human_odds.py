@@ -78,8 +78,8 @@ class HumanOddsDriver:
         number, sign = self.context.number, 1 if self.context.side == "left" else -1
         log_odds = number("odds_intercept") * sign
         log_odds += number("odds_headway") * headway_m + number("odds_velocity") * velocity_mps
-        own, other = self._random, Random(self.context.other_seed)
-        return own.expovariate(1.0) < exp(min(log_odds, CERTAIN)) * other.expovariate(1.0)
+        ego, other = self._random, Random(self.context.other_seed)
+        return ego.expovariate(1.0) < exp(min(log_odds, CERTAIN)) * other.expovariate(1.0)
 
     def _gap_m(self, headway_m: float, velocity_mps: float) -> float:
         number = self.context.number

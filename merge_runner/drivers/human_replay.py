@@ -85,10 +85,10 @@ class ImportedHumans:
             ]
             turns: dict[str, int] = {}
             order = []
-            for trial in sorted(chosen, key=lambda one: (one.pair, one.number)):
+            for trial in sorted(chosen, key=lambda t: (t.pair, t.number)):
                 turns[trial.pair] = turns.get(trial.pair, 0) + 1
                 order.append((turns[trial.pair], trial.pair, trial))
-            self._usable[key] = [trial for *_, trial in sorted(order, key=lambda one: one[:2])]
+            self._usable[key] = [trial for *_, trial in sorted(order, key=lambda turn: turn[:2])]
         return self._usable[key]
 
     def check(
@@ -108,11 +108,12 @@ class ImportedHumans:
                 f"{HUMAN_REPLAY} needs a world of step_s = {SAMPLE_S} and control_start = "
                 '"both_exits": set them under [scenario] of the sweep\'s file'
             )
-        there = len(self.usable(config, condition, pair))
-        if repetitions > there:
+        available = len(self.usable(config, condition, pair))
+        if repetitions > available:
             raise UsageError(
-                f"{HUMAN_REPLAY} has {there} trials of {condition} to replay, and {repetitions} "
-                "repetitions are asked for: choose fewer by --reps, or other --conditions"
+                f"{HUMAN_REPLAY} has {available} trials of {condition} to replay, and "
+                f"{repetitions} repetitions are asked for: choose fewer by --reps, "
+                "or other --conditions"
             )
 
 

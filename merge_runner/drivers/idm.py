@@ -71,8 +71,8 @@ class IdmDriver:
         closing = speed - seen.other_speed_mps
         braking = 2 * sqrt(most * self.context.number("comfortable_braking_mps2"))
         dynamic = speed * self.context.number("headway_s") + speed * closing / braking
-        wanted = self.context.number("jam_distance_m") + max(0.0, dynamic)
-        return most * (wanted / gap) ** 2
+        desired_gap = self.context.number("jam_distance_m") + max(0.0, dynamic)
+        return most * (desired_gap / gap) ** 2
 
     def _leads(self, seen: Observation) -> bool:
         distance = seen.distance_to_merge_m

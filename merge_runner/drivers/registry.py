@@ -69,7 +69,7 @@ class Program:
             raise UsageError(f"the driver {name} needs a rate_hz above 0")
         if self.sets:
             require(self.sets, f"{SET} of the driver {name}", str(self.parameters.get(SET)))
-        if not all(isinstance(each, str) or _is_number(each) for each in self.values.values()):
+        if not all(isinstance(value, str) or _is_number(value) for value in self.values.values()):
             raise UsageError(f"the parameters of the driver {name} must be finite numbers or texts")
         if self.check is not None:
             self.check(self.values)
@@ -110,17 +110,17 @@ class Program:
             raise UsageError(f"the parameters of {name} stand in its source and cannot be set")
         values, given = self.values, dict(self.parameters)
         # The set comes first: the other parameters depend on it.
-        for each in sorted(changes, key=lambda each: each != SET):
+        for key in sorted(changes, key=lambda key: key != SET):
             hint = f"each {SET} has parameters of its own" if self.sets else ""
-            value, default = changes[each], require(values, f"parameter of {name}", each, hint)
+            value, default = changes[key], require(values, f"parameter of {name}", key, hint)
             if isinstance(default, str) and isinstance(value, str):
-                given[each] = value
+                given[key] = value
             elif not isinstance(default, str) and _is_number(value):
-                given[each] = float(value)
+                given[key] = float(value)
             else:
-                wanted = "a text" if isinstance(default, str) else "a finite number"
-                raise UsageError(f"{each} of {name} is {wanted}, as {default!r}, not {value!r}")
-            if each == SET:
+                kind = "a text" if isinstance(default, str) else "a finite number"
+                raise UsageError(f"{key} of {name} is {kind}, as {default!r}, not {value!r}")
+            if key == SET:
                 values = replace(self, parameters=given).values
         return replace(
             self,

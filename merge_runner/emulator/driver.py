@@ -69,9 +69,9 @@ class Situation:
     @property
     def projected_lead_m(self) -> float:
         """Lead of the own vehicle when the first one reaches the merge point, at present speeds."""
-        own = (self.distance_to_merge or 0.0) / max(self.own_speed, 0.1)
-        other = max(self.other_distance_to_merge, 0.0) / max(self.other_speed, 0.1)
-        return (self.own_speed - self.other_speed) * min(own, other) - self.relative_distance
+        own_s = (self.distance_to_merge or 0.0) / max(self.own_speed, 0.1)
+        other_s = max(self.other_distance_to_merge, 0.0) / max(self.other_speed, 0.1)
+        return (self.own_speed - self.other_speed) * min(own_s, other_s) - self.relative_distance
 
 
 def answer(prompt: str, slot: Slot | None, effect: PlantedEffect | None = None) -> str:
@@ -106,12 +106,12 @@ def answer(prompt: str, slot: Slot | None, effect: PlantedEffect | None = None) 
             share = draw_between(0.1, 0.7, "share", *trial)
             action, reason = _open_gap(situation, gap_m, share, goes_first=goes_first)
             # The driver keeps the level of its previous plan unless the needed one is far from it.
-            held = (
+            level = (
                 None if situation.previous is None else situation.previous * MAX_ACCELERATION_MPS2
             )
-            if held is None or abs(action - held) >= 0.25:
-                held = action + draw_between(-0.05, 0.05, "wobble", *decision)
-            action = held
+            if level is None or abs(action - level) >= 0.25:
+                level = action + draw_between(-0.05, 0.05, "wobble", *decision)
+            action = level
         reason = f"{opening} {reason}"
     normalised = round(min(1.0, max(-1.0, action / MAX_ACCELERATION_MPS2)), 2) + 0.0
     plan = ", ".join([f"{normalised:.2f}"] * situation.plan_actions)
@@ -135,15 +135,15 @@ def random_answer(prompt: str, slot: Slot | None) -> str:
 
 def read_prompt(prompt: str) -> Situation | str:
     """Return the situation that a prompt describes, or a reply that names what is missing."""
-    own = _quantity("Your speed", "m/s", prompt)
-    other = _quantity("Speed of the other car", "m/s", prompt)
+    speed = _quantity("Your speed", "m/s", prompt)
+    other_speed = _quantity("Speed of the other car", "m/s", prompt)
     relative = _quantity("Relative distance .*?", "m", prompt)
     actions = _number(r"exactly (\d+) numbers", prompt)
     other_seen = not re.search(rf"Speed of the other car(?:: | \| ){NOT_SEEN}", prompt)
     if not other_seen:
-        other, relative = own, -FAR_BEHIND_M
-    if own is None or other is None or relative is None or actions is None:
-        needed = zip(NEEDED, (own, other, relative, actions), strict=True)
+        other_speed, relative = speed, -FAR_BEHIND_M
+    if speed is None or other_speed is None or relative is None or actions is None:
+        needed = zip(NEEDED, (speed, other_speed, relative, actions), strict=True)
         missing = ", ".join(f"`{words}`" for words, number in needed if number is None)
         return (
             "I am the emulator, a scripted driver and no language model, and cannot read this "
@@ -153,14 +153,16 @@ def read_prompt(prompt: str) -> Situation | str:
     before = _number(r"Observed speeds of the other car .*[\[ ]([^, \]]+)\]$", prompt)
     step_s = _number(r"one value every (\S+) s", prompt)
     return Situation(
-        own_speed=own,
-        other_speed=other,
+        own_speed=speed,
+        other_speed=other_speed,
         relative_distance=relative,
         distance_to_merge=_quantity("Your distance to the merge point", "m", prompt),
         asks_tactical="merge first (M) or yield" in prompt,
         plan_actions=int(actions),
         vehicle_length=_quantity("Length of each car", "m", prompt) or VEHICLE_LENGTH_M,
-        other_acceleration=(other - before) / step_s if before is not None and step_s else 0.0,
+        other_acceleration=(other_speed - before) / step_s
+        if before is not None and step_s
+        else 0.0,
         previous=_number(r"not been executed yet\): \[([^,\]]+)", prompt),
         other_seen=other_seen,
     )

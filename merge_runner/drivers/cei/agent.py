@@ -22,25 +22,25 @@ class Agent:
     def __init__(self, context: DriverContext, thresholds: ThresholdSet, seen: Observation) -> None:
         self._model = Model(task_of(context.scenario, TRACK), thresholds, Habits())
         self._random = np.random.default_rng(context.seed)
-        own, other = _vehicles(seen)
+        ego, other = _vehicles(seen)
         offsets = offsets_of(int(context.number("pair")), context.repetition)
         base = thresholds.base(offsets[SIDES.index(context.side)])
-        desired = set_speeds(self._model.task, own.speeds_mps)
-        ticks = tunnel_ticks(own, other) if seen.other_seen else np.zeros(1)
-        self._agents = start(self._model, [base], own, other, desired, ticks, self._noise())
+        desired = set_speeds(self._model.task, ego.speeds_mps)
+        ticks = tunnel_ticks(ego, other) if seen.other_seen else np.zeros(1)
+        self._agents = start(self._model, [base], ego, other, desired, ticks, self._noise())
         self._last = seen
 
     def decide(self, seen: Observation, ticks: int) -> float:
         """Return the input in [-1, 1] to hold; ``ticks`` have passed since the last decision."""
-        own, other = _vehicles(seen)
+        ego, other = _vehicles(seen)
         accelerated = np.array([self._acceleration_mps2(seen, ticks)])
         noises = [self._noise() for _ in range(ticks)]
         for noise in noises:
             self._agents.perceive(self._model, other, accelerated, noise[:, 0])
         if not seen.other_seen:
-            self._agents.perceived_mps = own.speeds_mps
+            self._agents.perceived_mps = ego.speeds_mps
         controls = np.ones(1, bool)
-        self._agents.decide(self._model, own, other, noises[-1][:, 1], controls, ticks)
+        self._agents.decide(self._model, ego, other, noises[-1][:, 1], controls, ticks)
         self._last = seen
         return float(self._agents.inputs[0])
 

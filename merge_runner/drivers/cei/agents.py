@@ -101,7 +101,7 @@ class Agents:
     def decide(
         self,
         model: Model,
-        own: Vehicles,
+        ego: Vehicles,
         other: Vehicles,
         noise: Array,
         controls: Mask,
@@ -112,18 +112,18 @@ class Agents:
         ``noise`` is standard normal, one number an agent; ``ticks`` have passed since the last
         call. Agents without ``controls`` are driven by their cruise control.
         """
-        last_mps, self.last_mps = self.last_mps, own.speeds_mps
+        last_mps, self.last_mps = self.last_mps, ego.speeds_mps
         if not controls.any():
             return
         belief = self._belief(model, other)
-        ahead = course(model.task, own.positions_m, own.speeds_mps, self.inputs)
+        ahead = course(model.task, ego.positions_m, ego.speeds_mps, self.inputs)
         risk = risks(model.task, ahead.positions_m[1:], belief).max(axis=0)
-        crossed = (last_mps - self.desired_mps) * (own.speeds_mps - self.desired_mps) < 0
-        thresholds = self._thresholds(model.thresholds, own, other)
+        crossed = (last_mps - self.desired_mps) * (ego.speeds_mps - self.desired_mps) < 0
+        thresholds = self._thresholds(model.thresholds, ego, other)
         bound = self._bound(model.habits, risk, thresholds, crossed, controls, ticks)
         replans = np.isfinite(bound)
         if replans.any():
-            self._plan(model, own, other, belief, bound, noise, replans)
+            self._plan(model, ego, other, belief, bound, noise, replans)
 
     def keep(self, chosen: Mask) -> Agents:
         """Return the chosen agents."""
@@ -139,9 +139,9 @@ class Agents:
             spread * seconds**2 / 2,
         )
 
-    def _thresholds(self, of: ThresholdSet, own: Vehicles, other: Vehicles) -> tuple[Array, Array]:
-        headway = own.positions_m - other.positions_m
-        faster = own.speeds_mps - self.perceived_mps
+    def _thresholds(self, of: ThresholdSet, ego: Vehicles, other: Vehicles) -> tuple[Array, Array]:
+        headway = ego.positions_m - other.positions_m
+        faster = ego.speeds_mps - self.perceived_mps
         lower = of.lower_headway * headway + of.lower_speed * faster
         upper = of.upper_headway * headway + of.upper_speed * faster
         product = headway * faster
@@ -180,7 +180,7 @@ class Agents:
     def _plan(
         self,
         model: Model,
-        own: Vehicles,
+        ego: Vehicles,
         other: Vehicles,
         belief: Belief,
         bound: Array,
@@ -189,7 +189,7 @@ class Agents:
     ) -> None:
         """Set the cheapest input within the bound; if none is, full power if ahead, else brakes."""
         agents = np.flatnonzero(replans)
-        plans = course(model.task, own.positions_m[agents], own.speeds_mps[agents], INPUTS[:, None])
+        plans = course(model.task, ego.positions_m[agents], ego.speeds_mps[agents], INPUTS[:, None])
         best = cheapest_safe(
             model.task,
             plans.positions_m[1:],
@@ -198,7 +198,7 @@ class Agents:
             bound[agents],
         )
         solved = best != UNSOLVED
-        ahead = own.positions_m[agents] > other.positions_m[agents]
+        ahead = ego.positions_m[agents] > other.positions_m[agents]
         self.inputs, self.unsolved = self.inputs.copy(), self.unsolved.copy()
         self.inputs[agents] = np.where(
             solved, _driven(model, INPUTS[best], noise[agents]), np.where(ahead, 1.0, -1.0)
@@ -209,7 +209,7 @@ class Agents:
 def start(
     model: Model,
     bases: Sequence[Base],
-    own: Vehicles,
+    ego: Vehicles,
     other: Vehicles,
     desired_mps: Array,
     ticks: Array,
@@ -223,11 +223,11 @@ def start(
     """
     habits = model.habits
     remaining = habits.remaining**ticks
-    known = other.speeds_mps + remaining * (own.speeds_mps - other.speeds_mps)
+    known = other.speeds_mps + remaining * (ego.speeds_mps - other.speeds_mps)
     wander = habits.wander_mps * np.sqrt((1 - remaining**2) / (1 - habits.remaining**2))
-    hold = course(model.task, own.positions_m, desired_mps, INPUTS[:, None])
+    hold = course(model.task, ego.positions_m, desired_mps, INPUTS[:, None])
     inputs = INPUTS[hold.cost(desired_mps).argmin(axis=0)]
-    agents = len(own.positions_m)
+    agents = len(ego.positions_m)
     return Agents(
         lower=np.array([base.lower for base in bases]),
         upper=np.array([base.upper for base in bases]),
@@ -236,7 +236,7 @@ def start(
         memory_mps2=np.zeros((MEMORY_TICKS, agents)),
         waited_ticks=np.full(agents, OFF),
         unsolved=np.zeros(agents, bool),
-        last_mps=own.speeds_mps,
+        last_mps=ego.speeds_mps,
         inputs=_driven(model, inputs, noise[:, 1]),
     )
 
@@ -274,12 +274,12 @@ def cheapest_safe(
     return best
 
 
-def tunnel_ticks(own: Vehicles, other: Vehicles) -> Array:
+def tunnel_ticks(ego: Vehicles, other: Vehicles) -> Array:
     """Return the ticks since the vehicle farther back was at position 0, at present speeds.
 
     A perceived speed may be 0 by an error: SLOWEST_MPS then takes its place.
     """
-    return np.asarray(np.minimum(_since_start_s(own), _since_start_s(other)) / TICK_S)
+    return np.asarray(np.minimum(_since_start_s(ego), _since_start_s(other)) / TICK_S)
 
 
 def _since_start_s(vehicles: Vehicles) -> Array:

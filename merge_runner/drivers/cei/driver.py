@@ -43,7 +43,7 @@ def thresholds_of(context: DriverContext) -> ThresholdSet:
     """Return the thresholds that a study sets, or those calibrated for its resistance."""
     if context.parameters[SET] == BY_RESISTANCE:
         return SETS[USUAL_SETS[context.scenario.resistance]]
-    return ThresholdSet(**{each.name: context.number(each.name) for each in fields(ThresholdSet)})
+    return ThresholdSet(**{f.name: context.number(f.name) for f in fields(ThresholdSet)})
 
 
 def check(parameters: Mapping[str, Parameter]) -> None:
@@ -74,7 +74,7 @@ PROGRAMS.register(
         {SET: BY_RESISTANCE, PAIR: 0},
         1 / TICK_S,
         settable=True,
-        sets={BY_RESISTANCE: {}, **{name: asdict(one) for name, one in SETS.items()}},
+        sets={BY_RESISTANCE: {}, **{name: asdict(values) for name, values in SETS.items()}},
         check=check,
         check_clock=check_clock,
         chance=True,
