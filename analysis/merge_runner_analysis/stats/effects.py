@@ -16,7 +16,8 @@ import pandas as pd
 from merge_runner.errors import UsageError
 from merge_runner.registry import in_use, require
 from merge_runner.study.arms import MODEL
-from merge_runner.study.file import StudySource
+from merge_runner.study.file import StudyFile, StudySource
+from merge_runner.text_safety import first_line
 from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.frames import KEYS
 from merge_runner_analysis.grouping import Group, levels_of

@@ -15,7 +15,7 @@ import duckdb
 from pydantic import ValidationError
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.records import NO_DECISION, SIDES
+from merge_runner.records import ANSWERS, NO_DECISION, SIDES
 from merge_runner.results.instance import SETTINGS, in_memory
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.served_model import Pair, other_models, sql_of

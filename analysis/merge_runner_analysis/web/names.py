@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from inspect import getdoc
 from typing import Any
 
-from merge_runner.config import without_endpoint
+from merge_runner.driver_names import without_endpoint
 from merge_runner.drivers.registry import EMULATOR, PROGRAMS
 from merge_runner.records import SIDES
 

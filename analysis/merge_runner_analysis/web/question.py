@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from merge_runner.prompts.blocks import title_of
-from merge_runner.study.arms import MODEL, OPPONENT, PROMPT
+from merge_runner.study.arms import MODEL, OPPONENT, PROMPT, SELF
 from merge_runner_analysis.metrics import COLLISIONS, GAP, LEFT_FIRST, RMSE
 from merge_runner_analysis.tables.model import Row, Table
 from merge_runner_analysis.web.effect_rows import (
