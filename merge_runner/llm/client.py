@@ -22,25 +22,15 @@ from merge_runner.errors import (
 from merge_runner.llm.budget import Budget, PaidAttempt
 from merge_runner.llm.cache import Attempts, CachedCall, ResponseCache
 from merge_runner.llm.call import Call, Meter, Wait
-from merge_runner.llm.formats import FORMATS, WireFormat, as_text
-from merge_runner.llm.http_outcome import (
-    UNSURE,
-    AttemptOutcome,
-    TransportFailure,
-    TryAgain,
-    backoff_s,
-    if_nobody,
-    judge,
-    may_be_charged,
-    next_wait_s,
-    reason_of,
-    utc_after,
-    why_refused,
-)
+from merge_runner.llm.delays import TryAgain, backoff_s, next_wait_s, utc_after
+from merge_runner.llm.formats import FORMATS
+from merge_runner.llm.formats.wire import WireFormat, as_text
+from merge_runner.llm.http_outcome import AttemptOutcome, TransportFailure, judge, may_be_charged
 from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger
 from merge_runner.llm.limiter import Limiter
 from merge_runner.llm.prices import cost_usd, underpriced_tiers
 from merge_runner.llm.recorded import RecordedReplies
+from merge_runner.llm.refusals import UNSURE, if_nobody, reason_of, why_refused
 from merge_runner.records import (
     SCRIPTED_HEADER,
     Attempt,

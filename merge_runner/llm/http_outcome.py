@@ -6,46 +6,31 @@
 from __future__ import annotations
 
 import json
-import random
 import re
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta
-from email.utils import parsedate_to_datetime
 from functools import cached_property
-from math import inf
 from typing import TYPE_CHECKING, Literal
-from urllib.parse import urlsplit
 
-from merge_runner.config import PROVIDERS, ModelEntry
+from merge_runner.config import PROVIDERS
 from merge_runner.errors import MergeRunnerError
-from merge_runner.llm.formats import (
+from merge_runner.llm.delays import server_delay_s
+from merge_runner.llm.formats.server_error import ServerError, is_per_day, known_meaning, read_error
+from merge_runner.llm.formats.wire import (
     BROKEN_OFF,
     Reading,
-    ServerError,
     WireFormat,
     as_dict,
-    as_text,
     at,
     is_error,
-    is_per_day,
-    known_delay_s,
-    known_meaning,
-    read_error,
     read_reply,
 )
 
 if TYPE_CHECKING:
-    from tenacity import RetryCallState
+    pass
 
 Action = Literal["accept", "retry", "fail", "quota", "refused"]
 EXCERPT = 200
-FIRST_BACKOFF_S, LONGEST_BACKOFF_S = 0.5, 60.0
-# In 2001: a smaller number of s is no moment.
-SMALLEST_UNIX_S = 1e9
-# The statuses of a refusal that names the request.
-REQUEST_ITSELF = (200, 400, 413, 422, 429)
 # Azure charges for a prompt that it has looked at, also where it then refuses it.
 CHARGED_ERRORS = frozenset({"content_filter", "context_length_exceeded"})
 TOO_LATE = frozenset({408, 499, 504, 524})
@@ -93,46 +78,8 @@ ACTIONS: dict[str, Action] = {
     **dict.fromkeys(("server_error", "overloaded", "server_timeout"), "retry"),
 }
 
-# Why no call of a run would be answered, and what a user can do.
-REASONS = {
-    "bad_certificate": "the endpoint's certificate cannot be trusted, and nothing was sent; check "
-    "the base URL, or set SSL_CERT_FILE to the certificates of whoever signed it",
-    "not_allowed": "the endpoint does not accept the key; set {key} to a valid one",
-    "unknown_model": "the endpoint has no model {id!r}; see `merge-runner models`, or {base_url}",
-    "path_twice": "the base URL must not end with what the path begins with (such as /v1), or it "
-    "stands there twice: {base_url}",
-    "proxy_refused": "the proxy (HTTPS_PROXY, HTTP_PROXY or ALL_PROXY) lets nothing through, and "
-    "nothing was sent: give its URL a user name and a password if it asks for them (407), have it "
-    "allow the host, or name the host in NO_PROXY",
-    "request": "the request is refused: look at {place}",
-    "other_format": "what answers there does not speak {format}: {base_url}",
-    "other_error": "the endpoint sends an error in the place of an answer: {base_url}",
-    "stream": "the endpoint sends a stream of events (SSE), though none is asked for: switch "
-    "streaming off at the server or at the gateway before it, take `stream` out of `parameters` of "
-    "{place}, or {base_url}",
-    "page": "what answers there is a web page and does not speak {format}: {base_url}",
-    "packed": "the body has a Content-Encoding ({encoding}) that cannot be read: have the server, "
-    "or the gateway before it, send it plain or as gzip",
-    "unreadable_reply": "what answers there cannot be read: have the server, or the gateway before "
-    "it, send headers of at most 64 KiB and a body that is plain or gzip",
-    "reasoning_alone": "the whole answer lies in `reasoning_content`, and the content is empty: "
-    "start the server without its reasoning parser (vLLM, SGLang: leave --reasoning-parser out; "
-    "llama.cpp: --reasoning-format none), or let the model think, as `chat_template_kwargs = "
-    "{{ enable_thinking = true }}` among `parameters` of {place} does",
-}
-# Those that a passing fault may look like: several in a row tell.
-UNSURE = frozenset({"other_error", "text", "unreadable_reply", "proxy_refused"})
-# A part of a path that follows itself, as in /v1/v1/messages.
-_TWICE = re.compile(r"(/\w.*)\1(/|$)")
 # After comments and other fields, since a plain text may begin with "id:", too.
 _EVENTS = re.compile(r"\s*(?:(?:id|retry)?:[^\n]*\n\s*)*(?:data|event):", re.ASCII)
-
-_UNIT_S = {"ms": 0.001, "milli": 0.001, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
-# 1.574s and 6m0s, but also 5 minutes.
-_PART = r"(\d+(?:\.\d+)?)\s*(ms|milli|[smhd])(?:ec|sec|econd|second|in|inute|r|our|ay)?s?(?![a-z])"
-_IN_TEXT = re.compile(rf"(?:try again|retry) (?:in|after) ({_PART}(?:(?:,|\s|and)*{_PART})*)", re.I)
-# A header that is sent several times has all its values in one, and a date has a comma of its own.
-_LISTED = re.compile("[A-Z][a-z]{2}, [^,]+|[^,]+")
 
 
 @dataclass(frozen=True)
@@ -299,141 +246,3 @@ def judge_error(error: ServerError, wire: WireFormat) -> AttemptOutcome:
         delay_s=server_delay_s(error, wire) if tells else None,
         pause=name == "rate_limited",
     )
-
-
-def server_delay_s(
-    error: ServerError, wire: WireFormat, now: datetime | None = None
-) -> float | None:
-    """Return the delay in s that a failed reply asks for, None if it says nothing usable.
-
-    Sources in order: ``retry-after-ms``, ``retry-after`` (seconds or HTTP date), a member of the
-    error, "try again in 1.574s" or "retry after 5 minutes" in the message, and for a 429
-    ``x-ratelimit-reset``. Of several values of a header the longest counts.
-    """
-    told = _IN_TEXT.search(error.message)
-    parts = re.findall(_PART, told[1], re.I) if told else []
-    candidates = (
-        _longest_s(error.headers.get("retry-after-ms", ""), now) / 1000,
-        _longest_s(error.headers.get("retry-after", ""), now),
-        wire.delay_s(error) or known_delay_s(error) or 0.0,
-        sum(float(number) * _UNIT_S[unit.lower()] for number, unit in parts),
-        _reset_s(error, now) if error.status == 429 else 0.0,
-    )
-    return next((delay for delay in candidates if 0 < delay < inf), None)
-
-
-def _longest_s(header: str, now: datetime | None) -> float:
-    """Return the longest usable delay among the values of a header, 0 if there is none."""
-    delays = [0.0]
-    for text in _LISTED.findall(header):
-        with suppress(ValueError):
-            delays.append(float(text))
-            continue
-        with suppress(ValueError, OverflowError):  # the latter: beyond the first or last date
-            moment = parsedate_to_datetime(text)
-            aware = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
-            delays.append((aware - (now or datetime.now(UTC))).total_seconds())
-    return max(delay for delay in delays if 0 <= delay < inf)
-
-
-def _reset_s(error: ServerError, now: datetime | None) -> float:
-    """Return the time in s until a used-up limit is reset, 0 if it is not said.
-
-    The header is a number of seconds, or a moment as Unix time in s or ms, as OpenRouter has it.
-    """
-    reset = error.headers.get("x-ratelimit-reset", "")
-    if error.headers.get("x-ratelimit-remaining", "0") != "0" or not reset.isdecimal():
-        return 0.0
-    number = float(reset)
-    for scale in (1000, 1):
-        if number / scale > SMALLEST_UNIX_S:
-            return number / scale - (now or datetime.now(UTC)).timestamp()
-    return number
-
-
-def utc_after(seconds: float) -> str:
-    """Return the moment after a delay in s, to the minute."""
-    try:
-        return f"{datetime.now(UTC) + timedelta(seconds=seconds):%Y-%m-%d %H:%M} UTC"
-    except OverflowError:
-        return "a moment after the year 9999"
-
-
-class TryAgain(MergeRunnerError):
-    """An attempt failed in a way that passes; ``delay_s`` is what the server asked for."""
-
-    def __init__(self, message: str, delay_s: float | None = None) -> None:
-        super().__init__(message)
-        self.delay_s = delay_s
-
-
-def backoff_s(attempts: int) -> float:
-    """Return the wait in s after so many failed attempts, without jitter."""
-    # The exponent is bounded: after a thousand attempts the power would fit in no float.
-    return float(min(FIRST_BACKOFF_S * 2 ** min(attempts - 1, 10), LONGEST_BACKOFF_S))
-
-
-def next_wait_s(state: RetryCallState) -> float:
-    """Return the wait in s after a failed attempt: the backoff, or the server's longer one."""
-    error = state.outcome.exception() if state.outcome else None
-    assert isinstance(error, TryAgain)
-    # The jitter lets calls that failed together, as when a server restarts, not return together.
-    jitter_s = random.uniform(0, FIRST_BACKOFF_S)  # noqa: S311 # no secret
-    return max(
-        error.delay_s or 0, min(backoff_s(state.attempt_number) + jitter_s, LONGEST_BACKOFF_S)
-    )
-
-
-def reason_of(outcome: AttemptOutcome, url: str) -> str | None:
-    """Return why all calls of a run would fare as this one to ``url``: a name of REASONS or UNSURE.
-
-    None: they might not.
-    """
-    raw, name = outcome.raw, outcome.name
-    if outcome.action == "refused":
-        is_twice = name == "unknown_model" and _TWICE.search(urlsplit(url).path)
-        return "path_twice" if is_twice else name
-    if raw is None or name == "bad_prompt":
-        return outcome.reason
-    if name == "bad_body":
-        return raw.kind
-    if outcome.action == "fail":
-        return "request" if raw.status in REQUEST_ITSELF else "other_format"
-    is_told = is_error(as_dict(raw.payload).get("error"))
-    if outcome.action == "retry" and raw.status == 200 and is_told and not raw.error.names:
-        return "other_error"
-    message = as_dict(at(raw.payload, "choices.0.message"))
-    # Thoughts within the text are the model's choice, not the server's.
-    is_apart = message and not as_text(message.get("content"))
-    is_alone = name == "empty" and is_apart and outcome.reading.reasoning.strip()
-    return "reasoning_alone" if is_alone else None
-
-
-def why_refused(reason: str, entry: ModelEntry, outcome: AttemptOutcome) -> str:
-    """Return a reason in words, with what to set and what came."""
-    raw = outcome.raw
-    why = REASONS["other_format" if reason == "text" else reason].format(
-        place=entry.place,
-        key=" or ".join(entry.key_envs) or f"`key_env` of {entry.place}",
-        id=entry.id,
-        format=entry.format,
-        encoding=raw and raw.headers.get("content-encoding"),
-        base_url=set_base_url(entry),
-    )
-    return f"{why} ({outcome.message or (raw and raw.excerpt)})"
-
-
-def if_nobody(entry: ModelEntry) -> str:
-    """Return what a user can do if no server answers."""
-    what = PROVIDERS[entry.provider].if_nobody
-    return f"{what}, or {set_base_url(entry)}; then run the same command again"
-
-
-def set_base_url(entry: ModelEntry) -> str:
-    """Return how a user corrects the base URL of an entry."""
-    provider = PROVIDERS[entry.provider]
-    if entry.base_url is not None or provider.base_url_env is None:
-        return f"correct `base_url` of {entry.place}"
-    path = urlsplit(provider.base_url).path
-    ending = f" (with {path} at its end)" if path else ""
-    return f"set {provider.base_url_env} to the base URL of the service{ending}, or unset it"

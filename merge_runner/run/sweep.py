@@ -39,9 +39,10 @@ from merge_runner.errors import (
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LONG_WAIT_S
-from merge_runner.llm.http_outcome import TransportFailure, if_nobody, set_base_url
+from merge_runner.llm.http_outcome import TransportFailure
 from merge_runner.llm.kinds import counted, recorded_values
 from merge_runner.llm.ledger import Ledger, scopes
+from merge_runner.llm.refusals import if_nobody, set_base_url
 from merge_runner.paths import DEFAULT_DB, SHIPPED_RECORDINGS, command_at
 from merge_runner.records import ReplayMiss, TrialRecord, TrialSpec, canonical_json
 from merge_runner.registry import using

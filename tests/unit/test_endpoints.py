@@ -15,8 +15,8 @@ from merge_runner.config import (
 from merge_runner.errors import UsageError
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import url_of
-from merge_runner.llm.http_outcome import if_nobody
 from merge_runner.llm.models import read_models, shutdown_notes, with_parameter
+from merge_runner.llm.refusals import if_nobody
 from tests.support.harness import PROJECT
 
 REGISTRY = PROJECT / "experiments/models.toml"

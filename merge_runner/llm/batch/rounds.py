@@ -35,10 +35,11 @@ from merge_runner.errors import (
     RecordingError,
     TrialSuspended,
 )
-from merge_runner.llm.batch.providers import BatchFailed, BatchService, BatchStatus
+from merge_runner.llm.batch.service import BatchFailed, BatchService, BatchStatus
 from merge_runner.llm.budget import USED_UP, PaidAttempt
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.http_outcome import AttemptOutcome, backoff_s, judge
+from merge_runner.llm.delays import backoff_s
+from merge_runner.llm.http_outcome import AttemptOutcome, judge
 from merge_runner.records import ChatRequest
 
 # The prefix of names in the cache.

@@ -13,8 +13,8 @@ from merge_runner.emulator.driver import answer
 from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
+from merge_runner.llm.delays import FIRST_BACKOFF_S, LONGEST_BACKOFF_S, backoff_s
 from merge_runner.llm.http import HttpTransport
-from merge_runner.llm.http_outcome import FIRST_BACKOFF_S, LONGEST_BACKOFF_S, backoff_s
 from merge_runner.llm.limiter import Limiter
 from merge_runner.records import CallFailed, Slot
 from tests.support.scenarios import CASES, ScenarioPlan, playing

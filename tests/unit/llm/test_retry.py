@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import pytest
 
-from merge_runner.llm.http_outcome import backoff_s
+from merge_runner.llm.delays import backoff_s
 from merge_runner.llm.limiter import Limiter
 from merge_runner.records import CallFailed
 from tests.support.clients import answer, error, slot

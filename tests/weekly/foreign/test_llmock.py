@@ -30,7 +30,7 @@ BACKOFF_S = 0.05  # a tenth of ours, so that tests end soon
 async def client_of(llmock, tmp_path, monkeypatch):
     """Makes clients of LLMock, one for each format and model."""
     monkeypatch.setenv("SSL_CERT_DIR", str(tmp_path))  # nothing here speaks TLS
-    monkeypatch.setattr("merge_runner.llm.http_outcome.FIRST_BACKOFF_S", BACKOFF_S)
+    monkeypatch.setattr("merge_runner.llm.delays.FIRST_BACKOFF_S", BACKOFF_S)
     cache = ResponseCache(tmp_path / "responses")
     transports = {
         wire: HttpTransport(Endpoint("openai", wire, llmock.base_url(name), {}), connections=16)

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from merge_runner.config import ModelEntry, Price
 from merge_runner.errors import CacheFailed, EndpointRefused, ProviderDown, QuotaExhausted
-from merge_runner.llm.batch.providers import BatchFailed, BatchStatus
 from merge_runner.llm.batch.rounds import Rounds
+from merge_runner.llm.batch.service import BatchFailed, BatchStatus
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
