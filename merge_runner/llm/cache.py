@@ -192,7 +192,7 @@ class ResponseCache:
         kept.
         """
         entries = list(entries)
-        aside = [partial(self.set_damage_aside, entry.request.key) for entry in entries]
+        aside = [partial(self.quarantine, entry.request.key) for entry in entries]
         kept = [partial(self.keep, entry) for entry in entries]
         others = [partial(self.remove, _UNANSWERED + entry.request.key) for entry in entries]
         others += [partial(self.keep_attempts, *each) for each in tried]
@@ -313,7 +313,7 @@ class ResponseCache:
             try:
                 return self._kept(key) or entry
             except RecordingError:
-                self._move_aside(key, execute)
+                self._quarantine_row(key, execute)
                 execute(_ADD, (key, text))
         if len(entry.attempts) > 1:
             self._texts.delete(_UNANSWERED + key)
@@ -323,7 +323,7 @@ class ResponseCache:
         """Keep the attempts at a call that has no answer yet; an operation."""
         self.replace(_UNANSWERED + key, ATTEMPTS.dump_json(attempts).decode(), execute)
 
-    def set_damage_aside(self, key: str, execute: Execute) -> list[str]:
+    def quarantine(self, key: str, execute: Execute) -> list[str]:
         """Move a damaged entry or list of attempts to quarantine as it is; an operation.
 
         Returns their names.
@@ -334,10 +334,10 @@ class ResponseCache:
                 check(key)
             except RecordingError:
                 damaged.append(name)
-                self._move_aside(name, execute)
+                self._quarantine_row(name, execute)
         return damaged
 
-    def _move_aside(self, name: str, execute: Execute) -> None:
+    def _quarantine_row(self, name: str, execute: Execute) -> None:
         """Rename a row, whatever it holds; an operation."""
         aside = _DAMAGED + name
         aside += f" {len(before) + 1}" if (before := self.names(aside)) else ""

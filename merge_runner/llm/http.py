@@ -81,7 +81,8 @@ class HttpTransport:
         self._most_bytes = most_bytes
         keys = (value.removeprefix("Bearer ") for value in endpoint.auth_headers.values())
         secrets = {*keys, *proxy_secrets()}
-        self._mask = Mask(secret for secret in secrets if len(secret) >= SHORTEST_SECRET)
+        secrets = {secret for secret in secrets if len(secret) >= SHORTEST_SECRET}
+        self._has_secrets, self._mask = bool(secrets), Mask(secrets)
         self.doubted = False
         self._answers_named = False
         # Each id is a UUID, as some servers demand (llama-cpp-python): a random part, this
@@ -164,7 +165,9 @@ class HttpTransport:
         headers = dict(reply.headers.items())  # httpx has their names in lower case
         # As UTF-8, the encoding of JSON, whatever a header says. A provider may echo the key in an
         # error; it must not get into a log or a database.
-        text = self._mask(body.decode("utf-8-sig", errors="replace"))
+        text = body.decode("utf-8-sig", errors="replace")
+        if self._has_secrets:
+            text = self._mask(text)
         return RawReply(reply.status_code, headers, text)
 
     def _failure(self, error: Exception) -> TransportFailure:

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+from dataclasses import replace
 from decimal import Decimal
 from functools import partial
+from typing import TYPE_CHECKING
 
 from merge_runner.config import ModelEntry, Price
+from merge_runner.llm.http_outcome import may_be_charged
 from merge_runner.records import Usage
+
+if TYPE_CHECKING:
+    from merge_runner.llm.endpoint_state import EndpointState
+    from merge_runner.llm.sender import Sent
 
 # The provider names of genai-prices where they differ from ours.
 GENAI_PRICES_PROVIDER = {"gemini": "google"}
@@ -50,6 +57,43 @@ def cost_usd(entry: ModelEntry, usage: Usage, tier: str | None = None) -> float 
         return float(calculate().total_price)
     except LookupError:
         return None
+
+
+def attempt_usd(
+    sent: Sent, worst: Usage, endpoint: EndpointState, price_factor: float
+) -> float | None:
+    """Return the cost of an attempt by its usage, which an error may have too; None: unknown.
+
+    Output beyond the cap is billed even where the server does not report the input.
+    """
+    outcome, entry = sent.outcome, endpoint.entry
+    raw, usage = outcome.raw, outcome.reading.usage
+    if entry.price == "free":
+        return 0.0
+    if raw is None:
+        return None if outcome.charged else 0.0
+    if sent.took_s is None and raw.status != 200 and usage == Usage():
+        return 0.0  # a failed request of a batch is not billed
+    usd: float | None
+    if usage.input_tokens and usage.output_tokens is not None:
+        usd = cost_usd(entry, usage, outcome.reading.service_tier)
+    elif (usage.output_tokens or 0) > entry.max_output_tokens:
+        most = replace(worst, output_tokens=usage.output_tokens)
+        usd = cost_usd(entry, most, outcome.reading.service_tier)
+    else:
+        # Where no model ever answered, a web page is that of another server.
+        stray = raw.status == 200 and raw.is_web_page and not endpoint.has_answered
+        usd = None if may_be_charged(raw, endpoint.identity) and not stray else 0.0
+    return usd and usd * price_factor
+
+
+def worst_case(entry: ModelEntry, body: str) -> tuple[Usage, float]:
+    """Return an upper bound of the tokens of a request, and their cost in USD."""
+    # No tokeniser makes more tokens than bytes.
+    worst = Usage(input_tokens=len(body.encode()), output_tokens=entry.max_output_tokens)
+    tier = entry.parameters.get("service_tier")
+    in_tier_usd = cost_usd(entry, worst, tier) if isinstance(tier, str) else None
+    return worst, max(cost_usd(entry, worst) or 0.0, in_tier_usd or 0.0)
 
 
 def underpriced_tiers(entry: ModelEntry) -> set[str]:

@@ -100,7 +100,7 @@ def stock(cache, folder):
 
 def aside(cache, key):
     """The names of what is damaged of a call, and set aside."""
-    return cache.run_now([partial(cache.set_damage_aside, key)])[0]
+    return cache.run_now([partial(cache.quarantine, key)])[0]
 
 
 texts = st.text(st.characters(exclude_categories=["Cs"]))

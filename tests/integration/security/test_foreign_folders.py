@@ -85,7 +85,7 @@ def test_a_file_that_a_row_names_is_neither_read_nor_deleted(folder, mode, leads
     cache = ResponseCache(folder)
     with pytest.raises(RecordingError, match="not ours"):
         cache.get(key)
-    assert cache.run_now([partial(cache.set_damage_aside, key)]) == [[key]]
+    assert cache.run_now([partial(cache.quarantine, key)]) == [[key]]
     assert cache.put_now([FIRST]) == [FIRST]
     assert list(cache.entries()) == [SECOND, FIRST]
     cache.run_now([partial(cache.remove, f"damaged {key}")])
