@@ -22,9 +22,9 @@ from functools import partial
 from operator import itemgetter
 
 from merge_runner.errors import TrialSuspended
-from merge_runner.llm.cache import both
 from merge_runner.llm.durable import Execute, ResultT
 from merge_runner.llm.ledger import TOLERANCE_USD, CallLabel, Ledger
+from merge_runner.llm.store import both
 from merge_runner.records import Attempt
 
 # Deadlock breaker: an older trial may wait for a call of a younger one, which waits for money.

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from merge_runner.errors import MergeRunnerError, RecordingError, SweepStopped
 from merge_runner.llm.attempts import Meter, record
 from merge_runner.llm.budget import Budget, Reservation
-from merge_runner.llm.cache import Attempts, CachedCall, ResponseCache
+from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.call import Call, Calls, Wait
 from merge_runner.llm.delays import TryAgain
 from merge_runner.llm.endpoint_state import EndpointState
@@ -26,6 +26,7 @@ from merge_runner.llm.probe import Probe
 from merge_runner.llm.recorded import RecordedReplies
 from merge_runner.llm.retry import Retry
 from merge_runner.llm.sender import DirectSender, Sender
+from merge_runner.llm.store import Attempts, CachedCall
 from merge_runner.records import Attempt, ChatReply, ChatRequest, Slot
 
 if TYPE_CHECKING:

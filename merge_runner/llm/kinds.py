@@ -12,8 +12,9 @@ from functools import partial
 from typing import NamedTuple
 
 from merge_runner.errors import RecordingError
-from merge_runner.llm.cache import CachedCall, ResponseCache, text_of
+from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.durable import Execute
+from merge_runner.llm.store import CachedCall, text_of
 from merge_runner.records import DAMAGED, Attempt, ChatRequest, is_scripted, without_prompt
 
 BATCH = 1_000

@@ -19,9 +19,9 @@ from datetime import UTC, datetime
 from typing import Any
 
 from merge_runner.errors import CacheFailed, RecordingError, UsageError
-from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.cache_file import FILE
 from merge_runner.llm.durable import Execute, Rows
+from merge_runner.llm.store import CallStore
 from merge_runner.records import Attempt
 
 TOLERANCE_USD = 1e-9  # sums of floats
@@ -109,7 +109,7 @@ class Spending:
         return ", ".join(f"{driver} up to {ratio:.2f} times as much" for driver, ratio in ratios)
 
 
-def scopes(store: ResponseCache) -> list[str]:
+def scopes(store: CallStore) -> list[str]:
     """Return the names of all ledgers in a cache."""
     rows = store.rows("SELECT scope FROM spent UNION SELECT scope FROM open ORDER BY 1")
     return [scope for (scope,) in rows]
@@ -125,7 +125,7 @@ class Ledger:
 
     is_shared_out = False  # a coordinator reserves each attempt first
 
-    def __init__(self, store: ResponseCache, scope: str, cap: Cap | None = None) -> None:
+    def __init__(self, store: CallStore, scope: str, cap: Cap | None = None) -> None:
         self.store = store
         self.scope = scope
         self.cap = cap

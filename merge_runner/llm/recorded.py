@@ -9,8 +9,8 @@ from merge_runner.config import ModelEntry
 from merge_runner.drivers.language_model import Question
 from merge_runner.errors import RecordingError
 from merge_runner.llm.attempts import Meter
-from merge_runner.llm.cache import CachedCall
 from merge_runner.llm.formats.wire import WireFormat, read_reply
+from merge_runner.llm.store import CachedCall
 from merge_runner.records import (
     ANSWERS,
     CallFailed,

@@ -29,8 +29,9 @@ import duckdb
 from pydantic import BaseModel, ConfigDict, JsonValue, field_validator
 
 from merge_runner.errors import RecordingError, UsageError
-from merge_runner.llm.cache import ATTEMPTS, CachedCall, Overlay, ResponseCache
+from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.kinds import kinds_of
+from merge_runner.llm.store import ATTEMPTS, CachedCall, Overlay
 from merge_runner.paths import refuse_another_kind
 from merge_runner.records import (
     DAMAGED,

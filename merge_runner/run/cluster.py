@@ -41,11 +41,12 @@ from merge_runner.errors import (
     UsageError,
 )
 from merge_runner.llm.attempts import Meter
-from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.call import Calls, Wait
 from merge_runner.llm.durable import Rows
 from merge_runner.llm.ledger import CallLabel, Cap, Ledger
 from merge_runner.llm.limiter import Limiter
+from merge_runner.llm.store import CachedCall
 from merge_runner.records import Attempt, TrialRecord, TrialSpec, Usage
 from merge_runner.registry import plugin_sources, using
 from merge_runner.run.clients import live_clients

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 
 from merge_runner.errors import CacheFailed, RecordingError, TrialSuspended, UsageError
 from merge_runner.llm.attempts import Meter
-from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.ledger import CallLabel, Ledger
+from merge_runner.llm.store import CachedCall
 from merge_runner.records import Attempt, Slot, make_request
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import make_plan

@@ -19,9 +19,10 @@ from hypothesis import strategies as st
 
 from merge_runner.errors import MergeRunnerError, RecordingError, UsageError
 from merge_runner.llm import kinds
-from merge_runner.llm.cache import CachedCall, ResponseCache, import_folder
+from merge_runner.llm.cache import ResponseCache, import_folder
 from merge_runner.llm.cache_file import TABLES, TextDisk
 from merge_runner.llm.ledger import Ledger
+from merge_runner.llm.store import CachedCall
 from merge_runner.records import Attempt, ChatRequest, Slot, Usage, make_request
 from tests.support.cases import cases
 from tests.support.json_values import paths, replaced

@@ -12,7 +12,8 @@ import duckdb
 import pytest
 
 from merge_runner.errors import RecordingError, UsageError
-from merge_runner.llm.cache import CachedCall, ResponseCache, import_folder
+from merge_runner.llm.cache import ResponseCache, import_folder
+from merge_runner.llm.store import CachedCall
 from merge_runner.records import Attempt
 from tests.support.raw_server import a_request
 

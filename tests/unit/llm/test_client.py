@@ -10,11 +10,12 @@ import pytest
 from merge_runner.drivers.language_model import Question
 from merge_runner.errors import EndpointRefused, QuotaExhausted, TrialSuspended, UsageError
 from merge_runner.llm.attempts import Meter
-from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.call import Calls
 from merge_runner.llm.http_outcome import TransportFailure
 from merge_runner.llm.ledger import CallLabel
 from merge_runner.llm.limiter import Limiter, Pause
+from merge_runner.llm.store import CachedCall
 from merge_runner.records import Attempt, CallFailed, ReplayMiss, Usage
 from merge_runner.run.cluster import Desk, ToldLedger
 from tests.support.clients import PRICE, answer, begun, error, raw, slot, ticks

@@ -23,8 +23,9 @@ from hypothesis.stateful import (
 )
 
 from merge_runner.errors import TrialSuspended
-from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.ledger import CallLabel, Cap, Ledger
+from merge_runner.llm.store import CachedCall
 from merge_runner.records import Attempt, Slot, make_request
 from tests.support.clients import budget_of
 
