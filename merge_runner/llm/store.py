@@ -32,7 +32,7 @@ from merge_runner.llm.durable import BatchWriter, Execute, ModelLocks, Operation
 from merge_runner.records import DAMAGED, Attempt, ChatRequest, check_call
 
 if TYPE_CHECKING:
-    from merge_runner.llm.kinds import Kinds
+    from merge_runner.llm.templates import TemplateCounts
 
 CHECKSUM_LENGTH = 32
 Attempts = tuple[Attempt, ...]
@@ -82,7 +82,7 @@ class _Stored:
 
 
 _STORED: TypeAdapter[_Stored] = TypeAdapter(_Stored)
-Overlay = tuple[Mapping[str, CachedCall], "Kinds"]
+Overlay = tuple[Mapping[str, CachedCall], "TemplateCounts"]
 """A recording: its entries by key, and how many there are of each kind."""
 
 

@@ -40,10 +40,10 @@ from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.call import Calls
 from merge_runner.llm.http_outcome import TransportFailure
-from merge_runner.llm.kinds import counted, recorded_values
 from merge_runner.llm.ledger import Cap, Ledger, scopes
 from merge_runner.llm.probe import LONG_WAIT_S
 from merge_runner.llm.refusals import if_nobody, set_base_url
+from merge_runner.llm.templates import answer_counts, recorded_values
 from merge_runner.paths import DEFAULT_DB, SHIPPED_RECORDINGS, command_at
 from merge_runner.records import ReplayMiss, TrialRecord, TrialSpec, canonical_json
 from merge_runner.registry import using
@@ -139,7 +139,10 @@ async def play(
 
 def _has_replies(cache: ResponseCache, plan: Plan) -> bool:
     """Whether a model of a plan is recorded, or it has none; what is damaged may be of it."""
-    models, (_, kinds) = {entry.id or UNNAMED for entry in plan.entries.values()}, counted(cache)
+    models, (_, kinds) = (
+        {entry.id or UNNAMED for entry in plan.entries.values()},
+        answer_counts(cache),
+    )
     whole = sum(answers.answers for answers in kinds.values())
     return any(kind.model in models for kind in kinds) or cache.number > whole or not models
 

@@ -1,7 +1,7 @@
-"""How many calls a cache has answered, by kind of request, so that no run reads them all to begin.
+"""Counts of a cache's answered calls by request template: all of a request but prompt and slot.
 
-The counts lie in a table of the cache's file. Calls that were answered since it was written are
-added when it is next asked for.
+A run needs them when it begins, and need not read all calls for that. The counts lie in a table of
+the cache's file; calls that were answered since it was written are added when it is next read.
 """
 
 from __future__ import annotations
@@ -38,11 +38,8 @@ output_tokens = output_tokens + excluded.output_tokens, last = max(last, exclude
 """  # noqa: S608 # constants
 
 
-class Kind(NamedTuple):
-    """Requests that are equal but for their prompt and slot.
-
-    ``body`` is without the prompt; ``own`` says that no stand-in answered in the model's name.
-    """
+class RequestTemplate(NamedTuple):
+    """A request without its prompt and slot; ``own``: no mock model answered in its name."""
 
     provider: str
     endpoint: str
@@ -52,74 +49,80 @@ class Kind(NamedTuple):
     own: bool
 
 
-class Answers(NamedTuple):
-    """How many answers there are, how many of them name their tokens, and the sums of these."""
+class AnswerCounts(NamedTuple):
+    """Number of answers, of those that report their tokens, and the sums of these."""
 
     answers: int = 0
     measured: int = 0
     input_tokens: int = 0
     output_tokens: int = 0
 
-    def plus(self, other: Answers) -> Answers:
-        """Return the counts of both."""
-        return Answers(*map(sum, zip(self, other, strict=True)))
+    def plus(self, other: AnswerCounts) -> AnswerCounts:
+        """Return the sum of both."""
+        return AnswerCounts(*map(sum, zip(self, other, strict=True)))
 
 
-Kinds = dict[Kind, Answers]
+TemplateCounts = dict[RequestTemplate, AnswerCounts]
 
 
-def kinds_of(calls: Iterable[tuple[ChatRequest, Attempt]]) -> Kinds:
-    """Count answered calls: their requests and last attempts."""
-    found: Kinds = {}
+def count_by_template(calls: Iterable[tuple[ChatRequest, Attempt]]) -> TemplateCounts:
+    """Count answered calls, given as requests and last attempts."""
+    counts: TemplateCounts = {}
     for request, last in calls:
         own = request.provider == "emulator" or not is_scripted(request, last)
-        body = without_prompt(request.body)
-        kind = Kind(request.provider, request.endpoint, request.model, request.path, body, own)
+        template = RequestTemplate(
+            request.provider,
+            request.endpoint,
+            request.model,
+            request.path,
+            without_prompt(request.body),
+            own,
+        )
         read, written = last.usage.input_tokens, last.usage.output_tokens
-        one = Answers(1) if read is None or written is None else Answers(1, 1, read, written)
-        found[kind] = found.get(kind, Answers()).plus(one)
-    return found
+        answer = AnswerCounts(1)
+        if read is not None and written is not None:
+            answer = AnswerCounts(1, 1, read, written)
+        counts[template] = counts.get(template, AnswerCounts()).plus(answer)
+    return counts
 
 
-def counted(cache: ResponseCache) -> tuple[Kinds, Kinds]:
-    """Return how many calls the recording and the folder have answered, by kind of request.
-
-    Those of the folder since it was last asked for are counted first.
-    """
+def answer_counts(cache: ResponseCache) -> tuple[TemplateCounts, TemplateCounts]:
+    """Return the counts of the recording and of the folder, whose newer calls are counted first."""
     after = 0
     while after := cache.run_now([partial(_count_newer, after)])[0]:
         pass
     rows = cache.rows("SELECT * FROM kinds")
-    return cache.recording[1], {Kind(*row[:6]): Answers(*row[6:10]) for row in rows}
+    folder = {RequestTemplate(*row[:6]): AnswerCounts(*row[6:10]) for row in rows}
+    return cache.recording[1], folder
 
 
 def _count_newer(after: int, execute: Execute) -> int:
-    """Count some calls that are not counted yet, and whose number is higher; an operation.
+    """Count up to BATCH calls that are not counted yet, with a row id above ``after``.
 
-    No call is ever removed, so that a newer one has a higher number than all before it. Returns the
-    number after which to go on, 0 where there are no more.
+    An operation. No call is ever removed, so newer calls have higher row ids. Returns the row id
+    after which to go on, 0 at the end.
     """
     execute(TABLE)
     ((last,),) = execute("SELECT coalesce(max(last), 0) FROM kinds").fetchall()
     rows = execute(NEWER, (max(last, after), BATCH)).fetchall()
     calls = []
     for _, mode, filename, value in rows:
-        with suppress(RecordingError, *DAMAGED):  # it is told where it is used
+        with suppress(RecordingError, *DAMAGED):  # reported where it is used
             entry = CachedCall.from_json(text_of(mode, filename, value.decode()))
             calls.append((entry.request, entry.attempts[-1]))
     newest = rows[-1][0] if rows else 0
-    for kind, answers in kinds_of(calls).items():
-        execute(ADD, (*kind, *answers, newest))
+    for template, answers in count_by_template(calls).items():
+        execute(ADD, (*template, *answers, newest))
     return newest if len(rows) == BATCH else 0
 
 
 def recorded_values(cache: ResponseCache, name: str, **fields: str) -> set[str]:
-    """Return what ``name`` is in requests with a reply and these ``fields``.
+    """Return the values of ``name`` in templates with these ``fields``.
 
-    They are those of the recording, else of the folder.
+    Those of the recording, else of the folder.
     """
-    for kinds in counted(cache):
-        wanted = [k for k in kinds if all(getattr(k, f) == of for f, of in fields.items())]
-        if wanted:
-            return {getattr(kind, name) for kind in wanted}
+    for counts in answer_counts(cache):
+        matching = [t for t in counts if all(getattr(t, f) == of for f, of in fields.items())]
+        if matching:
+            return {getattr(template, name) for template in matching}
     return set()
