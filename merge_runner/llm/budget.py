@@ -221,8 +221,8 @@ class Budget:
         try:
             while self._queue[0] is not own or not may_go(loop.time() - began_s):
                 changed.clear()
-                # An older trial may wait for our call, or a run of another model, under the same
-                # cap, may free money: nobody here would wake this.
+                # No event reports that an older trial waits for this call, or that a run of another
+                # model under the same cap frees money.
                 try:
                     async with asyncio.timeout(PATIENCE_S):
                         await changed.wait()

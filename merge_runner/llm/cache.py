@@ -1,4 +1,4 @@
-"""The cache of a folder: all recorded calls, listed, imported and quarantined."""
+"""Cache folder: list, import and quarantine recorded calls."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from itertools import islice
 from pathlib import Path
 
 from merge_runner.errors import RecordingError
-from merge_runner.llm.cache_file import FAILURES
+from merge_runner.llm.cache_file import FAILURES, FOREIGN_KEY
 from merge_runner.llm.durable import Execute, Operation
 from merge_runner.llm.store import UNANSWERED, Attempts, CachedCall, CallStore, text_of, verified
 from merge_runner.records import DAMAGED, check_body
 
 BATCH = 1_000
-# A call's key has 64 characters, without a space; another type or a damaged key is told.
+# A call's key has 64 characters, without a space; keys of another type are reported as damaged.
 _IS_CALL = """(
 typeof(key) != 'text' OR raw IS NOT 1 OR length(CAST(key AS BLOB)) = 64 AND NOT instr(key, ' ')
 )"""
@@ -31,7 +31,7 @@ _CALL = "SELECT key, raw, mode, filename, value FROM Cache WHERE rowid = ?"
 
 
 class ResponseCache(CallStore):
-    """The calls of a cache folder and of the recording before it."""
+    """Calls of a cache folder and of a recording."""
 
     def put_now(
         self,
@@ -39,20 +39,19 @@ class ResponseCache(CallStore):
         tried: Iterable[tuple[str, Attempts]] = (),
         money: Iterable[Operation] = (),
     ) -> list[CachedCall]:
-        """Keep entries, and attempts at calls without an answer, in one transaction in this thread.
+        """Store entries, and attempts of calls without an answer, in one transaction here.
 
-        What they cost is settled in it by the operations ``money``. Returns the entries that are
-        kept.
+        The operations ``money`` book their costs in it. Returns the entries that are stored.
         """
         entries = list(entries)
-        aside = [partial(self.quarantine, entry.request.key) for entry in entries]
+        damaged = [partial(self.quarantine, entry.request.key) for entry in entries]
         kept = [partial(self.keep, entry) for entry in entries]
         others = [partial(self.remove, UNANSWERED + entry.request.key) for entry in entries]
         others += [partial(self.keep_attempts, *each) for each in tried]
-        return self.run_now([*aside, *kept, *others, *money])[len(aside) :][: len(kept)]
+        return self.run_now([*damaged, *kept, *others, *money])[len(damaged) :][: len(kept)]
 
     def add_missing(self, entries: Iterable[CachedCall]) -> tuple[int, int]:
-        """Keep the entries that the cache lacks; returns (added, already there)."""
+        """Store the entries that the cache lacks; return (added, already there)."""
         added = seen = 0
         waiting = iter(entries)
         while batch := list(islice(waiting, BATCH)):
@@ -61,23 +60,22 @@ class ResponseCache(CallStore):
         return added, seen - added
 
     def all_unanswered(self) -> dict[str, Attempts]:
-        """Return the attempts at all calls without an answer, by call key."""
+        """Return the attempts of all calls without an answer, by call key."""
         keys = (name.removeprefix(UNANSWERED) for name in self.names(UNANSWERED))
         return {key: self._tried(key) for key in keys}
 
     def entries(self, left_out: list[str] | None = None) -> Iterator[CachedCall]:
-        """Yield all entries, of the folder and of the overlay, each verified.
+        """Yield all verified entries, of the folder and of the recording.
 
-        What is damaged, or none of ours, is left out, and the reason added to ``left_out``.
+        Rows that are damaged, or not written by merge-runner, are left out; the reason is added to
+        ``left_out``.
         """
         try:
             for row in self._reading.execute(_CALLS):
                 try:
                     ((key, raw, *value),) = self.rows(_CALL, *row)
                     if not (raw and isinstance(key, str)):
-                        raise RecordingError(
-                            "the cache holds a key that is no text: it is not ours"
-                        )
+                        raise RecordingError(FOREIGN_KEY)
                     entry = verified(key, text_of(*value))
                     check_body(entry.request.body)
                     yield entry
@@ -89,7 +87,7 @@ class ResponseCache(CallStore):
         yield from self.recording[0].values()
 
     def newest(self, most: int) -> Iterator[CachedCall]:
-        """Yield the calls that the folder has answered last, the newest first, but damaged ones."""
+        """Yield the newest calls of the folder, the newest first; damaged ones are left out."""
         for (key,) in self.rows(_NEWEST, most):
             call = None
             with contextlib.suppress(RecordingError):
@@ -99,13 +97,13 @@ class ResponseCache(CallStore):
 
     @property
     def number(self) -> int:
-        """The number of calls in the folder, with damaged ones."""
+        """Number of calls in the folder, with damaged ones."""
         return int(self.rows(_NUMBER)[0][0])
 
     def quarantine(self, key: str, execute: Execute) -> list[str]:
-        """Move a damaged entry or list of attempts to quarantine as it is; an operation.
+        """Quarantine a damaged entry or list of attempts, unchanged; an operation.
 
-        Returns their names.
+        Returns the names of what was damaged.
         """
         damaged = []
         for name, check in ((key, self._kept), (UNANSWERED + key, self._tried)):
@@ -118,9 +116,9 @@ class ResponseCache(CallStore):
 
 
 def import_folder(folder: Path, cache: ResponseCache) -> tuple[int, int]:
-    """Add what the cache lacks of another folder's replies; returns (added, already there).
+    """Add the replies of another folder that the cache lacks; return (added, already there).
 
-    The folder is only read. Raises RecordingError, when all others are added, if any was damaged.
+    The folder is only read. Raises RecordingError after all others are added, if any was damaged.
     """
     left_out: list[str] = []
     with closing(ResponseCache(folder, read_only=True, before=True)) as source:

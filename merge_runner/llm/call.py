@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Wait:
-    """What a call waits for, and until when (UTC); None: until it happens.
+    """A wait of a call, ``until`` a moment (UTC) or until something happens.
 
-    ``blocked``: only the end of another call can end this wait. ``charged``: the reply may be
-    billed already.
+    ``blocked``: only the end of another call can end it. ``charged``: the reply may be billed
+    already.
     """
 
     what: str
@@ -99,7 +99,7 @@ class Calls:
         return sum(call.askers for call in calls if call.wait and call.wait.blocked)
 
     def wait(self, call: Call, wait: Wait) -> None:
-        """Let a call wait, so that it can be cancelled; raise CallFailed if nobody wants it.
+        """Let a call wait, so that it can be cancelled; raise CallFailed if it is given up.
 
         It is in flight again when its ``wait`` is None.
         """
@@ -108,7 +108,7 @@ class Calls:
         call.wait = wait
 
     def given_up(self, call: Call) -> CallFailed:
-        """Return the error of a call that nobody wants any more."""
+        """Return the error of a call that is given up: no asker is left, or the run stops."""
         why = "the sweep was stopped" if self.stopping else "its trial was left"
         return CallFailed(why, call.request)
 

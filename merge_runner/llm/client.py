@@ -120,7 +120,7 @@ class LlmClient:
         self.calls.under_way[request.key] = call
 
         def forget(done: asyncio.Task[ChatReply]) -> None:
-            if self.calls.under_way[request.key] is call:  # it is not asked anew meanwhile
+            if self.calls.under_way[request.key] is call:  # no new call has replaced it
                 del self.calls.under_way[request.key]
             if not done.cancelled():
                 done.exception()  # retrieved, since all who asked may be gone by now

@@ -1,4 +1,4 @@
-"""How long to wait before the next attempt: as the server asks, and by exponential backoff."""
+"""Waits before the next attempt: the server's delay, or exponential backoff."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ if TYPE_CHECKING:
     from tenacity import RetryCallState
 
 FIRST_BACKOFF_S, LONGEST_BACKOFF_S = 0.5, 60.0
-# In 2001: a smaller number of s is no moment.
+# In 2001: a smaller number is a duration, not a Unix time.
 SMALLEST_UNIX_S = 1e9
 _UNIT_S = {"ms": 0.001, "milli": 0.001, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 # 1.574s and 6m0s, but also 5 minutes.
 _PART = r"(\d+(?:\.\d+)?)\s*(ms|milli|[smhd])(?:ec|sec|econd|second|in|inute|r|our|ay)?s?(?![a-z])"
 _IN_TEXT = re.compile(rf"(?:try again|retry) (?:in|after) ({_PART}(?:(?:,|\s|and)*{_PART})*)", re.I)
-# A header that is sent several times has all its values in one, and a date has a comma of its own.
+# Repeated headers are joined by commas, and a date contains a comma.
 _LISTED = re.compile("[A-Z][a-z]{2}, [^,]+|[^,]+")
 
 
 def server_delay_s(
     error: ServerError, wire: WireFormat, now: datetime | None = None
 ) -> float | None:
-    """Return the delay in s that a failed reply asks for, None if it says nothing usable.
+    """Return the delay in s that a failed reply asks for, None without a usable one.
 
     Sources in order: ``retry-after-ms``, ``retry-after`` (seconds or HTTP date), a member of the
     error, "try again in 1.574s" or "retry after 5 minutes" in the message, and for a 429
     ``x-ratelimit-reset``. Of several values of a header the longest counts.
     """
-    told = _IN_TEXT.search(error.message)
-    parts = re.findall(_PART, told[1], re.I) if told else []
+    in_text = _IN_TEXT.search(error.message)
+    parts = re.findall(_PART, in_text[1], re.I) if in_text else []
     candidates = (
         _longest_s(error.headers.get("retry-after-ms", ""), now) / 1000,
         _longest_s(error.headers.get("retry-after", ""), now),
@@ -64,9 +64,9 @@ def _longest_s(header: str, now: datetime | None) -> float:
 
 
 def _reset_s(error: ServerError, now: datetime | None) -> float:
-    """Return the time in s until a used-up limit is reset, 0 if it is not said.
+    """Return the time in s until a used-up limit is reset, 0 if it is unknown.
 
-    The header is a number of seconds, or a moment as Unix time in s or ms, as OpenRouter has it.
+    The header is a number of seconds, or a Unix time in s or ms, as at OpenRouter.
     """
     reset = error.headers.get("x-ratelimit-reset", "")
     if error.headers.get("x-ratelimit-remaining", "0") != "0" or not reset.isdecimal():
@@ -87,7 +87,7 @@ def utc_after(seconds: float) -> str:
 
 
 class TryAgain(MergeRunnerError):
-    """An attempt failed in a way that passes; ``delay_s`` is what the server asked for."""
+    """A transient failure of an attempt; ``delay_s`` is the delay that the server asks for."""
 
     def __init__(self, message: str, delay_s: float | None = None) -> None:
         super().__init__(message)
@@ -95,8 +95,8 @@ class TryAgain(MergeRunnerError):
 
 
 def backoff_s(attempts: int) -> float:
-    """Return the wait in s after so many failed attempts, without jitter."""
-    # The exponent is bounded: after a thousand attempts the power would fit in no float.
+    """Return the wait in s after a number of failed attempts, without jitter."""
+    # Bounded: after a thousand attempts the power would overflow.
     return float(min(FIRST_BACKOFF_S * 2 ** min(attempts - 1, 10), LONGEST_BACKOFF_S))
 
 
@@ -104,7 +104,7 @@ def next_wait_s(state: RetryCallState) -> float:
     """Return the wait in s after a failed attempt: the backoff, or the server's longer one."""
     error = state.outcome.exception() if state.outcome else None
     assert isinstance(error, TryAgain)
-    # The jitter lets calls that failed together, as when a server restarts, not return together.
+    # Calls that failed together, as when a server restarts, do not return together.
     jitter_s = random.uniform(0, FIRST_BACKOFF_S)  # noqa: S311 # no secret
     return max(
         error.delay_s or 0, min(backoff_s(state.attempt_number) + jitter_s, LONGEST_BACKOFF_S)

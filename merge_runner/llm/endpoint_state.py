@@ -1,4 +1,4 @@
-"""What a run knows of an endpoint, and the error that follows from an attempt there."""
+"""State of an endpoint in a run, and the error that follows from an attempt there."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""What a raw HTTP reply means: an answer, something to try again, or a reason to stop.
+"""Outcome of an attempt, from a raw HTTP reply: an answer, a retry, or a reason to stop.
 
-``judge`` says what a reply is by itself; what follows for its call and its run, the client decides.
+``judge`` classifies a reply by itself; ``EndpointState`` decides what follows for its call and run.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ if TYPE_CHECKING:
 
 Action = Literal["accept", "retry", "fail", "quota", "refused"]
 EXCERPT = 200
-# Azure charges for a prompt that it has looked at, also where it then refuses it.
+# Azure bills a prompt that it has checked, even where it then refuses it.
 CHARGED_ERRORS = frozenset({"content_filter", "context_length_exceeded"})
 TOO_LATE = frozenset({408, 499, 504, 524})
 
-# What a status means unless a format knows better; any other 5xx passes, and all else means a bad
-# request.
+# Meaning of a status unless a format overrides it; any other 5xx is transient, and any other status
+# means a bad request.
 STATUSES = {
     401: "not_allowed",
     402: "quota_exhausted",
@@ -54,7 +54,7 @@ STATUSES = {
     # Not implemented, another HTTP version, a network that wants a login.
     **dict.fromkeys((501, 505, 511), "bad_request"),
 }
-# The status that a named error within a 200 stands for, where it has no number; the first counts.
+# Status of a named error within a 200 that has no number; the first match counts.
 WITHIN = {
     **dict.fromkeys(("rate_limit_exceeded", "rate_limit_error", "base_resp 1002"), 429),
     "RESOURCE_EXHAUSTED": 429,
@@ -67,7 +67,7 @@ WITHIN = {
     **dict.fromkeys(("server_error", "api_error", "internal_server_error", "INTERNAL"), 500),
     **dict.fromkeys(("base_resp 1000", "base_resp 1013"), 500),
 }
-# What to do about it; anything else fails its call.
+# What follows; anything else fails its call.
 ACTIONS: dict[str, Action] = {
     "refusal": "accept",
     "quota_exhausted": "quota",
@@ -84,7 +84,7 @@ _EVENTS = re.compile(r"\s*(?:(?:id|retry)?:[^\n]*\n\s*)*(?:data|event):", re.ASC
 
 @dataclass(frozen=True)
 class RawReply:
-    """A reply as received: ``headers`` have lower-case names, ``body`` is the text."""
+    """A reply as received: ``headers`` with lower-case names, and the text of its ``body``."""
 
     status: int
     headers: Mapping[str, str]
@@ -92,9 +92,9 @@ class RawReply:
 
     @cached_property
     def payload(self) -> object:
-        """The body as JSON, read once; None where it is none.
+        """The body as JSON, parsed once; None if it is not JSON.
 
-        An error is taken out of the list into which Gemini may wrap it.
+        Gemini may wrap an error in a list, which is removed.
         """
         try:
             payload: object = json.loads(self.body)
@@ -111,12 +111,12 @@ class RawReply:
 
     @property
     def is_web_page(self) -> bool:
-        """Whether a web site answers: no service of any format sends this as an answer."""
+        """Whether the body is HTML, which no API sends."""
         return self.body.lstrip("\ufeff \t\r\n")[:9].lower().startswith(("<!doctype", "<html"))
 
     @property
     def kind(self) -> str:
-        """The kind of a body that is no answer, by the names of REASONS, or ``text``."""
+        """Kind of a body that is no answer: a name of ``refusals.REASONS``, or ``text``."""
         if self.payload is not None:
             return "other_format"
         if self._is("content-type", "text/event-stream") or _EVENTS.match(self.body):
@@ -128,7 +128,7 @@ class RawReply:
 
     @property
     def excerpt(self) -> str:
-        """The content type and the beginning of the body, in one line."""
+        """Content type and beginning of the body, in one line."""
         words = " ".join(self.body[:EXCERPT].split()) or "an empty body"
         return f"{self.headers.get('content-type', 'no content type')}: {words}"
 
@@ -137,9 +137,9 @@ class RawReply:
 
 
 class TransportFailure(MergeRunnerError):
-    """An attempt brought no reply; ``outcome`` names the failure in the calls table.
+    """An attempt without a reply; ``outcome`` names the failure in the table of calls.
 
-    ``sent`` is False where the request was certainly never sent, so that nobody can charge for it.
+    ``sent`` is False where the request was certainly not sent, so that it cannot be billed.
     ``action`` and ``reason`` are those of an AttemptOutcome.
     """
 
@@ -161,13 +161,12 @@ class TransportFailure(MergeRunnerError):
 
 @dataclass(frozen=True, slots=True)
 class AttemptOutcome:
-    """What an attempt brought, and what to do about it.
+    """Outcome of an attempt, by its ``name`` in the table of calls, and the action that follows.
 
-    ``accept`` it as the answer, ``retry`` after ``delay_s`` (all calls of the key wait where
-    ``pause``), ``fail`` this call, or stop the sweep because the ``quota`` is exhausted or the
-    endpoint ``refused`` the key or the model. ``name`` is its outcome in the calls table.
-    Without a ``raw`` reply the attempt may have been ``charged`` all the same, and has the
-    ``reason`` of ``reason_of`` where it is known.
+    ``accept`` it as the answer, ``retry`` after ``delay_s`` (``pause``: all calls of the key wait),
+    ``fail`` this call, or stop the sweep because the ``quota`` is exhausted or the endpoint has
+    ``refused`` the key or the model. Without a ``raw`` reply the attempt may have been ``charged``
+    all the same; then ``reason`` is that of ``refusals.reason_of``, if it is known.
     """
 
     action: Action
@@ -184,9 +183,9 @@ class AttemptOutcome:
 def may_be_charged(raw: RawReply, endpoint: str) -> bool:
     """Return whether a reply without usage may have been billed.
 
-    A refusal before any work is not, nor an error with the members that a provider documents for
-    its own, where ``endpoint`` says that its own host answered. That of a gateway, or one for want
-    of time, may follow an answer that was made.
+    A refusal before any work is not, nor an error in the documented form of a provider whose own
+    host answered, by ``endpoint``. An error of a gateway, or a timeout, may follow a generated
+    answer.
     """
     own = PROVIDERS.get(endpoint)
     if raw.status < 300 or raw.status in TOO_LATE or '"usage' in raw.body:
@@ -205,17 +204,17 @@ def judge(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
     body = as_dict(raw.payload)
     reading = read_reply(wire, body)
     if raw.status != 200:
-        reading = Reading("error", usage=reading.usage)  # which is billed
+        reading = Reading("error", usage=reading.usage)  # usage is billed
         return replace(judge_error(raw.error, wire), reading=reading, raw=raw)
     if reading.outcome not in ("error", "empty"):
         return AttemptOutcome("accept", reading.outcome, reading=reading, raw=raw)
-    told = is_error(body.get("error")) or is_error(at(body, "choices.0.error"))
-    if reading.outcome == "error" and not told and reading.finish_reason in BROKEN_OFF:
+    has_error = is_error(body.get("error")) or is_error(at(body, "choices.0.error"))
+    if reading.outcome == "error" and not has_error and reading.finish_reason in BROKEN_OFF:
         why = f"the server broke its answer off (finish reason {reading.finish_reason})"
         return AttemptOutcome("retry", "server_error", why, reading, raw=raw)
     is_nothing = reading.outcome == "empty" and not any(body.get(name) for name in wire.members)
     # Also an error in another format's form, or in MiniMax's.
-    failed = told or as_dict(body.get("base_resp")).get("status_code")
+    failed = has_error or as_dict(body.get("base_resp")).get("status_code")
     if reading.outcome == "error" or (is_nothing and failed):
         error = replace(raw.error, status=status_within(raw.error))
         reading = replace(reading, outcome="error")
@@ -227,22 +226,22 @@ def judge(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
 
 
 def status_within(error: ServerError) -> int:
-    """Return the status that an error within a 200 stands for: 400 or 500 if nobody knows it."""
+    """Return the status of an error within a 200; by default 400 if it has names, else 500."""
     numbers = [int(name) for name in error.names if re.fullmatch("[45][0-9][0-9]", name)]
     named = [status for name, status in WITHIN.items() if name in error.names]
     return next(iter([*numbers, *named]), 400 if error.names else 500)
 
 
 def judge_error(error: ServerError, wire: WireFormat) -> AttemptOutcome:
-    """Classify an error, whatever was asked for."""
+    """Classify an error, of a call or of a batch mode."""
     default = "server_error" if 500 <= error.status < 600 else "bad_request"
     name = wire.meaning(error) or known_meaning(error) or STATUSES.get(error.status, default)
     action = ACTIONS.get(name, "fail")
-    tells = action == "retry" or (action == "quota" and is_per_day(error))
+    may_delay = action == "retry" or (action == "quota" and is_per_day(error))
     return AttemptOutcome(
         action,
         name,
         f"HTTP {error.status}: {error.message}",
-        delay_s=server_delay_s(error, wire) if tells else None,
+        delay_s=server_delay_s(error, wire) if may_delay else None,
         pause=name == "rate_limited",
     )

@@ -119,7 +119,7 @@ class Ledger:
     """Spending of one sweep, named ``scope`` in the cache, under a ``cap``; None: no limit.
 
     ``spending`` is as last summed; ``committed_usd`` includes the other ledgers under the cap.
-    Several processes may run the sweep, so every transaction sums anew. The ledger of a free model
+    Several processes may run the sweep, so every transaction sums first. The ledger of a free model
     has no name and keeps no record.
     """
 
@@ -131,7 +131,7 @@ class Ledger:
         self.cap = cap
         self.spending = Spending()
         self.committed_usd = 0.0
-        self._others = json.dumps([each for each in cap.scopes if each != scope] if cap else [])
+        self._others = json.dumps([name for name in cap.scopes if name != scope] if cap else [])
         # A replay spends nothing and needs no record: a damaged one is an error only in a live run.
         with contextlib.suppress(UsageError, CacheFailed, RecordingError):
             self.read()

@@ -1,4 +1,4 @@
-"""What attempts cost: by the registry's figures, or by the table of genai-prices."""
+"""Costs of attempts, by the prices of the registry or of genai-prices."""
 
 from __future__ import annotations
 
@@ -16,18 +16,17 @@ if TYPE_CHECKING:
     from merge_runner.llm.endpoint_state import EndpointState
     from merge_runner.llm.sender import Sent
 
-# The provider names of genai-prices where they differ from ours.
+# Provider names of genai-prices where they differ from the registry's.
 GENAI_PRICES_PROVIDER = {"gemini": "google"}
 PER_MILLION = Decimal(1_000_000)
-# What is billed at more than the plain price, about twice at OpenAI.
+# Billed above the normal price, at OpenAI about twice.
 DEARER_TIERS = frozenset({"priority"})
 
 
 def cost_usd(entry: ModelEntry, usage: Usage, tier: str | None = None) -> float | None:
-    """Return the cost of an attempt in USD, None where the price or the tokens are unknown.
+    """Return the cost of tokens in USD, None where the price or a count is unknown.
 
-    ``tier`` is the service tier that the reply names; one without a price of its own is priced as
-    the plain one.
+    ``tier`` is the service tier that the reply names; one without a price has the normal price.
     """
     price, read, written = entry.price, usage.input_tokens, usage.output_tokens
     if price == "free":
@@ -36,10 +35,10 @@ def cost_usd(entry: ModelEntry, usage: Usage, tier: str | None = None) -> float 
         return None
     cached = usage.cached_input_tokens or 0
     if cached > read:
-        cached = 0  # the server counts wrongly: none is taken for cheap
+        cached = 0  # a wrong count: no token is priced as cached
     if isinstance(price, Price):
         cached_price = price.input if price.cached_input is None else price.cached_input
-        # Decimals of the written figures, so that sums of costs have no digits that nobody wrote.
+        # Decimals of the prices as written: binary fractions would add digits to sums.
         plain = (read - cached) * Decimal(str(price.input)) + cached * Decimal(str(cached_price))
         plain += written * Decimal(str(price.output))
         return float(plain / PER_MILLION * Decimal(str(price.tiers.get(tier or "", 1))))
@@ -97,7 +96,7 @@ def worst_case(entry: ModelEntry, body: str) -> tuple[Usage, float]:
 
 
 def underpriced_tiers(entry: ModelEntry) -> set[str]:
-    """Return the service tiers whose replies cost more than the registry knows."""
+    """Return the service tiers that cost more than the registry's price."""
     million = Usage(1_000_000, 0, 1_000_000)
     plain_usd = cost_usd(entry, million)
     return {t for t in DEARER_TIERS if plain_usd and cost_usd(entry, million, t) == plain_usd}

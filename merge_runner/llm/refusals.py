@@ -1,4 +1,4 @@
-"""Why an endpoint answers no call of a run, and what a user can do about it."""
+"""Reasons why an endpoint answers no call of a run, with what a user can do about each."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from merge_runner.config import PROVIDERS, ModelEntry
 from merge_runner.llm.formats.wire import as_dict, as_text, at, is_error
 from merge_runner.llm.http_outcome import AttemptOutcome
 
-# The statuses of a refusal that names the request.
+# Statuses of a refusal of the request itself.
 REQUEST_ITSELF = (200, 400, 413, 422, 429)
-# Why no call of a run would be answered, and what a user can do.
 REASONS = {
     "bad_certificate": "the endpoint's certificate cannot be trusted, and nothing was sent; check "
     "the base URL, or set SSL_CERT_FILE to the certificates of whoever signed it",
@@ -38,16 +37,16 @@ REASONS = {
     "llama.cpp: --reasoning-format none), or let the model think, as `chat_template_kwargs = "
     "{{ enable_thinking = true }}` among `parameters` of {place} does",
 }
-# Those that a passing fault may look like: several in a row tell.
+# A transient fault may look like these: only several in a row mean the configuration.
 UNSURE = frozenset({"other_error", "text", "unreadable_reply", "proxy_refused"})
-# A part of a path that follows itself, as in /v1/v1/messages.
+# A repeated part of a path, as in /v1/v1/messages.
 _TWICE = re.compile(r"(/\w.*)\1(/|$)")
 
 
 def reason_of(outcome: AttemptOutcome, url: str) -> str | None:
-    """Return why all calls of a run would fare as this one to ``url``: a name of REASONS or UNSURE.
+    """Return the reason, of REASONS or UNSURE, why all calls to ``url`` would fail like this one.
 
-    None: they might not.
+    None: others may succeed.
     """
     raw, name = outcome.raw, outcome.name
     if outcome.action == "refused":
@@ -63,14 +62,14 @@ def reason_of(outcome: AttemptOutcome, url: str) -> str | None:
     if outcome.action == "retry" and raw.status == 200 and is_told and not raw.error.names:
         return "other_error"
     message = as_dict(at(raw.payload, "choices.0.message"))
-    # Thoughts within the text are the model's choice, not the server's.
+    # Thoughts within the text are the model's, not the server's, doing.
     is_apart = message and not as_text(message.get("content"))
     is_alone = name == "empty" and is_apart and outcome.reading.reasoning.strip()
     return "reasoning_alone" if is_alone else None
 
 
 def why_refused(reason: str, entry: ModelEntry, outcome: AttemptOutcome) -> str:
-    """Return a reason in words, with what to set and what came."""
+    """Return the text of a reason, with what to set and what the server sent."""
     raw = outcome.raw
     why = REASONS["other_format" if reason == "text" else reason].format(
         place=entry.place,
@@ -84,13 +83,13 @@ def why_refused(reason: str, entry: ModelEntry, outcome: AttemptOutcome) -> str:
 
 
 def if_nobody(entry: ModelEntry) -> str:
-    """Return what a user can do if no server answers."""
+    """Return the hint for a server that does not answer."""
     what = PROVIDERS[entry.provider].if_nobody
     return f"{what}, or {set_base_url(entry)}; then run the same command again"
 
 
 def set_base_url(entry: ModelEntry) -> str:
-    """Return how a user corrects the base URL of an entry."""
+    """Return the hint to correct the base URL of an entry."""
     provider = PROVIDERS[entry.provider]
     if entry.base_url is not None or provider.base_url_env is None:
         return f"correct `base_url` of {entry.place}"

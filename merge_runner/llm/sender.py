@@ -1,4 +1,4 @@
-"""Sends the attempts of a call; this one sends each as a request of its own."""
+"""Senders of attempts; the direct one sends each as a normal (synchronous) request."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class Sent(NamedTuple):
-    """What an attempt brought; one in a batch has no ``took_s``, and an ``error`` ends the run."""
+    """Outcome of an attempt; in a batch it has no ``took_s``, and an ``error`` ends the run."""
 
     outcome: AttemptOutcome
     began: datetime
@@ -36,7 +36,7 @@ class Sender(Protocol):
     price_factor: float
 
     async def send(self, call: Call, reservation: Reservation) -> Sent:
-        """Begin the reservation, send the next attempt of a call, and return what it brought.
+        """Begin the reservation, send the next attempt of a call, and return its outcome.
 
         Raises TrialSuspended where the money cannot be reserved.
         """

@@ -1,11 +1,10 @@
-"""Recorded replies on disk, and what they cost: one SQLite file, in which nothing is evicted.
+"""Store of recorded replies and their costs: one SQLite file, from which nothing is evicted.
 
-An entry is the JSON of a request and every attempt, the answering one last, behind a checksum.
-It is durable before anyone sees it: each batch of writes is one synchronous SQLite transaction.
-Beside the entries lie the attempts of calls that have no answer yet, the notes of batches, and
-damaged entries in quarantine. Two tables of our own in the same file hold the money of all sweeps
-(``ledger``), so that a reply and its cost are kept together or not at all; a third one counts the
-calls by kind (``kinds``).
+An entry is the JSON of a request and all its attempts, the answering one last, after a checksum. It
+is durable before anyone sees it: each group of writes is one synchronous SQLite transaction. The
+file also holds the attempts of calls without an answer, the notes of batches, and damaged entries
+in quarantine. Two tables in it are the ledgers of all sweeps, so that a reply and its cost are kept
+together or not at all; a third counts calls by request template.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from merge_runner.errors import CacheFailed, MergeRunnerError, RecordingError, UsageError
 from merge_runner.llm.cache_file import FAILURES, FILE, NEW_CACHE, close_texts, open_texts, prepare
-from merge_runner.llm.durable import BatchWriter, Execute, ModelLocks, Operation, Rows, connect
+from merge_runner.llm.durable import Execute, GroupWriter, ModelLocks, Operation, Rows, connect
 from merge_runner.records import DAMAGED, Attempt, ChatRequest, check_call
 
 if TYPE_CHECKING:
@@ -41,7 +40,7 @@ ATTEMPTS = TypeAdapter(Attempts)
 UNANSWERED, _DAMAGED = "attempts ", "damaged "
 UNSEEN = "the run ended before a reply was seen; it may have been charged"
 _GET = "SELECT mode, filename, value FROM Cache WHERE key = ? AND raw = 1"
-# The rows of a call, and of its attempts whose end nobody has seen.
+# The rows of a call, and of its attempts in flight when their process ended.
 _LOOK_UP = """
 SELECT key, mode, filename, value FROM Cache WHERE raw = 1 AND key IN (?1, ?2)
 UNION ALL SELECT NULL, attempt, NULL, since FROM open WHERE call = ?1 AND outcome = 'in flight'
@@ -65,7 +64,7 @@ class CachedCall:
 
     @classmethod
     def from_json(cls, text: str) -> CachedCall:
-        """Read an entry; raises RecordingError."""
+        """Read an entry; raise RecordingError."""
         try:
             return _STORED.validate_json(text, strict=True).entry
         except ValidationError as exc:
@@ -83,14 +82,14 @@ class _Stored:
 
 _STORED: TypeAdapter[_Stored] = TypeAdapter(_Stored)
 Overlay = tuple[Mapping[str, CachedCall], "TemplateCounts"]
-"""A recording: its entries by key, and how many there are of each kind."""
+"""A recording: its entries by key, and their counts by request template."""
 
 
 class CallStore:
-    """The cache folder. Reads are direct; writes are batched in a thread and awaited.
+    """Store of calls in a cache folder, read directly and written by a thread in groups.
 
     ``locks`` keep other live runs from asking the same model. ``write`` runs an operation in the
-    next durable batch, and returns its future result.
+    next durable transaction, and returns its future result.
     """
 
     def __init__(
@@ -101,17 +100,15 @@ class CallStore:
         read_only: bool = False,
         before: bool = False,
     ) -> None:
-        """Open or make the folder; ``overlay`` opens a recording.
+        """Open or make the folder; ``overlay`` opens a recording, which takes precedence.
 
-        What the recording holds comes before what the folder holds; both are closed together.
-        ``read_only`` changes nothing in the folder, which must be there, and may be of the format
-        ``before``; else it is brought to this one. Raises UsageError for a folder that cannot be
-        used.
+        ``read_only`` changes nothing in the folder, which must exist, and may have the format
+        ``before``; otherwise it is upgraded. Raises UsageError for a folder that cannot be used.
         """
         self.folder = folder
         self.locks = ModelLocks(folder)
         self._open_overlay, self._with_overlay = overlay, contextlib.ExitStack()
-        self._writer = BatchWriter(self._run_each)
+        self._writer = GroupWriter(self._run_each)
         self.write = self._writer.write
         self.summed: object = None  # the ledger that knows its sums in the transaction under way
         try:
@@ -127,28 +124,27 @@ class CallStore:
 
     @cached_property
     def recording(self) -> Overlay:
-        """The recording, opened when it is first asked for."""
+        """The recording, opened on first use."""
         opened = self._open_overlay
         return self._with_overlay.enter_context(opened()) if opened else ({}, {})
 
     def get(self, key: str, request: ChatRequest | None = None) -> CachedCall | None:
-        """Return the entry of a call, whose ``request`` is given where it is known.
+        """Return the entry of a call, checked against its ``request`` where that is given.
 
-        Raises RecordingError where it is damaged or made up.
+        Raises RecordingError where it is damaged or forged.
         """
         return self.recording[0].get(key) or self._kept(key, request)
 
     def in_recording(self, key: str) -> bool:
-        """Whether the recording holds an entry of a call key."""
+        """Return whether the recording holds an entry of a call key."""
         return key in self.recording[0]
 
     def look_up(
         self, key: str, request: ChatRequest | None = None
     ) -> tuple[CachedCall | None, Attempts]:
-        """Return the entry of a call, or the attempts of earlier runs, also unknown ones.
+        """Return the entry of a call, or the attempts of earlier runs, unseen ones included.
 
-        ``request`` is the call's where it is known. Raises RecordingError where what is recorded is
-        damaged or made up.
+        Raises RecordingError where they are damaged, or do not match the ``request``.
         """
         if recorded := self.recording[0].get(key):
             return recorded, ()
@@ -181,9 +177,9 @@ class CallStore:
             raise self._failure("written", hidden or exc) from exc
 
     def _run_each(self, operations: Sequence[Operation]) -> list[Any]:
-        """Run operations in one durable transaction; where one fails, each in one of its own.
+        """Run operations in one durable transaction; if that fails, each in its own.
 
-        Its result is then an error of its own.
+        The result of one that fails is its error.
         """
         try:
             return self.run_now(operations)
@@ -194,25 +190,25 @@ class CallStore:
             return [exc] if alone else [self._run_each([each])[0] for each in operations]
 
     def read(self, name: str) -> str | None:
-        """Return the text under a name, or None; raises RecordingError where it is damaged."""
+        """Return the text under a name, or None; raise RecordingError where it is damaged."""
         rows = self.rows(_GET, name)
         return text_of(*rows[0]) if rows else None
 
     def replace(self, name: str, text: str, _: Execute) -> None:
-        """Keep a text under a name that is no call key, behind a checksum; an operation."""
+        """Store a text under a name that is no call key, after a checksum; an operation."""
         self._texts.set(name, _behind_checksum(text))
 
     def remove(self, name: str, _: Execute) -> None:
-        """Forget the text under a name that is no call key; an operation."""
+        """Delete the text under a name that is no call key; an operation."""
         self._texts.delete(name)
 
     def names(self, prefix: str) -> list[str]:
-        """Return the names, none of a call, that begin with a prefix."""
+        """Return the names with a prefix; none is a call key."""
         rows = self.rows(_KEYS, prefix, prefix + chr(0x10FFFF))
         return [name.decode(errors="replace") for (name,) in rows]
 
     def close(self) -> None:
-        """Close the folder and the recording before it, and free its locks."""
+        """Close the folder and its recording, and free its locks."""
         self._with_overlay.close()
         self._writer.close()
         self.locks.close()
@@ -221,9 +217,9 @@ class CallStore:
             close_texts(self._texts)
 
     def keep(self, entry: CachedCall, execute: Execute) -> CachedCall:
-        """Keep an entry unless there is one, and return what is kept; an operation.
+        """Store an entry unless there is one, and return the stored one; an operation.
 
-        One that is damaged goes to quarantine.
+        A damaged one is quarantined.
         """
         key, text = entry.request.key, _behind_checksum(entry.to_json())
         if not execute(_ADD, (key, text)).rowcount:
@@ -237,14 +233,15 @@ class CallStore:
         return entry
 
     def keep_attempts(self, key: str, attempts: Attempts, execute: Execute) -> None:
-        """Keep the attempts at a call that has no answer yet; an operation."""
+        """Store the attempts of a call that has no answer yet; an operation."""
         self.replace(UNANSWERED + key, ATTEMPTS.dump_json(attempts).decode(), execute)
 
     def _quarantine_row(self, name: str, execute: Execute) -> None:
-        """Rename a row, whatever it holds; an operation."""
-        aside = _DAMAGED + name
-        aside += f" {len(before) + 1}" if (before := self.names(aside)) else ""
-        execute("UPDATE Cache SET key = ? WHERE key = ? AND raw = 1", [aside, name])
+        """Rename a damaged row and keep its content; an operation."""
+        renamed = _DAMAGED + name
+        if earlier := self.names(renamed):
+            renamed += f" {len(earlier) + 1}"
+        execute("UPDATE Cache SET key = ? WHERE key = ? AND raw = 1", [renamed, name])
 
     def _kept(self, key: str, request: ChatRequest | None = None) -> CachedCall | None:
         text = self.read(key)
@@ -254,7 +251,7 @@ class CallStore:
         return _attempts(self.read(UNANSWERED + key) or "[]")
 
     def rows(self, sql: str, *values: object) -> Rows:
-        """Return the rows of a query; raises CacheFailed, or RecordingError for what is no text."""
+        """Return the rows of a query; raise CacheFailed, or RecordingError for invalid text."""
         try:
             with self._one_query:
                 return self._reading.execute(sql, values).fetchall()
@@ -262,20 +259,20 @@ class CallStore:
             raise self._failure("read", exc) from exc
 
     def _failure(self, done: str, why: BaseException) -> CacheFailed | RecordingError:
-        """Return the error of a folder that cannot be used, or of what is no text."""
-        if "utf-8" in str(why).lower():  # SQLite says no more of it
+        """Return the error of a folder that cannot be used, or of invalid text."""
+        if "utf-8" in str(why).lower():  # the only trace in SQLite's message
             return RecordingError("the recorded reply is damaged: it is no text")
-        told = f"cannot be {done}: {str(why) or 'another program writes'}"
+        reason = f"cannot be {done}: {str(why) or 'another program writes'}"
         if self._file != self._opened:
-            told = "was removed, moved or replaced while it was in use"
+            reason = "was removed, moved or replaced while it was in use"
         return CacheFailed(
-            f"the cache {self.folder} {told}. When that is mended, or a copy of it put back, "
+            f"the cache {self.folder} {reason}. When that is mended, or a copy of it put back, "
             "run the same command again: what is in no cache is asked again"
         )
 
     @property
     def _file(self) -> tuple[int, int] | None:
-        """The identity of the file in the folder: SQLite goes on with one that is gone."""
+        """Identity of the file in the folder, since SQLite goes on with a deleted one."""
         with contextlib.suppress(OSError):
             status = os.stat(self.folder / FILE)
             return status.st_dev, status.st_ino
@@ -283,7 +280,7 @@ class CallStore:
 
 
 def both(first: Operation, then: Operation, execute: Execute) -> Any:  # noqa: ANN401 # of any
-    """Run two operations as one, with the result of the first."""
+    """Run two operations as one, and return the result of the first."""
     result = first(execute)
     then(execute)
     return result
@@ -297,7 +294,7 @@ def _attempts(text: str) -> Attempts:
 
 
 def verified(key: str, text: str, request: ChatRequest | None = None) -> CachedCall:
-    """Return the entry that a row holds; raises RecordingError unless it belongs to its key."""
+    """Return the entry in a row; raise RecordingError unless it belongs to its key."""
     entry = CachedCall.from_json(text)
     try:
         check_call(key, entry.request, entry.attempts, request)
@@ -311,12 +308,14 @@ def _behind_checksum(text: str) -> str:
 
 
 def text_of(mode: object, filename: object, value: object) -> str:
-    """Return the text of a row, which was put behind a checksum.
+    """Return the text of a row after its checksum.
 
-    Raises RecordingError where it is damaged, or none of ours.
+    Raises RecordingError where it is damaged, or not written by merge-runner.
     """
     if filename is not None or mode != MODE_RAW:
-        raise RecordingError("the cache holds a pickle or names a file: it is not ours")
+        raise RecordingError(
+            "the cache holds a pickle or names a file: merge-runner did not write it"
+        )
     if not isinstance(value, str):
         raise RecordingError("the recorded reply is damaged: it is no text")
     content = value[CHECKSUM_LENGTH:]

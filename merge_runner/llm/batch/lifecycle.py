@@ -41,7 +41,7 @@ class Lifecycle:
 
     ``services`` has the batch modes by model, ``batches`` all that calls wait in, by mark.
     ``max_calls`` is set for a model after its provider has rejected a batch as too large; such a
-    model has one open batch at a time. A run that does not ``submit`` only follows.
+    model has one open batch at a time. Unless it ``submits``, a run only follows.
     """
 
     cache: ResponseCache
@@ -92,7 +92,7 @@ class Lifecycle:
                 begun.append(each.request)
 
         await asyncio.gather(*map(begin, requests))
-        await self._note(batch, lines={each.key: batch.note.lines[each.key] for each in begun})
+        await self._note(batch, lines={r.key: batch.note.lines[r.key] for r in begun})
         return begun
 
     async def _submit(self, batch: Batch, requests: Sequence[ChatRequest]) -> bool:

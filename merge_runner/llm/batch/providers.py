@@ -1,4 +1,4 @@
-"""The batch modes of three providers, and which models have one on what terms."""
+"""Batch modes of three providers, and the terms of each model."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from merge_runner.llm.formats.wire import as_count, as_dict, as_text, at
 from merge_runner.llm.http_outcome import RawReply, status_within
 from merge_runner.records import LARGEST_STATUS, ChatRequest, canonical_json
 
-# Where a provider's addresses stand, whatever the base URL of the server is.
+# Prefixes of a provider's paths, whatever the base URL of the server is.
 OPENAI, GEMINI = "/v1", "/v1beta"
 NOT_ASKED = frozenset({"batch_expired", "batch_cancelled"})
-# Of ASCII, as a URL is; it may carry a long token.
+# ASCII, as in URLs; it may contain a long token.
 UPLOAD_PATH = re.compile("/[!-~]{1,8000}")
-# The status with which the plain endpoint sends an error: a result has its type or its code
-# (google/rpc/code.proto) alone. All others may pass.
+# Statuses of the normal endpoint for errors of which a result has only the type or the code
+# (google/rpc/code.proto). All others may be transient.
 ANTHROPIC_STATUSES = {
     "invalid_request_error": 400,
     "request_too_large": 413,
@@ -72,8 +72,8 @@ class OpenAIBatches(BatchService):
     def _status_of(self, batch: dict[str, Any]) -> BatchStatus:
         word = (as_text(batch.get("status")) or "").upper()
         answered = as_count(as_dict(batch.get("request_counts")).get("completed")) or 0
-        error, told = at(batch, "errors.data.0"), batch.get("errors")
-        why = read_error(400, {}, json.dumps(told) if told else "", {"error": error})
+        error, errors = at(batch, "errors.data.0"), batch.get("errors")
+        why = read_error(400, {}, json.dumps(errors) if errors else "", {"error": error})
         why = replace(why, status=status_within(why) if why.names else 400)
         failure = self._failure_of(why) if word == "FAILED" else None
         if word not in ("COMPLETED", "EXPIRED", "CANCELLED"):
@@ -107,7 +107,7 @@ class AnthropicBatches(BatchService):
         if (as_text(batch.get("processing_status")) or "").upper() != "ENDED":
             return BatchStatus()
         counts = as_dict(batch.get("request_counts")).values()
-        # Not at the URL that the batch names: the key goes to the configured host alone.
+        # Not at the URL that the batch names: only the configured host may get the key.
         path = f"{self.path}/{id_of(batch)}/results"
         return BatchStatus([path], sum(as_count(count) or 0 for count in counts))
 
@@ -128,7 +128,7 @@ class AnthropicBatches(BatchService):
 class GeminiBatches(BatchService):
     """``models/MODEL:batchGenerateContent`` and ``batches``, with the requests in a file.
 
-    They could also stand in the body of the creation; a file has room for more, and each of its
+    The body of the creation could contain them, too; a file has room for more, and each of its
     results has the key of its request.
     """
 
@@ -146,7 +146,7 @@ class GeminiBatches(BatchService):
         }
         file = canonical_json({"file": {"displayName": mark, "mimeType": "application/jsonl"}})
         begun = await self._ask("POST", f"/upload{GEMINI}/files", file.encode(), start)
-        # At the configured host, to which alone the key goes, whatever the URL names.
+        # At the configured host, whatever the URL names: no other may get the key.
         url = begun.headers.get("x-goog-upload-url", "")
         path = "/" + url.partition("://")[2].partition("/")[2]
         path = path.removeprefix(urlsplit(self.endpoint.base_url).path)
@@ -162,9 +162,9 @@ class GeminiBatches(BatchService):
         return path, canonical_json({"batch": batch}).encode()
 
     def _status_of(self, batch: dict[str, Any]) -> BatchStatus:
-        # The word of an operation that is done may be one that nobody knows.
+        # The state of an operation that is done may be unknown.
         metadata, error = as_dict(batch.get("metadata")), as_dict(batch.get("error"))
-        # It says JOB_STATE_ or BATCH_STATE_ before it.
+        # It has the prefix JOB_STATE_ or BATCH_STATE_.
         word = (as_text(metadata.get("state")) or "").upper().rpartition("_STATE_")[2]
         done = batch.get("done") is True
         if word not in ("SUCCEEDED", "PARTIALLY_SUCCEEDED", "CANCELLED", "EXPIRED"):
@@ -199,7 +199,7 @@ def _reply(status: int, body: dict[str, Any]) -> RawReply:
 
 
 def _http_status(error: dict[str, Any]) -> int:
-    """The HTTP status of an error of Gemini's, whose code may be one already."""
+    """Return the HTTP status of an error of Gemini, whose code may be one already."""
     code = as_count(error.get("code")) or 2
     return code if 400 <= code < 600 else GEMINI_STATUSES.get(code, 500)
 
@@ -214,7 +214,7 @@ SERVICES: Mapping[str, type[BatchService]] = {
 
 
 def batch_terms(entry: ModelEntry) -> BatchTerms | None:
-    """Return the terms on which a model answers in batches; None: it has no known batch mode."""
+    """Return the terms of a model's batch mode; None: it has no known one."""
     # A path of its own leads to one deployment, which no batch can name.
     if entry.batch == "none" or entry.path is not None or entry.format not in SERVICES:
         return None

@@ -2,7 +2,7 @@
 
 A round is closed when no trial can go on before a reply comes. So all trials advance by one
 decision at a time, and a sweep takes as many rounds as its longest trial has decisions. A call that
-waits in an open batch is not asked anew: it joins those that wait there. One process at a time asks
+waits in an open batch is not repeated: it joins those that wait there. One process at a time asks
 a model in a cache, so it knows all notes of its models once it has read them.
 """
 
@@ -119,7 +119,7 @@ class Rounds:
     def _has_ended(self, key: str, batch: Batch) -> bool:
         with contextlib.suppress(RecordingError):  # damaged: its attempts are unknown
             entry, attempts = self._cache.look_up(key)
-            outcomes = {each.number: each.outcome for each in attempts}
+            outcomes = {attempt.number: attempt.outcome for attempt in attempts}
             return entry is not None or outcomes.get(batch.note.lines[key], "unknown") != "unknown"
         return False
 

@@ -1,4 +1,4 @@
-"""Sends the attempts of a call in the batches of a run."""
+"""Batch sender: attempts wait for the batches of a run."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class BatchSender:
         return is_new or call.pending_batch is not None
 
     def resume(self, call: Call) -> None:
-        """Drop the last attempt of a call from its record, which goes on in a batch."""
+        """Take the attempt that goes on in a batch out of the recorded attempts of a call."""
         if call.pending_batch is not None:
             end = call.pending_batch.note.lines[call.request.key]
-            call.attempts = [each for each in call.attempts if each.number < end]
+            call.attempts = [a for a in call.attempts if a.number < end]
             call.earlier = len(call.attempts)
 
     async def send(self, call: Call, reservation: Reservation) -> Sent:

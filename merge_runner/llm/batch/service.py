@@ -1,4 +1,4 @@
-"""The batch mode of one model: create a batch, find it, follow it, and read its results."""
+"""Batch mode of one model: create a batch, find it, get its status, and read its results."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ LONGEST_MESSAGE = 500
 ID = re.compile(r"(?!.*\.\.)[A-Za-z0-9_-][A-Za-z0-9_./-]{0,999}")
 FailureKind = Literal["again", "smaller", "quota", "refused", "lost"]
 Gone = Mapping[int, FailureKind]
-# A server does not have a batch, or no longer; its results may not be there yet.
+# Meaning of a 404 and 410: a batch is gone; its results may not exist yet.
 NO_BATCH: Gone = {404: "lost", 410: "lost"}
 NO_RESULTS: Gone = {404: "again", 410: "lost"}
 NEW: Gone = {}
 
 
 class BatchFailed(MergeRunnerError):
-    """A batch mode did not do what it was asked; ``kind`` says what to do.
+    """A request to a batch mode failed; ``kind`` names what follows.
 
-    ``again``: the same once more, after a while, ``delay_s`` where the server asks for that.
-    ``smaller``: submit fewer lines, since too many tokens are enqueued. ``quota`` and ``refused``:
-    nothing at this endpoint will be answered. ``lost``: what became of the batch cannot be known;
-    its lines may have been charged. ``sent`` is False where certainly no batch was created.
+    ``again``: retry later, after ``delay_s`` if the server asks for it. ``smaller``: submit fewer
+    requests, since too many tokens are enqueued. ``quota`` and ``refused``: this endpoint answers
+    nothing. ``lost``: the fate of the batch is unknown; its requests may have been billed. ``sent``
+    is False where certainly no batch was created.
     """
 
     def __init__(
@@ -59,11 +59,11 @@ class BatchFailed(MergeRunnerError):
 
 @dataclass(frozen=True, slots=True)
 class BatchStatus:
-    """The state of a batch.
+    """Status of a batch.
 
-    One that has ended, or expired or was cancelled, has its results at ``paths``: JSONL, in any
-    order, at least ``results`` of them, perhaps not of all lines. Where there is a ``failure`` no
-    line was asked or charged. One that goes on has neither.
+    One that has ended, expired or was cancelled has at least ``results`` results at ``paths``:
+    JSONL, in any order, perhaps not of all requests. After a ``failure`` no request was processed
+    or billed. One in progress has neither.
     """
 
     paths: Sequence[str] | None = None
@@ -72,13 +72,13 @@ class BatchStatus:
 
 
 class BatchService(ABC):
-    """The batch mode of one model at one endpoint; every request raises BatchFailed.
+    """Batch mode of one model at one endpoint; every request raises BatchFailed.
 
-    Where a batch takes no mark, one whose id was lost cannot be found. Batches are at ``path``,
-    where ``pages`` is the query for a page of their list, and ``cursor`` that for the one after it.
-    A page has its batches as ``list_member``, each with its mark as ``mark_member`` of its
-    metadata, and the cursor of the next page as ``next_member``. A line is made by ``template``,
-    with the key of its request: 64 hexadecimal digits, as many characters as Anthropic takes.
+    A mark is our name of a batch at its provider. Without one (``takes_mark``) a batch whose id was
+    lost cannot be found. Batches are listed at ``path``, in pages by the query ``pages``, and
+    ``cursor`` for the next one. A page has its batches in ``list_member``, each with its mark in
+    ``mark_member`` of its metadata, and the cursor of the next page in ``next_member``. A line is
+    made by ``template``, with the key of its request: 64 hexadecimal digits, Anthropic's maximum.
     """
 
     template: ClassVar[str]
@@ -96,31 +96,31 @@ class BatchService(ABC):
         self.wire = wire
 
     def line(self, request: ChatRequest) -> bytes:
-        """Return a line as it is sent, with the body as it is hashed."""
+        """Return the line of a request, with its hashed body."""
         slot = canonical_json(request.slot.as_dict())
-        # Only our own emulator is told the slot.
-        told = f',"{SLOT_HEADER}":{slot}' if self.endpoint.provider == "emulator" else ""
+        # Only the emulator gets the slot.
+        member = f',"{SLOT_HEADER}":{slot}' if self.endpoint.provider == "emulator" else ""
         line = self.template.format(
-            key=request.key, path=request.path, body=request.body, slot=told
+            key=request.key, path=request.path, body=request.body, slot=member
         )
         return line.encode()
 
     async def _upload(self, content: bytes, mark: str) -> str:
-        return ""  # the creation has the lines, unless they go into a file, whose name this returns
+        return ""  # the creation contains the lines, or else the file that this names
 
     @abstractmethod
     def _creation(self, requests: Sequence[ChatRequest], file: str, mark: str) -> tuple[str, bytes]:
-        """Return the path and the body that create a batch of requests, or of those in the file."""
+        """Return the path and the body that create a batch of requests, or of a file."""
 
     async def create(self, requests: Sequence[ChatRequest], mark: str) -> str:
-        """Create a batch of requests with different keys; returns its id.
+        """Create a batch of requests with different keys, and return its id.
 
-        ``mark``, up to 64 letters, digits, _ and -, is attached where the provider takes a name.
+        ``mark``, up to 64 letters, digits, _ and -, is attached where the provider takes one.
         """
         try:
             file = await self._upload(b"".join(map(self.line, requests)), mark)
         except BatchFailed as exc:
-            exc.sent = False  # a file is no batch yet
+            exc.sent = False  # an uploaded file is not a batch
             raise
         created = await self._ask("POST", *self._creation(requests, file, mark))
         return self._batch_id(json_object(created))
@@ -132,7 +132,7 @@ class BatchService(ABC):
         while cursor is not None and cursor not in seen:  # ends where a server knows no pages
             seen.add(cursor)
             after = f"&{self.cursor}={quote(cursor, safe='')}" if cursor else ""
-            page = await self._look(f"{self.path}?{self.pages}{after}")
+            page = await self._get_json(f"{self.path}?{self.pages}{after}")
             cursor = as_text(page.get(self.next_member))
             for batch in as_dicts(page.get(self.list_member)):
                 if as_dict(batch.get("metadata")).get(self.mark_member) == mark:
@@ -140,23 +140,23 @@ class BatchService(ABC):
         return None
 
     async def status(self, batch_id: str) -> BatchStatus:
-        """Return the state of a batch."""
-        return self._status_of(await self._look(f"{self.path}/{batch_id}"))
+        """Return the status of a batch."""
+        return self._status_of(await self._get_json(f"{self.path}/{batch_id}"))
 
     @abstractmethod
     def _status_of(self, batch: dict[str, Any]) -> BatchStatus:
-        """Return the state of a batch as its server describes it."""
+        """Return the status of a batch from its server's description."""
 
     @abstractmethod
     def _read(self, line: dict[str, Any]) -> RawReply | None:
-        """Return what the plain endpoint would have replied: an answer (status 200) or an error.
+        """Return the reply of the normal endpoint: an answer (status 200) or an error.
 
-        None where the line was never asked, since the batch expired or was cancelled before. Raises
+        None where the request was never processed, since the batch expired or was cancelled. Raises
         ValueError where the line has no known form.
         """
 
     async def results(self, paths: Sequence[str]) -> AsyncIterator[tuple[str, RawReply | None]]:
-        """Yield the results of a batch that has ended, by key; it is empty where one is broken."""
+        """Yield the results of a batch that has ended, by key; the key of a broken one is empty."""
         for path in paths:
             raw = await self._ask("GET", path, gone=NO_RESULTS)
             for line in filter(str.strip, raw.body.split("\n")):
@@ -170,7 +170,7 @@ class BatchService(ABC):
     def _failure_of(self, error: ServerError, gone: Gone = NEW) -> BatchFailed:
         """Return the failure of a batch that is not created or fails as a whole.
 
-        Where one exists, ``gone`` says what the statuses mean with which it is not found.
+        For an existing batch ``gone`` has the meaning of statuses such as 404.
         """
         outcome = judge_error(error, self.wire)
         kinds: dict[str, FailureKind] = {"retry": "again", "quota": "quota", "refused": "refused"}
@@ -189,26 +189,26 @@ class BatchService(ABC):
         headers: Mapping[str, str] | None = None,
         gone: Gone = NEW,
     ) -> RawReply:
-        """Return the reply to a step of a creation (POST), or to a look at what exists (GET)."""
+        """Return the reply to a step of a creation (POST), or to a query (GET)."""
         sent = {**self.wire.headers, **(headers or {})}
         try:
             raw = await self.transport.ask(
                 method, path, sent, body, timeout_s=TIMEOUT_S, most_bytes=MOST_BYTES
             )
         except TransportFailure as exc:
-            # One that is refused for what it is will be no other next time.
+            # A reply that is refused for its content will be the same next time.
             kinds: dict[str, FailureKind] = {"refused": "refused", "fail": "lost"}
             kind = kinds.get(exc.action, "again")
             raise BatchFailed(kind, str(exc), sent=exc.sent) from exc
         if 200 <= raw.status < 300:
             return raw
         failure = self._failure_of(raw.error, gone)
-        # Without a mark it cannot be looked for: what the provider says of itself decides.
+        # Without a mark it cannot be found: the provider's own statement decides.
         failure.sent = may_be_charged(raw, self.endpoint.identity)
         failure.sent |= self.takes_mark and raw.status >= 500
         raise failure
 
-    async def _look(self, path: str) -> dict[str, Any]:
+    async def _get_json(self, path: str) -> dict[str, Any]:
         return json_object(await self._ask("GET", path, gone=NO_BATCH))
 
     def _batch_id(self, batch: dict[str, Any]) -> str:
@@ -216,14 +216,14 @@ class BatchService(ABC):
 
 
 def json_object(raw: RawReply) -> dict[str, Any]:
-    """Return the body of a reply as a JSON object; raises BatchFailed."""
+    """Return the body of a reply as a JSON object; raise BatchFailed."""
     if not isinstance(raw.payload, dict):
         raise BatchFailed("again", f"HTTP {raw.status}: the body is not a JSON object")
     return raw.payload
 
 
 def id_of(reply: Mapping[str, Any], member: str = "id") -> str:
-    """Return an id, which can stand in a path; raises BatchFailed."""
+    """Return an id that is safe in a path; raise BatchFailed."""
     value = reply.get(member)
     if not isinstance(value, str) or not ID.fullmatch(value):
         raise BatchFailed("again", f"the reply cannot be used: it has no {member} of a known form")

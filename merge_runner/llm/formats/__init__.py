@@ -1,6 +1,7 @@
-"""The wire formats: how a prompt becomes a request body, and a reply's body an answer.
+"""Wire formats: make request bodies of prompts, and read answers from reply bodies.
 
-Those of OpenAI and the many servers that speak them, and two more. A package can add others.
+Two formats of OpenAI, which many servers speak, and those of Gemini and Anthropic. A package can
+add others.
 """
 
 from __future__ import annotations
@@ -46,6 +47,6 @@ for _name, _format in {
 
 
 def reasoning_of(payload: dict[str, Any]) -> str:
-    """Return the reasoning in a body of any format that is known."""
+    """Return the reasoning in a body of any known format."""
     readings = (read_reply(w, payload) for w in FORMATS.values() if w.members & payload.keys())
     return next((reading.reasoning for reading in readings if reading.reasoning), "")

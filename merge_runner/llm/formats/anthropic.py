@@ -1,4 +1,4 @@
-"""The messages format of Anthropic."""
+"""Messages format of Anthropic."""
 
 from __future__ import annotations
 

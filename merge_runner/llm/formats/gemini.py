@@ -1,4 +1,4 @@
-"""The generateContent format of Gemini."""
+"""Format generateContent of Gemini."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The responses format of OpenAI."""
+"""Responses format of OpenAI."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class OpenAIResponses(WireFormat):
     def read(self, payload: dict[str, Any]) -> Reading:
         """Join the text parts of all messages; a failed response arrives with status 200.
 
-        A commentary beside the final message is reasoning.
+        A commentary before the final message is reasoning.
         """
         items = as_dicts(payload.get("output"))
         messages = [item for item in items if item.get("type") == "message"]

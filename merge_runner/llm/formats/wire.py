@@ -1,4 +1,4 @@
-"""What all wire formats share, and chat completions, the one that most servers speak."""
+"""Base of all wire formats, and chat completions, which most servers speak."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ if TYPE_CHECKING:
     from merge_runner.llm.formats.server_error import ServerError
 
 MOST_TOKENS = 2**31 - 1
-# What ends an answer of Gemini that was refused.
+# Finish reasons of Gemini for a refusal.
 REFUSALS = (
     *("SAFETY", "RECITATION", "LANGUAGE", "OTHER", "BLOCKLIST", "PROHIBITED_CONTENT", "SPII"),
     "MODEL_ARMOR",
 )
-# What ends a reply of a chat server that passes on another API's word: Gemini's in capitals,
+# Finish reasons of chat servers, some of which pass on another API's: Gemini's in capitals,
 # Anthropic's, Mistral's (model_length), Zhipu's (sensitive).
 CHAT_TRUNCATED = {
     *("length", "MAX_TOKENS", "max_tokens", "max_output_tokens", "model_length"),
     "model_context_window_exceeded",
 }
 CHAT_REFUSED = {*REFUSALS, "content_filter", "refusal", "sensitive"}
-# The server broke the reply off, and what came of it is no answer of the model: vLLM and SGLang
-# (abort), Zhipu (network_error), DeepSeek, and routers (error).
+# Finish reasons of an aborted generation, which is no answer of the model: vLLM and SGLang (abort),
+# Zhipu (network_error), DeepSeek, and routers (error).
 BROKEN_OFF = {"abort", "error", "network_error", "insufficient_system_resource"}
 
 
 @dataclass(frozen=True, slots=True)
 class WireRequest:
-    """A request without its secret: ``headers`` are those that change its meaning."""
+    """A request without its key: ``headers`` are those that change its meaning."""
 
     path: str
     body: dict[str, JsonValue]
@@ -45,12 +45,12 @@ class WireRequest:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What a JSON body of status 200 says.
+    """Content of a JSON body of status 200.
 
     ``outcome`` is ``ok``, ``refusal``, ``truncated``, ``empty``, or ``error`` where the body
     reports a failure after all. ``finish_reason`` is the provider's own word, and so is
-    ``service_tier``, at which the reply is billed. ``reasoning`` is what stands apart from the text
-    of the answer.
+    ``service_tier``, at which the reply is billed. ``reasoning`` is separate from the ``text`` of
+    the answer.
     """
 
     outcome: str
@@ -63,20 +63,20 @@ class Reading:
 
 
 class WireFormat(ABC):
-    """One format of requests and replies, with all that is particular to it.
+    """A format of requests and replies.
 
-    None leaves a question about an error to what is known of all servers: gateways pass on the
-    errors of others, whatever format they speak themselves.
+    ``meaning`` and ``delay_s`` return None for what is the same for all formats: gateways pass on
+    the errors of others, whatever format they speak themselves.
     """
 
     parameters: ClassVar[Mapping[str, tuple[str, ...]]] = {}
-    """Parameters that a study may vary, by common names: where each stands in an entry's own."""
+    """Parameters that a study may vary, by common names, with their paths in a body."""
     members: ClassVar[frozenset[str]]
-    """Members of a body: an answer has at least one of them, whatever it says."""
+    """Members of which each answer has at least one."""
     headers: ClassVar[Mapping[str, str]] = {}
-    """Headers that every request to a batch mode has, since they change its meaning."""
+    """Headers of all requests to a batch mode that change their meaning."""
     retries_empty: ClassVar[bool] = False
-    """Whether an empty answer is a known fault of the service that asking again may mend."""
+    """Whether an empty answer is a known transient fault of the service."""
 
     @abstractmethod
     def request(self, entry: ModelEntry, prompt: str) -> WireRequest:
@@ -84,27 +84,27 @@ class WireFormat(ABC):
 
     @abstractmethod
     def read(self, payload: dict[str, Any]) -> Reading:
-        """Read a body of status 200; unknown keys and missing ones are normal.
+        """Read a body of status 200; unknown and missing keys are normal.
 
-        Reasoning that stands within the text stays there: see ``read_reply``.
+        Reasoning within the text stays there: ``read_reply`` separates it.
         """
 
     def meaning(self, error: ServerError) -> str | None:
-        """Return the meaning of an error whose status does not tell it.
+        """Return the meaning of an error that its status does not show.
 
-        As in the table of calls: ``refusal``, ``quota_exhausted``, ``unknown_model``,
-        ``not_allowed``, ``rate_limited``, ``request_too_large``, or ``bad_prompt``, which speaks
-        of one prompt alone.
+        A name of the table of calls: ``refusal``, ``quota_exhausted``, ``unknown_model``,
+        ``not_allowed``, ``rate_limited``, ``request_too_large``, or ``bad_prompt``, which concerns
+        one prompt alone.
         """
         return None
 
     def delay_s(self, error: ServerError) -> float | None:
-        """Return the delay in s in a member of the error; its words are read for every format."""
+        """Return the delay in s in a member of the error; its message is read for every format."""
         return None
 
 
 def read_reply(wire: WireFormat, payload: dict[str, Any]) -> Reading:
-    """Read a body of status 200; of its text the answer is kept apart from the reasoning."""
+    """Read a body of status 200, and separate the answer in its text from the reasoning."""
     reading = wire.read(payload)
     if reading.outcome not in {"ok", "truncated", "empty"}:
         return reading
@@ -122,9 +122,9 @@ def read_reply(wire: WireFormat, payload: dict[str, Any]) -> Reading:
 def outcome_of(
     text: str, *, failed: object = False, truncated: bool = False, refused: bool = False
 ) -> str:
-    """Return the outcome of an answer, from its text and what its finish reason means.
+    """Return the outcome of an answer, by its text and the meaning of its finish reason.
 
-    ``failed`` is what the body reports as an error, where it does.
+    ``failed`` is the error that the body reports, if any.
     """
     if failed or refused:
         return "error" if failed else "refusal"
@@ -133,8 +133,8 @@ def outcome_of(
     return "ok" if text.strip() else "empty"
 
 
-def at(value: object, path: str) -> Any:  # noqa: ANN401 # whatever JSON holds there
-    """Return the JSON at a path such as ``choices.0.message``, None where there is none."""
+def at(value: object, path: str) -> Any:  # noqa: ANN401 # any JSON
+    """Return the JSON at a path such as ``choices.0.message``, or None."""
     for name in path.split("."):
         if isinstance(value, dict):
             value = value.get(name)
@@ -151,14 +151,14 @@ def as_dict(value: object) -> dict[str, Any]:
 
 
 def as_dicts(value: object) -> list[dict[str, Any]]:
-    """Return the objects of a JSON array; anything else counts as an empty one."""
+    """Return the objects of a JSON array, or none for anything else."""
     return [as_dict(item) for item in value] if isinstance(value, list) else []
 
 
 def as_text(value: object) -> str | None:
     """Return a JSON string, or None for anything else.
 
-    JSON can spell half of a surrogate pair, which no file can hold: a "?" takes its place.
+    JSON can spell half of a surrogate pair, which no file can hold: it becomes "?".
     """
     if not isinstance(value, str):
         return None
@@ -166,7 +166,7 @@ def as_text(value: object) -> str | None:
 
 
 def as_count(value: object) -> int | None:
-    """Return a token count, or None for what cannot be one; some servers write 9.0."""
+    """Return a token count, or None for an impossible one; some servers write 9.0."""
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     return value if type(value) is int and 0 <= value <= MOST_TOKENS else None
@@ -178,15 +178,15 @@ def is_error(value: object) -> bool:
 
 
 def joined(parts: Iterable[dict[str, Any]], member: str = "text") -> str:
-    """Return the text of all parts of an answer that have some."""
+    """Return the joined text of the parts of an answer."""
     return "".join(as_text(part.get(member)) or "" for part in parts)
 
 
 def usage_of(counts: object, *, total: str = "", **places: str) -> Usage:
-    """Return the tokens that stand in ``counts`` at these places; of several the sum.
+    """Return the tokens at these paths of ``counts``; several paths are summed.
 
-    Some servers (xAI, gateways) leave the reasoning out of the output: it is at least what the
-    ``total`` has beside the input, and where it is less than the reasoning alone both are added.
+    Some servers (xAI, gateways) leave the reasoning out of the output: the output is at least
+    ``total`` less input, and where it is less than the reasoning alone both are added.
     """
     sums = dict[str, int]()
     for name, paths in places.items():
@@ -205,7 +205,7 @@ def usage_of(counts: object, *, total: str = "", **places: str) -> Usage:
 
 
 def plain(*names: str) -> dict[str, tuple[str, ...]]:
-    """Return parameters that stand at the top, under their common names."""
+    """Return parameters at the top of a body, under their common names."""
     return {name: (name,) for name in names}
 
 

@@ -269,13 +269,17 @@ def test_a_planted_value_is_refused_and_not_executed(cache, stock, tmp_path, pad
     stock[key] = [Bomb(tmp_path / "mark"), padding]
     with pytest.raises(RecordingError):
         cache.get(key)
-    assert left_out(cache) == ["the cache holds a pickle or names a file: it is not ours"]
+    assert left_out(cache) == [
+        "the cache holds a pickle or names a file: merge-runner did not write it"
+    ]
     assert not (tmp_path / "mark").exists()
 
 
 def test_no_key_is_unpickled_where_all_are_listed(cache, stock, tmp_path):
     stock[Bomb(tmp_path / "mark")] = entry().to_json()
-    assert left_out(cache) == ["the cache holds a key that is no text: it is not ours"]
+    assert left_out(cache) == [
+        "the cache holds a key that is no text: merge-runner did not write it"
+    ]
     with (
         diskcache.Cache(str(cache.folder), disk=TextDisk) as texts,
         pytest.raises(RecordingError, match="a key that is no text"),
