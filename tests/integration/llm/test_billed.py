@@ -158,7 +158,7 @@ async def test_a_server_that_ignores_the_output_cap_does_not_pass_the_other_one(
     spending = client.budget.ledger.read()
     assert 0.6 * cap_usd < till.usd <= cap_usd
     assert spending.spent_usd == pytest.approx(till.usd)
-    assert spending.overruns[client.driver] == pytest.approx(from_now_on, rel=0.05)
+    assert spending.overruns[client.endpoint.driver] == pytest.approx(from_now_on, rel=0.05)
     assert any("does not keep to the cap of 16000 output" in note for note in client.meter.notes)
 
 
