@@ -54,7 +54,12 @@ class Reservation:
     def __post_init__(self) -> None:
         self.budget.in_flight += 1
         self.budget.queued_usd += self.usd if self.queued else 0.0
-        self.budget.charge(self.trial, self.usd)
+        self._charge(self.usd)
+
+    @classmethod
+    def resume(cls, budget: Budget, trial: int, key: str, label: CallLabel) -> Reservation:
+        """Return the reservation of an attempt that an earlier run, of any sweep, has begun."""
+        return cls(budget, trial, key, label, budget.ledger.reserved_usd(key), queued=False)
 
     async def ask_coordinator(self) -> None:
         """Wait until the coordinator has reserved the attempt; raise TrialSuspended.
@@ -90,8 +95,45 @@ class Reservation:
         if self.budget.ledger.is_shared_out:
             self.budget.ledger.report_cost(self.key, self.cost_usd)
         if self.cost_usd is not None:
-            self.budget.charge(self.trial, self.cost_usd - self.usd)
-        self.budget.wake()
+            self._charge(self.cost_usd - self.usd)
+        self.budget.queue.wake()
+
+    def _charge(self, usd: float) -> None:
+        """Add to what the trial, if it still runs, has spent and reserved."""
+        if self.trial in self.budget.charged_usd:
+            self.budget.charged_usd[self.trial] += usd
+
+
+class MoneyQueue:
+    """Priority queue: attempts before trials that wait for admission, then by trial."""
+
+    def __init__(self, ledger: Ledger) -> None:
+        self.places: list[tuple[tuple[bool, int], asyncio.Event]] = []
+        self._ledger = ledger
+
+    def wake(self) -> None:
+        """Let the first in the queue check whether it may go on."""
+        if self.places:
+            self.places[0][1].set()
+
+    async def wait(self, place: tuple[bool, int], may_go: Callable[[float], bool]) -> None:
+        """Wait in the queue until ``may_go``, which gets the s waited so far, is True."""
+        changed, loop = asyncio.Event(), asyncio.get_running_loop()
+        own, began_s = (place, changed), loop.time()
+        bisect.insort(self.places, own, key=itemgetter(0))
+        try:
+            while self.places[0] is not own or not may_go(loop.time() - began_s):
+                changed.clear()
+                # No event reports that an older trial waits for this call, or that a run of another
+                # model under the same cap frees money.
+                try:
+                    async with asyncio.timeout(PATIENCE_S):
+                        await changed.wait()
+                except TimeoutError:
+                    await asyncio.to_thread(self._ledger.read)
+        finally:
+            self.places.remove(own)
+            self.wake()
 
 
 class Budget:
@@ -111,18 +153,17 @@ class Budget:
         self._largest_usd = 0.0
         self._spent_before = ledger.spending.committed_usd > 0
         self._left: set[int] = set()
-        # A priority queue: attempts before trials that wait for admission, then by trial.
-        self._queue: list[tuple[tuple[bool, int], asyncio.Event]] = []
+        self.queue = MoneyQueue(ledger)
 
     @property
     def waiting(self) -> set[int]:
         """Trials that wait for money, for admission or for an attempt."""
-        return {trial for (_, trial), _ in self._queue}
+        return {trial for (_, trial), _ in self.queue.places}
 
     async def admit(self, trial: int) -> None:
         """Wait until a trial may begin; raise TrialSuspended when no trial's end can let it."""
         if self.ledger.cap is not None and trial not in self.charged_usd:
-            await self._wait_in_queue((True, trial), lambda _: self._may_begin(trial))
+            await self.queue.wait((True, trial), lambda _: self._may_begin(trial))
 
     def readmit(self, trial: int) -> None:
         """Admit a trial at once: an earlier run has asked for it."""
@@ -133,7 +174,7 @@ class Budget:
         """Free the money of a trial that has ended or is suspended."""
         self._left.add(trial)
         if self.charged_usd.pop(trial, None) is not None:
-            self.wake()
+            self.queue.wake()
 
     async def reserve(self, trial: int, key: str, label: CallLabel) -> Reservation:
         """Reserve an attempt's worst case, scaled where its server ignores the output cap.
@@ -142,28 +183,15 @@ class Budget:
         caller closes the reservation.
         """
         usd = self._worst_usd(label)
-        if self.ledger.cap is not None and (self._queue or not self._may_reserve(trial, usd, 0.0)):
+        if self.ledger.cap is not None and (
+            self.queue.places or not self._may_reserve(trial, usd, 0.0)
+        ):
             may_reserve = partial(self._may_reserve, trial)
             place = (False, trial)
-            await self._wait_in_queue(place, lambda s: may_reserve(self._worst_usd(label), s))
+            await self.queue.wait(place, lambda s: may_reserve(self._worst_usd(label), s))
             usd = self._worst_usd(label)
         self._largest_usd = max(self._largest_usd, usd)
         return Reservation(self, trial, key, label, usd)
-
-    def resume(self, trial: int, key: str, label: CallLabel) -> Reservation:
-        """Return the reservation of an attempt that an earlier run, of any sweep, has begun."""
-        usd = self.ledger.reserved_usd(key)
-        return Reservation(self, trial, key, label, usd, queued=False)
-
-    def charge(self, trial: int, usd: float) -> None:
-        """Add to what a running trial has spent and reserved."""
-        if trial in self.charged_usd:
-            self.charged_usd[trial] += usd
-
-    def wake(self) -> None:
-        """Let the first in the queue check whether it may go on."""
-        if self._queue:
-            self._queue[0][1].set()
 
     def _may_begin(self, trial: int) -> bool:
         """Admit a trial if its expected cost fits beside the running ones; raise TrialSuspended."""
@@ -210,27 +238,6 @@ class Budget:
             if trial < before:
                 needed_usd += max(0.0, self.trial_usd(trial) - charged_usd)
         return needed_usd
-
-    async def _wait_in_queue(
-        self, place: tuple[bool, int], may_go: Callable[[float], bool]
-    ) -> None:
-        """Wait in the queue until ``may_go``, which gets the s waited so far, is True."""
-        changed, loop = asyncio.Event(), asyncio.get_running_loop()
-        own, began_s = (place, changed), loop.time()
-        bisect.insort(self._queue, own, key=itemgetter(0))
-        try:
-            while self._queue[0] is not own or not may_go(loop.time() - began_s):
-                changed.clear()
-                # No event reports that an older trial waits for this call, or that a run of another
-                # model under the same cap frees money.
-                try:
-                    async with asyncio.timeout(PATIENCE_S):
-                        await changed.wait()
-                except TimeoutError:
-                    await asyncio.to_thread(self.ledger.read)
-        finally:
-            self._queue.remove(own)
-            self.wake()
 
     def _suspended(self, what: str) -> TrialSuspended:
         """Return the error of a trial for which the money left is too little."""

@@ -178,7 +178,7 @@ class LlmClient:
         if self.calls.stopping or not (call.askers or call.pending_batch):
             raise self.calls.given_up(call)
         if call.pending_batch:
-            reservation = self.budget.resume(call.order, key, label)
+            reservation = Reservation.resume(self.budget, call.order, key, label)
         else:
             call.wait = Wait(NO_MONEY, blocked=True)
             reservation = await self.budget.reserve(call.order, key, label)

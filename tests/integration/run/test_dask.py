@@ -159,7 +159,7 @@ def test_the_share_of_a_task_stays_reserved_until_the_task_is_kept(tmp_path):
         ledger = Ledger(cache, "baseline")
         for name in ("lost", "kept"):
             asked = CallLabel("Dask worker tcp://1", "L_4_0", 5.0)
-            reserve = partial(ledger.reserve, name, 1, 5.0, None, asked)
+            reserve = partial(ledger.reserve, name, 1, 5.0, asked)
             assert cache.run_now([reserve]) == [True]
         assert (ledger.read().reserved_usd, ledger.read().open_attempts) == (10, 2)
         unclear = ("a key", 1, 0.5, "o3", "N_0_0", 0.5, "2026-01-01T00:00:00Z", "read_timeout")
