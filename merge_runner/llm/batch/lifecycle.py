@@ -8,7 +8,6 @@ there.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import math
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -87,9 +86,11 @@ class Lifecycle:
         begun = []
 
         async def begin(each: BatchRequest) -> None:
-            with contextlib.suppress(TrialSuspended):
+            try:
                 await each.reservation.begin(each.number)
                 begun.append(each.request)
+            except TrialSuspended as exc:
+                batch.refused[each.request.key] = exc
 
         await asyncio.gather(*map(begin, requests))
         await self._note(batch, lines={r.key: batch.note.lines[r.key] for r in begun})

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 from pydantic import AwareDatetime, BaseModel, ValidationError
 
-from merge_runner.errors import MergeRunnerError, RecordingError
+from merge_runner.errors import MergeRunnerError, RecordingError, TrialSuspended
 from merge_runner.llm.budget import Reservation
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.http_outcome import AttemptOutcome
@@ -42,12 +42,14 @@ class Batch:
 
     ``work`` follows it to its end; None: no call of this run waits for it yet. ``results`` has the
     outcomes that are not taken yet, by key, and ``default`` that of all other requests; None: they
-    go into the next round. An ``error`` ends the sweep.
+    go into the next round. ``refused`` has, by key, why the money of a request was not reserved.
+    An ``error`` ends the sweep.
     """
 
     note: BatchNote
     results: dict[str, AttemptOutcome] = field(default_factory=dict)
     default: AttemptOutcome | None = None
+    refused: dict[str, TrialSuspended] = field(default_factory=dict)
     error: MergeRunnerError | None = None
     work: asyncio.Task[None] | None = None
 

@@ -17,10 +17,10 @@ from collections.abc import Callable, Collection, Sequence
 from datetime import UTC, datetime
 from functools import partial
 
-from merge_runner.errors import RecordingError, TrialSuspended
+from merge_runner.errors import RecordingError
 from merge_runner.llm.batch.lifecycle import Lifecycle, no_result
 from merge_runner.llm.batch.notes import PREFIX, Batch, BatchNote, BatchRequest, noted_batches
-from merge_runner.llm.budget import USED_UP, Reservation
+from merge_runner.llm.budget import Reservation
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.http_outcome import AttemptOutcome
 from merge_runner.records import ChatRequest
@@ -80,8 +80,8 @@ class Rounds:
         batch = batch or await self._next_round(request, number, reservation, model)
         while True:
             await asyncio.shield(batch.work or self._lifecycle.start(batch))
-            if request.key not in batch.note.lines:
-                raise TrialSuspended(USED_UP)
+            if refusal := batch.refused.get(request.key):
+                raise refusal
             outcome = batch.results.pop(request.key, batch.default)
             if outcome is None and not self.submits:
                 outcome = no_result("not_created", "the run ended before", charged=False)
