@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import json
 import select
 import socket
 import ssl
 from base64 import b64encode
 from collections.abc import Iterator, Mapping
 from contextlib import aclosing, suppress
+from dataclasses import asdict
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
@@ -26,7 +28,7 @@ from merge_runner.errors import UsageError
 from merge_runner.llm.formats.wire import as_dict, as_dicts, as_text
 from merge_runner.llm.http_outcome import Action, RawReply, TransportFailure
 from merge_runner.llm.masking import Mask
-from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, ChatRequest, canonical_json
+from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, ChatRequest
 
 if TYPE_CHECKING:
     from aiohttp.client_proto import ResponseHandler
@@ -100,7 +102,8 @@ class HttpTransport:
         """Post the hashed bytes; raise TransportFailure."""
         headers = request.headers
         if self._sends_slot:
-            slot = canonical_json(request.slot.as_dict())
+            # In the canonical form: the emulator's replies depend on it.
+            slot = json.dumps(asdict(request.slot), sort_keys=True, separators=(",", ":"))
             headers = {**headers, SLOT_HEADER: slot, ATTEMPT_HEADER: str(attempt)}
         body = request.body.encode()
         return await self.ask("POST", request.path, headers, body, timeout_s=timeout_s)

@@ -84,7 +84,7 @@ def test_a_file_that_a_row_names_is_neither_read_nor_deleted(folder, mode, leads
             [mode, names[leads], key],
         )
     cache = ResponseCache(folder)
-    with pytest.raises(RecordingError, match="not ours"):
+    with pytest.raises(RecordingError, match="did not write it"):
         cache.get(key)
     assert cache.run_now([partial(cache.quarantine, key)]) == [[key]]
     assert cache.put_now([FIRST]) == [FIRST]
