@@ -11,7 +11,8 @@ from functools import cache
 from itertools import islice
 from pathlib import Path
 
-from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.store import CachedCall
 from merge_runner.records import call_key
 
 BATCH = 500

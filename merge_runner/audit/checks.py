@@ -17,7 +17,7 @@ from typing import Any
 import duckdb
 
 from merge_runner.errors import RecordingError, StoreError
-from merge_runner.llm.cache import CachedCall
+from merge_runner.llm.store import CachedCall
 from merge_runner.records import ANSWERED_FIELD, SIDES, canonical_json
 from merge_runner.results.database import append, by_name, read_database, schema_sql
 from merge_runner.results.instance import SETTINGS, in_memory, limit_memory

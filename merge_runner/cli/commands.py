@@ -472,12 +472,12 @@ def recording_info(
 def ledger(
     cache: cli.CacheOption = DEFAULT_CACHE,
     release: Annotated[
-        str | None, cli.option("SWEEP", "Stop counting what is set aside.", "--release")
+        str | None, cli.option("SWEEP", "Stop counting what is reserved.", "--release")
     ] = None,
     yes: cli.YesOption = False,
     as_json: cli.JsonOption = False,
 ) -> None:
-    """Show what each sweep has spent, and what is set aside.
+    """Show what each sweep has spent and reserved.
 
     Example: merge-runner ledger --cache cache/responses
     """
@@ -495,7 +495,7 @@ def ledger(
             chosen = Ledger(opened, release)
             spending = chosen.read()
             agree(
-                f"{spending.reserved_usd:.4f} USD are set aside for {spending.open_attempts} "
+                f"{spending.reserved_usd:.4f} USD are reserved for {spending.open_attempts} "
                 f"attempts at {release}. If the provider did charge for them, --max-cost may be "
                 "passed by as much",
                 "Release it?",

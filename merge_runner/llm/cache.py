@@ -1,59 +1,23 @@
-"""Recorded replies on disk, and what they cost: one SQLite file, in which nothing is evicted.
-
-An entry is the JSON of a request and every attempt, the answering one last, behind a checksum.
-It is durable before anyone sees it: each batch of writes is one synchronous SQLite transaction.
-Beside the entries lie the attempts of calls that have no answer yet, the notes of batches, and
-damaged entries in quarantine. Two tables of our own in the same file hold the money of all sweeps
-(``ledger``), so that a reply and its cost are kept together or not at all; a third one counts the
-calls by kind (``kinds``).
-"""
+"""Cache folder: list, import and quarantine recorded calls."""
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import operator
-import os
-import sqlite3
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, closing
-from dataclasses import dataclass
-from functools import cached_property, partial
+from collections.abc import Iterable, Iterator
+from contextlib import closing
+from functools import partial
 from itertools import islice
 from pathlib import Path
-from threading import Lock
-from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import diskcache
-from diskcache.core import MODE_RAW
-from pydantic import Field, TypeAdapter, ValidationError
+from merge_runner.errors import RecordingError
+from merge_runner.llm.cache_file import FAILURES, FOREIGN_KEY
+from merge_runner.llm.durable import Execute, Operation
+from merge_runner.llm.store import UNANSWERED, Attempts, CachedCall, CallStore, text_of, verified
+from merge_runner.records import DAMAGED, check_body
 
-from merge_runner.errors import CacheFailed, MergeRunnerError, RecordingError, UsageError
-from merge_runner.llm.cache_file import FAILURES, FILE, NEW_CACHE, close_texts, open_texts, prepare
-from merge_runner.llm.durable import BatchWriter, Execute, ModelLocks, Operation, Rows, connect
-from merge_runner.records import DAMAGED, Attempt, ChatRequest, check_body, check_call
-
-if TYPE_CHECKING:
-    from merge_runner.llm.kinds import Kinds
-
-CHECKSUM_LENGTH = 32
 BATCH = 1_000
-Attempts = tuple[Attempt, ...]
-ATTEMPTS = TypeAdapter(Attempts)
-# Prefixes of keys that are no call keys.
-_UNANSWERED, _DAMAGED = "attempts ", "damaged "
-UNSEEN = "the run ended before a reply was seen; it may have been charged"
-_GET = "SELECT mode, filename, value FROM Cache WHERE key = ? AND raw = 1"
-# The rows of a call, and of its attempts whose end nobody has seen.
-_LOOK_UP = """
-SELECT key, mode, filename, value FROM Cache WHERE raw = 1 AND key IN (?1, ?2)
-UNION ALL SELECT NULL, attempt, NULL, since FROM open WHERE call = ?1 AND outcome = 'in flight'
-"""
-_ADD = "INSERT INTO Cache (key, raw, mode, value) VALUES (?, 1, 1, ?) ON CONFLICT DO NOTHING"
-_KEYS = """
-SELECT CAST(key AS BLOB) FROM Cache WHERE typeof(key) = 'text' AND key >= ? AND key < ? ORDER BY key
-"""
-# A call's key has 64 characters, without a space; another type or a damaged key is told.
+# A call's key has 64 characters, without a space; keys of another type are reported as damaged.
 _IS_CALL = """(
 typeof(key) != 'text' OR raw IS NOT 1 OR length(CAST(key AS BLOB)) = 64 AND NOT instr(key, ' ')
 )"""
@@ -66,119 +30,8 @@ AND length(CAST(key AS BLOB)) = 64 AND NOT instr(key, ' ') ORDER BY rowid DESC L
 _CALL = "SELECT key, raw, mode, filename, value FROM Cache WHERE rowid = ?"
 
 
-@dataclass(frozen=True, slots=True)
-class CachedCall:
-    """A recorded call: its request, and all attempts, the answering one last."""
-
-    request: ChatRequest
-    attempts: Annotated[Attempts, Field(min_length=1)]
-
-    def to_json(self) -> str:
-        """Return the entry as one JSON text."""
-        return _STORED.dump_json(_Stored(1, self)).decode()
-
-    @classmethod
-    def from_json(cls, text: str) -> CachedCall:
-        """Read an entry; raises RecordingError."""
-        try:
-            return _STORED.validate_json(text, strict=True).entry
-        except ValidationError as exc:
-            why = exc.errors()[0]["msg"]
-            raise RecordingError(f"the recorded reply is damaged: {why}") from exc
-
-
-@dataclass(frozen=True, slots=True)
-class _Stored:
-    """An entry as it lies in the cache."""
-
-    version: Literal[1]
-    entry: CachedCall
-
-
-_STORED: TypeAdapter[_Stored] = TypeAdapter(_Stored)
-Overlay = tuple[Mapping[str, CachedCall], "Kinds"]
-"""A recording: its entries by key, and how many there are of each kind."""
-
-
-class ResponseCache:
-    """The cache folder. Reads are direct; writes are batched in a thread and awaited.
-
-    ``locks`` keep other live runs from asking the same model. ``write`` runs an operation in the
-    next durable batch, and returns its future result.
-    """
-
-    def __init__(
-        self,
-        folder: Path,
-        *,
-        overlay: Callable[[], AbstractContextManager[Overlay]] | None = None,
-        read_only: bool = False,
-        before: bool = False,
-    ) -> None:
-        """Open or make the folder; ``overlay`` opens a recording.
-
-        What the recording holds comes before what the folder holds; both are closed together.
-        ``read_only`` changes nothing in the folder, which must be there, and may be of the format
-        ``before``; else it is brought to this one. Raises UsageError for a folder that cannot be
-        used.
-        """
-        self.folder = folder
-        self.locks = ModelLocks(folder)
-        self._open_overlay, self._with_overlay = overlay, contextlib.ExitStack()
-        self._writer = BatchWriter(self._run_each)
-        self.write = self._writer.write
-        self.summed: object = None  # the ledger that knows its sums in the transaction under way
-        try:
-            prepare(folder, read_only=read_only, before=before)
-            self._opened = self._file
-            self._one_query = Lock()
-            with contextlib.ExitStack() as unless_opened:
-                self._reading = unless_opened.enter_context(closing(connect(folder / FILE)))
-                self._texts: Any = None if read_only else open_texts(folder)
-                unless_opened.pop_all()
-        except FAILURES as exc:
-            raise UsageError(f"the cache {folder} cannot be used: {exc}. {NEW_CACHE}") from exc
-
-    @cached_property
-    def recording(self) -> Overlay:
-        """The recording, opened when it is first asked for."""
-        opened = self._open_overlay
-        return self._with_overlay.enter_context(opened()) if opened else ({}, {})
-
-    def get(self, key: str, request: ChatRequest | None = None) -> CachedCall | None:
-        """Return the entry of a call, whose ``request`` is given where it is known.
-
-        Raises RecordingError where it is damaged or made up.
-        """
-        return self.recording[0].get(key) or self._kept(key, request)
-
-    def in_recording(self, key: str) -> bool:
-        """Whether the recording holds an entry of a call key."""
-        return key in self.recording[0]
-
-    def look_up(
-        self, key: str, request: ChatRequest | None = None
-    ) -> tuple[CachedCall | None, Attempts]:
-        """Return the entry of a call, or the attempts of earlier runs, also unknown ones.
-
-        ``request`` is the call's where it is known. Raises RecordingError where what is recorded is
-        damaged or made up.
-        """
-        if recorded := self.recording[0].get(key):
-            return recorded, ()
-        rows = self.rows(_LOOK_UP, key, _UNANSWERED + key)
-        if not rows:
-            return None, ()
-        texts = {name: row for name, *row in rows if name is not None}
-        if key in texts:
-            return _verified(key, text_of(*texts[key]), request), ()
-        tried = _attempts(text_of(*texts[_UNANSWERED + key])) if texts else ()
-        begun = sorted(row for row in rows if row[0] is None and row[1] > len(tried))
-        unseen = (
-            Attempt(number, "unknown", started_at=since, error=UNSEEN)
-            for number, (*_, since) in enumerate(begun, len(tried) + 1)
-        )
-        return None, (*tried, *unseen)
+class ResponseCache(CallStore):
+    """Calls of a cache folder and of a recording."""
 
     def put_now(
         self,
@@ -186,20 +39,19 @@ class ResponseCache:
         tried: Iterable[tuple[str, Attempts]] = (),
         money: Iterable[Operation] = (),
     ) -> list[CachedCall]:
-        """Keep entries, and attempts at calls without an answer, in one transaction in this thread.
+        """Store entries, and attempts of calls without an answer, in one transaction here.
 
-        What they cost is settled in it by the operations ``money``. Returns the entries that are
-        kept.
+        The operations ``money`` book their costs in it. Returns the entries that are stored.
         """
         entries = list(entries)
-        aside = [partial(self.set_damage_aside, entry.request.key) for entry in entries]
+        damaged = [partial(self.quarantine, entry.request.key) for entry in entries]
         kept = [partial(self.keep, entry) for entry in entries]
-        others = [partial(self.remove, _UNANSWERED + entry.request.key) for entry in entries]
+        others = [partial(self.remove, UNANSWERED + entry.request.key) for entry in entries]
         others += [partial(self.keep_attempts, *each) for each in tried]
-        return self.run_now([*aside, *kept, *others, *money])[len(aside) :][: len(kept)]
+        return self.run_now([*damaged, *kept, *others, *money])[len(damaged) :][: len(kept)]
 
     def add_missing(self, entries: Iterable[CachedCall]) -> tuple[int, int]:
-        """Keep the entries that the cache lacks; returns (added, already there)."""
+        """Store the entries that the cache lacks; return (added, already there)."""
         added = seen = 0
         waiting = iter(entries)
         while batch := list(islice(waiting, BATCH)):
@@ -208,69 +60,23 @@ class ResponseCache:
         return added, seen - added
 
     def all_unanswered(self) -> dict[str, Attempts]:
-        """Return the attempts at all calls without an answer, by call key."""
-        keys = (name.removeprefix(_UNANSWERED) for name in self.names(_UNANSWERED))
+        """Return the attempts of all calls without an answer, by call key."""
+        keys = (name.removeprefix(UNANSWERED) for name in self.names(UNANSWERED))
         return {key: self._tried(key) for key in keys}
 
-    def run_now(self, operations: Sequence[Operation]) -> list[Any]:
-        """Run operations in one durable transaction, in this thread."""
-        try:
-            with self._texts.transact():
-                execute, self.summed = self._texts._sql, None
-                results = [operation(execute) for operation in operations]
-                if self._file != self._opened:
-                    raise FileNotFoundError("it is no longer there")
-                return results
-        except (diskcache.Timeout, *FAILURES) as exc:
-            # On a full disk SQLite rolls back itself, and diskcache's own attempt hides the reason.
-            hidden = exc.__context__ if isinstance(exc, sqlite3.Error) else None
-            raise self._failure("written", hidden or exc) from exc
-
-    def _run_each(self, operations: Sequence[Operation]) -> list[Any]:
-        """Run operations in one durable transaction; where one fails, each in one of its own.
-
-        Its result is then an error of its own.
-        """
-        try:
-            return self.run_now(operations)
-        except CacheFailed:
-            raise
-        except (MergeRunnerError, *DAMAGED) as exc:
-            alone = len(operations) == 1
-            return [exc] if alone else [self._run_each([each])[0] for each in operations]
-
-    def read(self, name: str) -> str | None:
-        """Return the text under a name, or None; raises RecordingError where it is damaged."""
-        rows = self.rows(_GET, name)
-        return text_of(*rows[0]) if rows else None
-
-    def replace(self, name: str, text: str, _: Execute) -> None:
-        """Keep a text under a name that is no call key, behind a checksum; an operation."""
-        self._texts.set(name, _behind_checksum(text))
-
-    def remove(self, name: str, _: Execute) -> None:
-        """Forget the text under a name that is no call key; an operation."""
-        self._texts.delete(name)
-
-    def names(self, prefix: str) -> list[str]:
-        """Return the names, none of a call, that begin with a prefix."""
-        rows = self.rows(_KEYS, prefix, prefix + chr(0x10FFFF))
-        return [name.decode(errors="replace") for (name,) in rows]
-
     def entries(self, left_out: list[str] | None = None) -> Iterator[CachedCall]:
-        """Yield all entries, of the folder and of the overlay, each verified.
+        """Yield all verified entries, of the folder and of the recording.
 
-        What is damaged, or none of ours, is left out, and the reason added to ``left_out``.
+        Rows that are damaged, or not written by merge-runner, are left out; the reason is added to
+        ``left_out``.
         """
         try:
             for row in self._reading.execute(_CALLS):
                 try:
                     ((key, raw, *value),) = self.rows(_CALL, *row)
                     if not (raw and isinstance(key, str)):
-                        raise RecordingError(
-                            "the cache holds a key that is no text: it is not ours"
-                        )
-                    entry = _verified(key, text_of(*value))
+                        raise RecordingError(FOREIGN_KEY)
+                    entry = verified(key, text_of(*value))
                     check_body(entry.request.body)
                     yield entry
                 except (RecordingError, *DAMAGED) as exc:
@@ -281,7 +87,7 @@ class ResponseCache:
         yield from self.recording[0].values()
 
     def newest(self, most: int) -> Iterator[CachedCall]:
-        """Yield the calls that the folder has answered last, the newest first, but damaged ones."""
+        """Yield the newest calls of the folder, the newest first; damaged ones are left out."""
         for (key,) in self.rows(_NEWEST, most):
             call = None
             with contextlib.suppress(RecordingError):
@@ -291,98 +97,28 @@ class ResponseCache:
 
     @property
     def number(self) -> int:
-        """The number of calls in the folder, with damaged ones."""
+        """Number of calls in the folder, with damaged ones."""
         return int(self.rows(_NUMBER)[0][0])
 
-    def close(self) -> None:
-        """Close the folder and the recording before it, and free its locks."""
-        self._with_overlay.close()
-        self._writer.close()
-        self.locks.close()
-        self._reading.close()  # first, since the last one to write ends the journal
-        if self._texts is not None:
-            close_texts(self._texts)
+    def quarantine(self, key: str, execute: Execute) -> list[str]:
+        """Quarantine a damaged entry or list of attempts, unchanged; an operation.
 
-    def keep(self, entry: CachedCall, execute: Execute) -> CachedCall:
-        """Keep an entry unless there is one, and return what is kept; an operation.
-
-        One that is damaged goes to quarantine.
-        """
-        key, text = entry.request.key, _behind_checksum(entry.to_json())
-        if not execute(_ADD, (key, text)).rowcount:
-            try:
-                return self._kept(key) or entry
-            except RecordingError:
-                self._move_aside(key, execute)
-                execute(_ADD, (key, text))
-        if len(entry.attempts) > 1:
-            self._texts.delete(_UNANSWERED + key)
-        return entry
-
-    def keep_attempts(self, key: str, attempts: Attempts, execute: Execute) -> None:
-        """Keep the attempts at a call that has no answer yet; an operation."""
-        self.replace(_UNANSWERED + key, ATTEMPTS.dump_json(attempts).decode(), execute)
-
-    def set_damage_aside(self, key: str, execute: Execute) -> list[str]:
-        """Move a damaged entry or list of attempts to quarantine as it is; an operation.
-
-        Returns their names.
+        Returns the names of what was damaged.
         """
         damaged = []
-        for name, check in ((key, self._kept), (_UNANSWERED + key, self._tried)):
+        for name, check in ((key, self._kept), (UNANSWERED + key, self._tried)):
             try:
                 check(key)
             except RecordingError:
                 damaged.append(name)
-                self._move_aside(name, execute)
+                self._quarantine_row(name, execute)
         return damaged
-
-    def _move_aside(self, name: str, execute: Execute) -> None:
-        """Rename a row, whatever it holds; an operation."""
-        aside = _DAMAGED + name
-        aside += f" {len(before) + 1}" if (before := self.names(aside)) else ""
-        execute("UPDATE Cache SET key = ? WHERE key = ? AND raw = 1", [aside, name])
-
-    def _kept(self, key: str, request: ChatRequest | None = None) -> CachedCall | None:
-        text = self.read(key)
-        return None if text is None else _verified(key, text, request)
-
-    def _tried(self, key: str) -> Attempts:
-        return _attempts(self.read(_UNANSWERED + key) or "[]")
-
-    def rows(self, sql: str, *values: object) -> Rows:
-        """Return the rows of a query; raises CacheFailed, or RecordingError for what is no text."""
-        try:
-            with self._one_query:
-                return self._reading.execute(sql, values).fetchall()
-        except FAILURES as exc:
-            raise self._failure("read", exc) from exc
-
-    def _failure(self, done: str, why: BaseException) -> CacheFailed | RecordingError:
-        """Return the error of a folder that cannot be used, or of what is no text."""
-        if "utf-8" in str(why).lower():  # SQLite says no more of it
-            return RecordingError("the recorded reply is damaged: it is no text")
-        told = f"cannot be {done}: {str(why) or 'another program writes'}"
-        if self._file != self._opened:
-            told = "was removed, moved or replaced while it was in use"
-        return CacheFailed(
-            f"the cache {self.folder} {told}. When that is mended, or a copy of it put back, "
-            "run the same command again: what is in no cache is asked again"
-        )
-
-    @property
-    def _file(self) -> tuple[int, int] | None:
-        """The identity of the file in the folder: SQLite goes on with one that is gone."""
-        with contextlib.suppress(OSError):
-            status = os.stat(self.folder / FILE)
-            return status.st_dev, status.st_ino
-        return None
 
 
 def import_folder(folder: Path, cache: ResponseCache) -> tuple[int, int]:
-    """Add what the cache lacks of another folder's replies; returns (added, already there).
+    """Add the replies of another folder that the cache lacks; return (added, already there).
 
-    The folder is only read. Raises RecordingError, when all others are added, if any was damaged.
+    The folder is only read. Raises RecordingError after all others are added, if any was damaged.
     """
     left_out: list[str] = []
     with closing(ResponseCache(folder, read_only=True, before=True)) as source:
@@ -393,46 +129,3 @@ def import_folder(folder: Path, cache: ResponseCache) -> tuple[int, int]:
             f"{len(left_out)} rows are left out, the first: {left_out[0]}"
         )
     return added, there
-
-
-def both(first: Operation, then: Operation, execute: Execute) -> Any:  # noqa: ANN401 # of any
-    """Run two operations as one, with the result of the first."""
-    result = first(execute)
-    then(execute)
-    return result
-
-
-def _attempts(text: str) -> Attempts:
-    try:
-        return ATTEMPTS.validate_json(text)
-    except ValidationError as exc:
-        raise RecordingError("the list of earlier attempts is damaged") from exc
-
-
-def _verified(key: str, text: str, request: ChatRequest | None = None) -> CachedCall:
-    """Return the entry that a row holds; raises RecordingError unless it belongs to its key."""
-    entry = CachedCall.from_json(text)
-    try:
-        check_call(key, entry.request, entry.attempts, request)
-    except DAMAGED as exc:
-        raise RecordingError(f"the recorded reply is damaged: {exc}") from exc
-    return entry
-
-
-def _behind_checksum(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()[:CHECKSUM_LENGTH] + text
-
-
-def text_of(mode: object, filename: object, value: object) -> str:
-    """Return the text of a row, which was put behind a checksum.
-
-    Raises RecordingError where it is damaged, or none of ours.
-    """
-    if filename is not None or mode != MODE_RAW:
-        raise RecordingError("the cache holds a pickle or names a file: it is not ours")
-    if not isinstance(value, str):
-        raise RecordingError("the recorded reply is damaged: it is no text")
-    content = value[CHECKSUM_LENGTH:]
-    if value != _behind_checksum(content):
-        raise RecordingError("the recorded reply is damaged: its checksum is wrong")
-    return content

@@ -1,8 +1,8 @@
-"""The file of a cache folder: made whole or not at all, refused if it is none of ours, upgraded.
+"""File of a cache folder: create it atomically, refuse one of another program, upgrade it.
 
-Anybody may have written the file of a folder, and diskcache unpickles keys and values, opens and
-removes the files that rows name, and applies the settings that it finds. So ``TextDisk`` takes and
-gives texts alone, and a file with other settings than ours is refused before diskcache opens it.
+Any program may have written the file, and diskcache unpickles keys and values, opens and removes
+the files that rows name, and applies the settings it reads. So ``TextDisk`` stores and returns text
+only, and a file with unknown settings is refused before diskcache opens it.
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ import diskcache
 from diskcache.core import METADATA, MODE_RAW, UNKNOWN
 
 from merge_runner.errors import RecordingError, UsageError
-from merge_runner.llm.durable import BUSY_S, ModelLocks, connect, making
+from merge_runner.llm.durable import BUSY_S, ModelLocks, connect, folder_lock
 from merge_runner.text_safety import one_line
 
 FILE = "cache.db"
+FOREIGN_KEY = "the cache holds a key that is no text: merge-runner did not write it"
 LEDGER = "ledger.db"  # of format 5, whose money lay in a file of its own
 FORMAT_KEY, FORMAT, BEFORE = "format", "6", "5"
 NEW_CACHE = "`merge-runner recording import FILE --cache NEW` makes one from a recording"
@@ -47,39 +48,39 @@ TABLES = (
 
 
 class TextDisk(diskcache.Disk):  # type: ignore[misc] # diskcache ships no types
-    """Texts alone: nothing is unpickled, and no file that a row names is opened or removed."""
+    """Disk for text only: it unpickles nothing, and touches no file that a row names."""
 
     def put(self, key: object) -> tuple[str, bool]:
-        """Return the key as it is stored; raises TypeError unless it is a text."""
+        """Return the key as stored; raise TypeError unless it is text."""
         if not isinstance(key, str):
             raise TypeError("the cache has texts alone as keys")
         return key, True
 
     def get(self, key: object, raw: object) -> str:
-        """Return a stored key; raises RecordingError unless it is a text."""
+        """Return a stored key; raise RecordingError unless it is text."""
         if not (raw and isinstance(key, str)):
-            raise RecordingError("the cache holds a key that is no text: it is not ours")
+            raise RecordingError(FOREIGN_KEY)
         return key
 
     def store(self, value: object, read: bool, key: object = UNKNOWN) -> tuple[int, int, None, str]:
-        """Return a row's size, mode, file name and value; raises TypeError unless it is a text."""
+        """Return a row's size, mode, file name and value; raise TypeError unless it is text."""
         if not isinstance(value, str):
             raise TypeError("the cache stores texts alone")
         return 0, MODE_RAW, None, value
 
     def fetch(self, *_: object, **__: object) -> str:
-        """Give nothing to diskcache itself: rows are read as ``cache`` checks them."""
+        """Refuse reads by diskcache itself: ``store`` reads and checks the rows."""
         raise RecordingError("diskcache reads no values here")
 
     def remove(self, file_path: object) -> None:
-        """Leave a file that a row names where it is: we wrote none."""
+        """Do nothing: no row of merge-runner names a file."""
 
 
 def open_texts(folder: Path) -> diskcache.Cache:
-    """Return the diskcache of a folder, whose file is made if there is none.
+    """Return the diskcache of a folder, and create its file if there is none.
 
-    Its triggers, which count rows and bytes as an eviction would need, are four more statements for
-    each reply: it goes without. Rows are counted when it is closed, and none has a size.
+    Its triggers, which count rows and bytes for an eviction, would cost four statements for each
+    reply: they are dropped. Rows are counted on closing, and none has a size.
     """
     texts = diskcache.Cache(str(folder), timeout=BUSY_S, disk=TextDisk, **SETTINGS)
     triggers = "SELECT name FROM sqlite_master WHERE type = 'trigger' AND tbl_name = 'Cache'"
@@ -87,13 +88,13 @@ def open_texts(folder: Path) -> diskcache.Cache:
         with texts.transact(retry=True):
             for name in ('"' + name.replace('"', '""') + '"' for (name,) in names):
                 texts._sql(f"DROP TRIGGER {name}")
-                # It would make one anew that is gone. No row of this table is ever deleted.
+                # diskcache would recreate a missing trigger. No row of this table is ever deleted.
                 texts._sql(f"CREATE TRIGGER {name} DELETE ON Settings BEGIN SELECT 0; END")
     return texts
 
 
 def close_texts(texts: diskcache.Cache) -> None:
-    """Close it when its rows are counted; where that cannot be written, it is as it was opened."""
+    """Count the rows and close; where the count cannot be written, it stays as it was opened."""
     with contextlib.suppress(*FAILURES):
         ((rows,),) = texts._sql("SELECT count(*) FROM Cache").fetchall()
         if len(texts) != rows:
@@ -102,10 +103,10 @@ def close_texts(texts: diskcache.Cache) -> None:
 
 
 def refuse_others(folder: Path) -> bytes:
-    """Return the format of a folder's file, as it is written there.
+    """Return the format that a folder's file names.
 
-    Raises UsageError for settings that we do not write, since diskcache would obey them, and for
-    the file of another version; the first one left no mark.
+    Raises UsageError for unknown settings, which diskcache would apply, and for the file of another
+    version; the first version left no mark.
     """
     sql = "SELECT CAST(value AS BLOB) FROM Cache WHERE key = ? AND raw = 1"
     with closing(connect(folder / FILE)) as connection:
@@ -126,12 +127,12 @@ def refuse_others(folder: Path) -> bytes:
 
 
 def make(folder: Path) -> None:
-    """Make a folder and its file, whole or not at all: an empty one is never taken for new."""
+    """Create a folder and its file atomically: an empty file is never taken for new."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     folder.chmod(0o700)
     if (folder / FILE).exists():
         return
-    with making(folder), tempfile.TemporaryDirectory(prefix="new-", dir=folder) as new:
+    with folder_lock(folder), tempfile.TemporaryDirectory(prefix="new-", dir=folder) as new:
         if not (folder / FILE).exists():
             with closing(open_texts(Path(new))) as made, made.transact():
                 made.set(FORMAT_KEY, FORMAT)
@@ -141,9 +142,9 @@ def make(folder: Path) -> None:
 
 
 def upgrade(folder: Path) -> None:
-    """Bring a folder of the format before to this one, with the money of its ledger."""
+    """Upgrade a folder of the format before, with its ledger."""
     locks = ModelLocks(folder)
-    with making(folder), closing(connect(folder / FILE, "rw")) as database, closing(locks):
+    with folder_lock(folder), closing(connect(folder / FILE, "rw")) as database, closing(locks):
         if refuse_others(folder) == FORMAT.encode():
             return
         if not locks.take_all():
@@ -162,9 +163,9 @@ def upgrade(folder: Path) -> None:
 
 
 def prepare(folder: Path, *, read_only: bool, before: bool) -> None:
-    """Make a folder that is not there, and upgrade one of the format before, or raise UsageError.
+    """Create a missing folder, and upgrade one of the format before; raise UsageError.
 
-    One that is ``read_only`` must be there, and only where ``before`` is True of that format.
+    With ``read_only`` it must exist, and may have that format only if ``before`` is True.
     """
     if read_only:
         require(folder)

@@ -1,113 +1,123 @@
-"""A call that is asked, what it waits for, and the counts of calls for display and summary."""
+"""A call under way, what it waits for, and the calls of a run."""
 
 from __future__ import annotations
 
 import asyncio
-from collections import Counter, deque
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from datetime import datetime
 from typing import TYPE_CHECKING
 
-from merge_runner.llm.ledger import Asked
-from merge_runner.records import Attempt, ChatReply, ChatRequest, Usage
+from merge_runner.llm.ledger import CallLabel
+from merge_runner.records import Attempt, CallFailed, ChatReply, ChatRequest, Usage
 
 if TYPE_CHECKING:
-    from merge_runner.llm.batch.rounds import Batch
+    from merge_runner.llm.batch.notes import Batch
 
 
 @dataclass(frozen=True, slots=True)
 class Wait:
-    """What a call waits for, and until when (UTC); None: until it happens.
+    """A wait of a call, ``until`` a moment (UTC) or until something happens.
 
-    It is ``idle`` where what it waits for does not happen by itself: an answer that makes room, or
-    that is somebody else's. It is ``paid`` where the answer may be charged already.
+    ``blocked``: only the end of another call can end it. ``charged``: the reply may be billed
+    already.
     """
 
     what: str
     until: datetime | None = None
-    idle: bool = False
-    paid: bool = False
+    blocked: bool = False
+    charged: bool = False
 
 
 @dataclass(slots=True, eq=False)
 class Call:
-    """A call that somebody waits for.
+    """A call under way, shared by all who ask for its key.
 
-    ``asked`` names it for a reader and bounds the cost of an attempt, ``worst`` bounds its tokens.
-    ``left_s`` is what its attempts and the waits between them may take yet; standing in the queue
-    of the limiter is no fault of the provider. ``attempts`` are all that were made, the first
-    ``earlier`` of them by earlier runs. While the call waits, ``wait`` says for what; otherwise it
-    is in flight, or being saved. ``task`` makes it. ``asking`` counts those who wait for its
-    answer. It goes ``singly`` where a batch brought no answer, and ``open`` says in which batch it
-    waits already. What is recorded of it may be ``damaged``.
+    ``label`` names it and bounds the cost of an attempt, ``worst`` bounds its tokens. ``left_s``
+    remains for its attempts and the waits between them; waits for the rate limiter do not count.
+    ``attempts`` has all attempts, the first ``earlier`` of them by earlier runs. ``wait`` is None
+    while it is in flight or being saved. ``task`` makes the call, ``askers`` counts who waits for
+    it. ``bypass_batch`` is set after a batch without a result for it; ``pending_batch`` is the
+    batch of an earlier run in which it waits. Its recorded reply may be ``damaged``.
     """
 
     request: ChatRequest
     order: int
-    asked: Asked
+    label: CallLabel
     worst: Usage
     left_s: float
     damaged: bool = False
     attempts: list[Attempt] = field(default_factory=list)
     earlier: int = 0
     wait: Wait | None = None
-    asking: int = 0
-    singly: bool = False
-    open: Batch | None = None
+    askers: int = 0
+    bypass_batch: bool = False
+    pending_batch: Batch | None = None
     task: asyncio.Task[ChatReply] = field(init=False)
 
     @property
     def own_attempts(self) -> list[Attempt]:
-        """The attempts of this run."""
+        """Attempts of this run."""
         return self.attempts[self.earlier :]
 
     @property
     def empty(self) -> int:
-        """The number of empty answers in this run."""
+        """Number of empty answers in this run."""
         return sum(attempt.outcome == "empty" for attempt in self.own_attempts)
 
     @property
     def last_failure(self) -> str:
-        """The reason why the last attempt brought no answer."""
+        """Why the last attempt brought no answer."""
         return self.attempts[-1].error or self.attempts[-1].outcome
 
 
 @dataclass(slots=True)
-class Meter:
-    """Counts of calls, attempts and cost.
+class Calls:
+    """The calls of a run, shared by its clients: two names of one model may ask the same.
 
-    ``calls_shared`` are those of ``calls_cached`` that this run has asked, for another trial, and
-    ``calls_recorded`` those of a recording that was named.
-    ``stand_ins`` counts the answers that a scripted stand-in gave in the model's name;
-    ``underpriced`` those that cost more than the registry knows, by service tier; ``damaged`` are
-    the keys of recorded replies that could not be read.
+    ``under_way`` has the calls that are not answered yet by key, ``answered`` the keys of those
+    that were answered. Once it is ``stopping``, no further attempt begins.
     """
 
-    calls_live: int = 0
-    calls_cached: int = 0
-    calls_shared: int = 0
-    calls_recorded: int = 0
-    cost_usd: float = 0.0
-    cost_unknown: int = 0
-    outcomes: Counter[str] = field(default_factory=Counter)
-    mismatches: Counter[str] = field(default_factory=Counter)
-    stand_ins: int = 0
-    underpriced: Counter[str] = field(default_factory=Counter)
-    notes: deque[str] = field(default_factory=deque)
-    damaged: list[str] = field(default_factory=list)
+    under_way: dict[str, Call] = field(default_factory=dict)
+    answered: set[str] = field(default_factory=set)
+    stopping: bool = False
 
     @property
-    def answered(self) -> tuple[int, int, int, int]:
-        """The calls: live, cached, and of these shared and recorded."""
-        return self.calls_live, self.calls_cached, self.calls_shared, self.calls_recorded
+    def waits(self) -> list[Wait]:
+        """Waits of the calls that are not in flight."""
+        return [call.wait for call in self.under_way.values() if call.wait is not None]
 
-    def count_attempt(self, attempt: Attempt) -> None:
-        """Count one live attempt."""
-        self.outcomes[attempt.outcome] += 1
-        self.cost_usd += attempt.cost_usd or 0.0
-        self.cost_unknown += attempt.cost_usd is None
+    @property
+    def in_flight(self) -> int:
+        """Number of calls in flight or being saved."""
+        return sum(call.wait is None for call in self.under_way.values())
 
-    def add(self, other: Meter) -> None:
-        """Add what another meter has counted."""
-        for each in fields(self):
-            setattr(self, each.name, getattr(self, each.name) + getattr(other, each.name))
+    @property
+    def blocked_askers(self) -> int:
+        """Number of questions that wait for calls that are blocked on another call."""
+        calls = self.under_way.values()
+        return sum(call.askers for call in calls if call.wait and call.wait.blocked)
+
+    def wait(self, call: Call, wait: Wait) -> None:
+        """Let a call wait, so that it can be cancelled; raise CallFailed if it is given up.
+
+        It is in flight again when its ``wait`` is None.
+        """
+        if self.stopping or not call.askers:
+            raise self.given_up(call)
+        call.wait = wait
+
+    def given_up(self, call: Call) -> CallFailed:
+        """Return the error of a call that is given up: no asker is left, or the run stops."""
+        why = "the sweep was stopped" if self.stopping else "its trial was left"
+        return CallFailed(why, call.request)
+
+    async def drain(self) -> None:
+        """Let attempts in flight end and be saved, and cancel calls that wait."""
+        self.stopping = True
+        calls = [*self.under_way.values()]
+        for call in calls:
+            # An attempt in flight may be billed whether or not anybody waits for it.
+            if call.wait is not None:
+                call.task.cancel()
+        await asyncio.gather(*(call.task for call in calls), return_exceptions=True)

@@ -1,9 +1,8 @@
-"""What makes a cache folder safe: SQLite files, batches of durable writes, and locks.
+"""Durable writes in groups, and locks, of a cache folder.
 
-A durable write waits some milliseconds for the disk however little it writes, so that one for each
-reply would bound a sweep to a few hundred calls a second: what gathers during one transaction goes
-together into the next. A lock is one on an open file, and the kernel frees it when its holder dies:
-none is ever left behind, as a file or a row would be.
+A durable write takes some milliseconds however little it writes. One for each reply would bound a
+sweep to a few hundred calls a second, so writes that gather during one transaction form the next
+(group commit). Locks are on open files: the kernel frees them when their holder dies.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from typing import Any, TypeVar
 from merge_runner.errors import UsageError
 
 BUSY_S = 600.0  # another process may be writing long replies to a slow disk
-# Live runs share it, and who releases what is set aside holds it alone.
+# Live runs share it; a release of reservations holds it exclusively.
 LIVE = "live.lock"
 ResultT = TypeVar("ResultT")
 Rows = list[tuple[Any, ...]]
@@ -33,8 +32,8 @@ Operation = Callable[[Execute], Any]
 
 
 @contextlib.contextmanager
-def making(folder: Path) -> Iterator[None]:
-    """Keep other processes from making a file in a folder; its name is durable afterwards."""
+def folder_lock(folder: Path) -> Iterator[None]:
+    """Lock a folder against other processes that create a file; its name is durable afterwards."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
@@ -45,9 +44,9 @@ def making(folder: Path) -> Iterator[None]:
 
 
 def connect(file: Path, mode: str = "ro") -> sqlite3.Connection:
-    """Return a connection of our own to an SQLite file, for all threads; ``mode`` is SQLite's.
+    """Return a connection to an SQLite file for all threads, in a ``mode`` of SQLite's URIs.
 
-    One query at a time: threads share prepared statements, and one could read another's row.
+    Run one query at a time: threads share prepared statements, and one could read another's row.
     """
     uri = f"{file.absolute().as_uri()}?mode={mode}"
     return sqlite3.connect(
@@ -55,10 +54,10 @@ def connect(file: Path, mode: str = "ro") -> sqlite3.Connection:
     )
 
 
-class BatchWriter:
-    """Hands operations to ``run`` in batches, in a thread, one batch at a time.
+class GroupWriter:
+    """Group commit: a thread hands the operations that have gathered to ``run``.
 
-    It returns their results, and for one that failed alone its error.
+    ``run`` returns their results, and the error of each that failed.
     """
 
     def __init__(self, run: Callable[[Sequence[Operation]], list[Any]]) -> None:
@@ -68,11 +67,11 @@ class BatchWriter:
         self._writing: asyncio.Task[None] | None = None
 
     def close(self) -> None:
-        """Wait for the batch that is being written, and end the thread."""
+        """Wait for the group that is being written, and end the thread."""
         self._thread.shutdown()
 
     def write(self, operation: Callable[[Execute], ResultT]) -> asyncio.Future[ResultT]:
-        """Return the future result of an operation, there once its batch is durable."""
+        """Return the future result of an operation, set once it is durable."""
         future = asyncio.get_running_loop().create_future()
         self._waiting.append((operation, future))
         if self._writing is None or self._writing.done():
@@ -80,7 +79,7 @@ class BatchWriter:
         return future
 
     async def _write_all(self) -> None:
-        """Write in each batch all that has gathered while the previous one was written."""
+        """Write in each group all that has gathered while the previous one was written."""
         loop = asyncio.get_running_loop()
         while self._waiting:
             operations, futures = zip(*self._waiting, strict=True)
@@ -91,7 +90,7 @@ class BatchWriter:
             failed = running.exception()
             results = repeat(failed) if failed else running.result()
             for future, result in zip(futures, results, strict=False):
-                if future.cancelled():  # whoever gave up waiting disturbs no other
+                if future.cancelled():
                     continue
                 if isinstance(result, BaseException):
                     future.set_exception(result)
@@ -100,14 +99,14 @@ class BatchWriter:
 
 
 class ModelLocks:
-    """The locks that this run holds on a folder; ``close`` frees them."""
+    """Locks of this run on a folder, freed by ``close``."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._files: list[int] = []
 
     def take(self, models: Iterable[str]) -> None:
-        """Lock models for a live run; raises UsageError where another run asks one of them."""
+        """Lock models for a live run; raise UsageError where another run asks one of them."""
         self._lock(LIVE, fcntl.LOCK_SH)
         for model in sorted(models):
             name = re.sub(r"[^\w. -]", "_", model)[:200] + ".lock"
@@ -123,7 +122,7 @@ class ModelLocks:
             os.write(self._files[-1], f"PID {os.getpid()} on {os.uname().nodename}".encode())
 
     def take_all(self) -> bool:
-        """Keep live runs from beginning; False while there is any."""
+        """Keep live runs from beginning; return False while there is any."""
         return self._lock(LIVE, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
     def close(self) -> None:

@@ -1,17 +1,17 @@
-"""The live transport: httpx on aiohttp's connections."""
+"""Live transport: httpx on aiohttp's connections."""
 
 from __future__ import annotations
 
 import asyncio
 import itertools
-import re
+import json
 import select
 import socket
 import ssl
 from base64 import b64encode
-from bisect import bisect_left
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import aclosing, suppress
+from dataclasses import asdict
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
@@ -24,10 +24,11 @@ import httpx
 from httpx_aiohttp import AiohttpTransport
 
 from merge_runner.errors import UsageError
-from merge_runner.llm.formats import as_dict, as_dicts, as_text
+from merge_runner.llm.formats.wire import as_dict, as_dicts, as_text
 from merge_runner.llm.http_outcome import Action, RawReply, TransportFailure
+from merge_runner.llm.masking import Mask
 from merge_runner.providers import LOOPBACK, SHORTEST_SECRET, Endpoint, http_url
-from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, ChatRequest, canonical_json
+from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, ChatRequest
 
 if TYPE_CHECKING:
     from aiohttp.client_proto import ResponseHandler
@@ -42,7 +43,7 @@ KEPT_S = 5.0
 # As the official SDKs set them: on a connection that is silent while a model thinks, a router with
 # address translation would forget it, and the answer be lost.
 ALIVE = {"TCP_KEEPIDLE": 60, "TCP_KEEPALIVE": 60, "TCP_KEEPINTVL": 60, "TCP_KEEPCNT": 5}
-# A server that answers one call at a time may be busy with one.
+# A server that processes one call at a time may be busy with one.
 LIST_TIMEOUT_S = 60.0
 HEADERS = {
     "accept": "*/*",
@@ -50,89 +51,23 @@ HEADERS = {
     "content-type": "application/json",
     "user-agent": "merge-runner",
 }
-# What a proxy says to all connections; anything else may pass.
+# Statuses with which a proxy refuses all connections; others may be transient.
 PROXY_REFUSES = frozenset({401, 403, 405, 407})
-# The note of an error that came before there was a connection, as where a proxy hangs up.
+# Note of an error before there was a connection, as where a proxy hangs up.
 NOT_SENT = "nothing was sent"
 UNPACKABLE = "the reply is not in the Content-Encoding that it names"
-# What aiohttp says of a header beyond the bound.
+# Part of aiohttp's message for a header beyond the bound.
 TOO_LONG, LONGEST = "Got more than", 300
-MASK = "[key]"
-# So many characters of a secret in a row are masked, too. Wherever they begin in it, they contain
-# one of its pieces, each half as long.
-RUN = 12
-PIECE = RUN // 2
-# JSON in a string of JSON, as routers pass on the errors of others, is escaped once more.
-NESTED = 8
-ESCAPE = re.compile(r'\\(?:u([0-9a-fA-F]{4})|(["\\/bfnrt]))')
-CONTROLS = {"b": "\b", "f": "\f", "n": "\n", "r": "\r", "t": "\t"}
-
-
-class Mask:
-    """Replaces secrets, and RUN characters of one in a row or more, in texts.
-
-    They may be spelled with the escapes of JSON, also in a string within a string.
-    """
-
-    def __init__(self, secrets: Iterable[str]) -> None:
-        given = [*secrets]
-        self._pieces = {
-            secret[at : at + PIECE]
-            for secret in given
-            for at in range(0, len(secret) - PIECE + 1, PIECE)
-        }
-        # The least that any spelling of a character of theirs has.
-        self._escape = "\\" if any({*secret} & {*'/"\\'} for secret in given) else "\\u00"
-        self._hints = re.compile("|".join(map(re.escape, [*self._pieces, self._escape])))
-        runs = {s[at : at + RUN] for s in given for at in range(max(1, len(s) - RUN + 1))}
-        # Each run wherever it begins; of a short secret, which may begin a run, there is one alone.
-        longest_first = sorted(map(re.escape, runs), key=len, reverse=True)
-        self._runs = re.compile(f"(?=({'|'.join(longest_first)}))")
-
-    def __call__(self, text: str) -> str:
-        """Return the text without the secrets."""
-        if self._hints.search(text) is None:
-            return text
-        kept, done = [], 0
-        for begin, end in sorted(self._spans(text, NESTED)):
-            if begin >= done:
-                kept += [text[done:begin], MASK]
-            done = max(done, end)
-        return "".join([*kept, text[done:]])
-
-    def _spans(self, text: str, nested: int) -> Iterator[tuple[int, int]]:
-        """Yield where secrets begin and end in a text, and in what its escapes stand for."""
-        if any(piece in text for piece in self._pieces):
-            yield from (match.span(1) for match in self._runs.finditer(text))
-        if nested and self._escape in text:
-            found = [*self._spans(ESCAPE.sub(unescaped, text), nested - 1)]
-            at = places(text) if found else int
-            yield from ((at(begin), at(end)) for begin, end in found)
-
-
-def unescaped(escape: re.Match[str]) -> str:
-    """Return the character that an escape of JSON stands for."""
-    code, letter = escape.groups()
-    return chr(int(code, 16)) if code else CONTROLS.get(letter, letter)
-
-
-def places(text: str) -> Callable[[int], int]:
-    """Return the function from a place in an unescaped text to the same place in the text."""
-    begins, longer = [], [0]
-    for escape in ESCAPE.finditer(text):
-        begins.append(escape.start() - longer[-1])
-        longer.append(longer[-1] + len(escape[0]) - 1)
-    return lambda place: place + longer[bisect_left(begins, place)]
 
 
 class HttpTransport:
     """Sends requests to one endpoint over at most ``connections`` connections.
 
     A reply of more than ``most_bytes`` is refused. Proxies are those of the environment; loopback
-    never goes through one. Only our own emulator is told the slot. Each attempt has a random id; an
-    answer that names another one is not taken. Once the endpoint is ``doubted``, since an answer
-    was late or cut, or came unasked, each connection serves one request, unless the answers name
-    their requests. A ``carrier`` takes the requests in the place of connections.
+    never goes through one. Only the emulator gets the slot. Each attempt has an id; a reply that
+    echoes another request's id is refused. After a timeout, a truncated or an unexpected reply the
+    endpoint is ``doubted``: connections are not reused unless the server echoes ids. A ``carrier``
+    takes the requests instead of connections.
     """
 
     def __init__(
@@ -144,11 +79,12 @@ class HttpTransport:
         carrier: httpx.AsyncBaseTransport | None = None,
     ) -> None:
         self._endpoint = endpoint
-        self._tells_slot = endpoint.provider == "emulator"
+        self._sends_slot = endpoint.provider == "emulator"
         self._most_bytes = most_bytes
         keys = (value.removeprefix("Bearer ") for value in endpoint.auth_headers.values())
         secrets = {*keys, *proxy_secrets()}
-        self._mask = Mask(secret for secret in secrets if len(secret) >= SHORTEST_SECRET)
+        secrets = {secret for secret in secrets if len(secret) >= SHORTEST_SECRET}
+        self._has_secrets, self._mask = bool(secrets), Mask(secrets)
         self.doubted = False
         self._answers_named = False
         # Each id is a UUID, as some servers demand (llama-cpp-python): a random part, this
@@ -159,14 +95,15 @@ class HttpTransport:
 
     @property
     def one_each(self) -> bool:
-        """True if a connection serves one request alone, so that nothing late is taken."""
+        """Whether each connection serves one request, so that no late reply is read."""
         return self.doubted and not self._answers_named
 
     async def send(self, request: ChatRequest, *, attempt: int, timeout_s: float) -> RawReply:
-        """Post the hashed bytes; raises TransportFailure."""
+        """Post the hashed bytes; raise TransportFailure."""
         headers = request.headers
-        if self._tells_slot:
-            slot = canonical_json(request.slot.as_dict())
+        if self._sends_slot:
+            # In the canonical form: the emulator's replies depend on it.
+            slot = json.dumps(asdict(request.slot), sort_keys=True, separators=(",", ":"))
             headers = {**headers, SLOT_HEADER: slot, ATTEMPT_HEADER: str(attempt)}
         body = request.body.encode()
         return await self.ask("POST", request.path, headers, body, timeout_s=timeout_s)
@@ -181,7 +118,7 @@ class HttpTransport:
         timeout_s: float,
         most_bytes: int | None = None,
     ) -> RawReply:
-        """Ask for anything; every error of the libraries becomes a TransportFailure."""
+        """Send any request; every error of the libraries becomes a TransportFailure."""
         own_id = self._own + next(self._ids)
         sent = {**HEADERS, **headers, **self._endpoint.auth_headers}
         sent |= dict.fromkeys(ID_HEADERS, own_id)
@@ -208,7 +145,7 @@ class HttpTransport:
         await self._carrier.aclose()
 
     def _refuse_others(self, reply: httpx.Response, own_id: str) -> None:
-        """Raise TransportFailure where an answer names another request of this transport."""
+        """Raise TransportFailure where a reply echoes the id of another request."""
         self._answers_named = False
         for header in ID_HEADERS:
             for part in reply.headers.get(header, "").split(","):
@@ -229,14 +166,16 @@ class HttpTransport:
                     action="fail",
                 )
         headers = dict(reply.headers.items())  # httpx has their names in lower case
-        # As UTF-8, the encoding of JSON, whatever a header says. A provider may echo the key in an
-        # error; it must not get into a log or a database.
-        text = self._mask(body.decode("utf-8-sig", errors="replace"))
+        # JSON is UTF-8, whatever a header says. A provider may echo the key in an error, and no log
+        # or database may contain it.
+        text = body.decode("utf-8-sig", errors="replace")
+        if self._has_secrets:
+            text = self._mask(text)
         return RawReply(reply.status_code, headers, text)
 
     def _failure(self, error: Exception) -> TransportFailure:
         """Return the TransportFailure for an error of the libraries."""
-        # httpx reports refused, reset and cut connections alike; what aiohttp said is its cause.
+        # httpx reports refused, reset and cut connections alike; aiohttp's error is its cause.
         reason = self._mask(str(error)) or type(error).__name__
         cause = error if isinstance(error, aiohttp.ClientError) else error.__cause__ or error
         if isinstance(error, httpx.DecodingError):
@@ -269,9 +208,9 @@ class HttpTransport:
         return TransportFailure("connection_lost", why, reason="unreadable_reply")
 
     def _network(self, connections: int) -> AiohttpTransport:
-        """Return the connections, by the proxies and certificates of the environment."""
+        """Return a transport with the proxies and certificates of the environment."""
         url = httpx.URL(self._endpoint.base_url)
-        # An empty one where there is no TLS, since to load the certificates takes long.
+        # Without TLS an empty one: loading the certificates takes long.
         trusted = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         try:
             if url.scheme == "https" or url.host not in LOOPBACK:
@@ -296,7 +235,7 @@ class HttpTransport:
         proxy = None
         if named and url.host not in LOOPBACK and not proxy_bypass(url.netloc.decode()):
             named = named if "://" in named else f"http://{named}"
-            if http_url(named) is None:  # which is not shown: it may hold a password
+            if http_url(named) is None:  # not shown: it may contain a password
                 raise UsageError(
                     f"{url.scheme.upper()}_PROXY or ALL_PROXY is no URL of an HTTP proxy: set it "
                     "to http://HOST:PORT or unset it; a SOCKS proxy needs an HTTP proxy before it"
@@ -306,7 +245,7 @@ class HttpTransport:
 
 
 class Connections(aiohttp.TCPConnector):
-    """Serves a further request on a connection only while it is silent."""
+    """Connections that are reused only while nothing has arrived after the last reply."""
 
     def __init__(self, transport: HttpTransport, **options: Any) -> None:  # noqa: ANN401
         super().__init__(**options)
@@ -314,7 +253,7 @@ class Connections(aiohttp.TCPConnector):
         self._used: WeakSet[ResponseHandler] = WeakSet()
 
     async def connect(self, *args: Any, **options: Any) -> Connection:  # noqa: ANN401
-        """Return a new connection, or one on which nothing has come since its last answer."""
+        """Return a new connection, or a silent one."""
         while True:
             try:
                 connection = await super().connect(*args, **options)
@@ -328,7 +267,7 @@ class Connections(aiohttp.TCPConnector):
                 self._used.add(handler)
                 keep_alive(channel.get_extra_info("socket"))
                 return connection
-            # The event loop may have had no time to read what has arrived: so ask the system.
+            # The event loop may not have read yet what has arrived: ask the system.
             arrived = select.poll()
             arrived.register(channel.get_extra_info("socket").fileno(), select.POLLIN)
             self._transport.doubted |= handler.should_close
@@ -338,16 +277,16 @@ class Connections(aiohttp.TCPConnector):
 
 
 def keep_alive(connection: socket.socket) -> None:
-    """Let the system ask the other end now and then whether it is there."""
+    """Switch TCP keep-alive on."""
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for name, value in ALIVE.items():
-        if hasattr(socket, name):  # each system has its own
+        if hasattr(socket, name):  # they differ between systems
             connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
 
 
 @lru_cache
 def url_of(base_url: str, path: str, place: str) -> httpx.URL:
-    """Return the URL of a path at the configured host, which alone may get the key.
+    """Return the URL of a path at the configured host: no other host may get the key.
 
     Raises UsageError, with the ``place`` of the model's entry.
     """
@@ -358,16 +297,16 @@ def url_of(base_url: str, path: str, place: str) -> httpx.URL:
 
 
 def proxy_secrets() -> Iterator[str]:
-    """Yield the user info of the proxies' URLs and its password, as given, decoded and as sent."""
+    """Yield user info and password of the proxies' URLs, as given, decoded and as sent."""
     for url in getproxies_environment().values():
-        with suppress(ValueError):  # it is no URL, and nothing goes there
+        with suppress(ValueError):  # no URL: nothing is sent there
             info = urlsplit(url if "://" in url else f"//{url}").netloc.rpartition("@")[0]
             for given in {info, unquote(info)}:
                 yield from (given, given.partition(":")[2], b64encode(given.encode()).decode())
 
 
 async def listed_models(endpoint: Endpoint) -> list[str]:
-    """Return the ids of the models that a server says it serves, by ``GET /models``.
+    """Return the ids of the models that a server lists at ``GET /models``.
 
     Raises TransportFailure, ``no_list`` if there is no list.
     """

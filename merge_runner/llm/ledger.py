@@ -1,34 +1,33 @@
-"""The money of sweeps: what attempts cost, and what is reserved, summed over all their runs.
+"""Spending of a sweep: cost of attempts and reservations, summed over all its runs.
 
 The worst case of an attempt is reserved durably right before it is sent, in one transaction that
-sums what is spent and open (``Budget``). What it cost is settled in the transaction that keeps its
-reply. A process that dies leaves its reservations: these attempts count with their worst case until
-a user releases them, and are listed with an unknown outcome.
+sums what is spent and reserved. Its cost is booked in the transaction that keeps its reply. A
+process that dies leaves its reservations: these attempts count with their worst case until a user
+releases them, and are listed with an unknown outcome.
 
-A server may ignore the output cap. What a reply cost beyond its worst case is taken from what is
-left, and from then on the worst case is multiplied by as much as that driver's most expensive reply
-exceeded it.
+A server may ignore the output cap. The cost of a reply beyond its worst case is booked, and from
+then on the worst case is scaled by that driver's largest overrun.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any
 
 from merge_runner.errors import CacheFailed, RecordingError, UsageError
-from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.cache_file import FILE
 from merge_runner.llm.durable import Execute, Rows
+from merge_runner.llm.store import CallStore
 from merge_runner.records import Attempt
 
 TOLERANCE_USD = 1e-9  # sums of floats
 _SPENT = "SELECT driver, usd, overrun_usd, most_overrun FROM spent WHERE scope = ?1"
-# In one statement: what is settled meanwhile is in the one or in the other sum. First what is open,
-# then what others hold under the same cap.
+# One statement, so that what is booked meanwhile is in one of the sums: first the reservations,
+# then the other ledgers under the same cap.
 _SUMS = f"""
 SELECT NULL, total(usd), count(*), 0 FROM open WHERE scope = ?1
 UNION ALL SELECT NULL, total(usd), 0, 0
@@ -58,28 +57,38 @@ WHERE scope = ? GROUP BY driver, outcome ORDER BY sum(usd) DESC
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
-    """Which driver at which endpoint is asked, for which slot, and the most that honestly costs."""
+class Cap:
+    """Spending limit: ``usd`` over the ledgers named in ``scopes``, given by ``source``."""
+
+    usd: float
+    source: str = "--max-cost"
+    scopes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class CallLabel:
+    """Driver and slot of a call, and the worst case if its server keeps to the output cap."""
 
     driver: str = ""
     slot: str = ""
-    honest_usd: float = 0.0
+    worst_usd: float = 0.0
 
 
 APART = (
     "A ledger and a run's replies may cost different sums: the ledger has all that was paid for a "
-    "sweep, over all its runs and also for replies that no stored trial uses, and sets aside "
-    "attempts of unknown cost; the replies of a run may have been paid by another sweep."
+    "sweep, over all its runs and also for replies that no stored trial uses, and reserves the "
+    "worst case of attempts of unknown cost; the replies of a run may have been paid by another "
+    "sweep."
 )
-"""Why two sums differ that are shown side by side."""
+"""Explains why two sums differ that are shown side by side."""
 
 
 @dataclass(frozen=True, slots=True)
 class Spending:
-    """In USD: what attempts cost, and what is reserved for those whose cost is not known.
+    """Spent and reserved USD of a ledger.
 
-    ``open_attempts`` are in flight, or nobody knows what became of them. ``overrun_usd`` is by how
-    much replies cost more than their worst case, ``overruns`` the largest such ratio by driver.
+    ``open_attempts`` are in flight, or their cost is unknown. ``overrun_usd`` sums the cost of
+    replies beyond their worst case, ``overruns`` has the largest such ratio by driver.
     """
 
     spent_usd: float = 0.0
@@ -90,50 +99,57 @@ class Spending:
 
     @property
     def committed_usd(self) -> float:
-        """The most that may have been spent."""
+        """Spent and reserved USD: the most that may have been spent."""
         return self.spent_usd + self.reserved_usd
 
     @property
-    def dearest(self) -> str:
-        """The largest overruns by driver, in words."""
+    def largest_overruns(self) -> str:
+        """The largest overrun of each driver, as text."""
         ratios = self.overruns.items()
         return ", ".join(f"{driver} up to {ratio:.2f} times as much" for driver, ratio in ratios)
 
 
-def scopes(store: ResponseCache) -> list[str]:
+def scopes(store: CallStore) -> list[str]:
     """Return the names of all ledgers in a cache."""
     rows = store.rows("SELECT scope FROM spent UNION SELECT scope FROM open ORDER BY 1")
     return [scope for (scope,) in rows]
 
 
 class Ledger:
-    """The spending of one sweep; ``scope`` names it in the cache. ``spending`` is as last summed.
+    """Spending of one sweep, named ``scope`` in the cache, under a ``cap``; None: no limit.
 
-    Several processes may run the sweep: every transaction sums anew. The ledger of a model that
-    costs nothing has no name, and keeps no record. What ``others`` hold counts under the same cap:
-    ``committed_usd`` is the most that may have been spent under it by now.
+    ``spending`` is as last summed; ``committed_usd`` includes the other ledgers under the cap.
+    Several processes may run the sweep, so every transaction sums first. The ledger of a free model
+    has no name and keeps no record.
     """
 
-    is_shared_out = False  # by a coordinator, which is asked before each attempt
+    is_shared_out = False  # a coordinator reserves each attempt first
 
-    def __init__(self, store: ResponseCache, scope: str, others: Sequence[str] = ()) -> None:
+    def __init__(self, store: CallStore, scope: str, cap: Cap | None = None) -> None:
         self.store = store
         self.scope = scope
+        self.cap = cap
         self.spending = Spending()
         self.committed_usd = 0.0
-        self._others = json.dumps(others)
-        # A damaged record is an error only where money is to be spent: a replay needs none.
+        self._others = json.dumps([name for name in cap.scopes if name != scope] if cap else [])
+        # A replay spends nothing and needs no record: a damaged one is an error only in a live run.
         with contextlib.suppress(UsageError, CacheFailed, RecordingError):
             self.read()
 
+    @property
+    def left_usd(self) -> float:
+        """USD under the cap that are neither spent nor reserved."""
+        assert self.cap is not None
+        return self.cap.usd - self.committed_usd
+
     def read(self) -> Spending:
-        """Return the current state; raises UsageError where its record is damaged."""
+        """Sum the record and return the spending; raise UsageError where it is damaged."""
         if self.scope:
             self._sum(self.store.rows(_SUMS, self.scope, self._others))
         return self.spending
 
     def _sum(self, rows: Iterable[tuple[Any, ...]]) -> None:
-        """Take the rows of _SUMS; raises UsageError for sums that cannot be."""
+        """Take the rows of _SUMS; raise UsageError for impossible sums."""
         (_, reserved_usd, attempts, _), (_, elsewhere_usd, _, _), *spent = rows
         spent_usd = overrun_usd = 0.0
         overruns = {}
@@ -154,39 +170,33 @@ class Ledger:
         self.committed_usd = spent_usd + reserved_usd + elsewhere_usd
 
     def _sum_once(self, execute: Execute) -> None:
-        """Sum before the first change that this ledger makes in a transaction."""
+        """Sum before the first change of this ledger in a transaction."""
         if self.store.summed is not self:
             self._sum(execute(_SUMS, (self.scope, self._others)))
             self.store.summed = self
 
     def reserve(
-        self,
-        key: str,
-        number: int,
-        usd: float,
-        cap_usd: float | None,
-        asked: Asked,
-        execute: Execute,
+        self, key: str, number: int, usd: float, label: CallLabel, execute: Execute
     ) -> bool:
-        """Reserve the worst case of an attempt; False if that exceeds the cap; an operation."""
+        """Reserve the worst case of an attempt; False if it exceeds the cap; an operation."""
         self._sum_once(execute)
-        if cap_usd is not None and self.committed_usd + usd > cap_usd + TOLERANCE_USD:
+        if self.cap is not None and self.committed_usd + usd > self.cap.usd + TOLERANCE_USD:
             return False
         since = datetime.now(UTC).isoformat(timespec="milliseconds")
-        place = (asked.driver, asked.slot, asked.honest_usd, since, "in flight")
+        place = (label.driver, label.slot, label.worst_usd, since, "in flight")
         execute(_OPEN, (self.scope, key, number, usd, *place))
         self.committed_usd += usd
         return True
 
-    async def ask(self, key: str, usd: float, asked: Asked) -> bool:
-        """Return whether the coordinator has money for an attempt, where there is one."""
+    async def ask_coordinator(self, key: str, usd: float, label: CallLabel) -> bool:
+        """Return whether the coordinator reserves an attempt; without one it is not asked."""
         return True
 
-    def ended(self, key: str, usd: float | None) -> None:
-        """Say there what an attempt at a call has cost; None: unknown."""
+    def report_cost(self, key: str, usd: float | None) -> None:
+        """Report to the coordinator what an attempt has cost; None: unknown."""
 
     def settle(self, key: str, attempt: Attempt, driver: str, execute: Execute) -> None:
-        """Settle what an attempt at a call cost; an operation.
+        """Book the cost of an attempt; an operation.
 
         Its reservation stays where the cost is unknown.
         """
@@ -200,35 +210,35 @@ class Ledger:
     def pay(
         self, key: str, number: int, usd: float, driver: str, execute: Execute
     ) -> tuple[str, float, float]:
-        """Count what an attempt has cost as spent, no longer its worst case; an operation.
+        """Replace the reservation of an attempt by its cost; an operation.
 
-        Returns the driver, the cost, and by how much that exceeds the worst case.
+        Returns the driver, the cost, and by how much it exceeds the worst case.
         """
         self._sum_once(execute)
         closed = execute(_CLOSE, (key, number)).fetchall()
-        # None: a user has released it. That of a line is of the sweep that has submitted its batch.
-        scope, aside_usd, honest_usd = closed[0] if closed else (self.scope, usd, usd)
-        exceeds = usd > aside_usd + TOLERANCE_USD
-        over = (usd - aside_usd, usd / max(honest_usd, TOLERANCE_USD)) if exceeds else (0.0, 0.0)
+        # Without one a user has released it. A batch's is of the sweep that has submitted it.
+        scope, reserved_usd, worst_usd = closed[0] if closed else (self.scope, usd, usd)
+        exceeds = usd > reserved_usd + TOLERANCE_USD
+        over = (usd - reserved_usd, usd / max(worst_usd, TOLERANCE_USD)) if exceeds else (0.0, 0.0)
         execute(_PAY, (scope, driver, usd, *over))
         if exceeds or not closed or scope != self.scope:
             self._sum(execute(_SUMS, (self.scope, self._others)))
         else:
-            self.committed_usd += usd - aside_usd
+            self.committed_usd += usd - reserved_usd
         return driver, usd, over[0]
 
     def reserved_usd(self, key: str) -> float:
-        """Return the USD reserved for the last attempt at a call; 0: a user has released them."""
+        """Return the USD reserved for a call's last attempt; 0 if a user has released them."""
         rows = self.store.rows("SELECT usd FROM open WHERE call = ? ORDER BY attempt", key)
         return float(rows[-1][0]) if rows else 0.0
 
     def rows(self) -> tuple[Rows, Rows]:
-        """Return the rows of what is spent and of what is open, for ``share``."""
+        """Return the rows of costs and of reservations, for ``share``."""
         opened = self.store.rows("SELECT * FROM open WHERE scope = ?", self.scope)
         return self.store.rows(_SPENT, self.scope), [row[1:] for row in opened]
 
     def share(self, name: str, spent: Rows, opened: Rows, execute: Execute) -> None:
-        """Count what a task has spent and has open, no longer what is reserved by its name.
+        """Replace what is reserved for a cluster's task by its costs and reservations.
 
         An operation.
         """
@@ -244,7 +254,7 @@ class Ledger:
         return [dict(zip(names, r, strict=True)) for r in self.store.rows(_REASONS, self.scope)]
 
     def release(self) -> None:
-        """Count no longer what is reserved; nobody may be asking meanwhile."""
+        """Drop all reservations; no run may be live."""
 
         def release(execute: Execute) -> None:
             execute("DELETE FROM open WHERE scope = ?", (self.scope,))

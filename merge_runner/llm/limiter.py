@@ -1,10 +1,10 @@
-"""Requests and tokens a minute, behind one dispatcher that serves the oldest trial first.
+"""Rate limits, requests and tokens a minute; one dispatcher serves the oldest trial first.
 
 asyncio-throttle counts the requests. It polls for every waiter and keeps no order among them, so
-only the dispatcher ever asks it, and not before it has room: a turn that was taken early, and then
-held up by a pause, would be counted at the wrong time. Tokens are counted in a sliding window
-of a minute: an estimate at dispatch, settled to the actual usage afterwards. Each process counts
-for itself: where several use one key, the server refuses the excess, which is retried.
+only the dispatcher calls it, and only when it has room: a turn that was taken early, and delayed by
+a pause, would be counted at the wrong time. Tokens are counted in a sliding window of a minute: an
+estimate at dispatch, settled to the actual usage afterwards. Each process counts for itself: where
+several use one key, the server refuses the excess, which is retried.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ CLOCK_STEP_S, POLL_S = 1e-6, 1e-3
 
 @dataclass(order=True, slots=True)
 class _Turn:
-    """A request that waits for its turn; then its tokens count while the window holds it."""
+    """A request in the priority queue; once dispatched, its tokens count in the window."""
 
     order: int
     arrival: int
@@ -41,17 +41,16 @@ class _Turn:
 
 @dataclass(slots=True)
 class Pause:
-    """Until when nothing is dispatched, on the loop's clock; shared by all limiters of one key."""
+    """End of a pause on the loop's clock, shared by all limiters of one key."""
 
     until: float = 0.0
 
 
 class Limiter:
-    """Hands out turns: lowest ``order`` first, first come first served within one order.
+    """Priority queue of turns: lowest ``order`` first, then first come first served.
 
-    The oldest trial goes first so that trials end, and their memory and money are free again. A
-    waiter whose tokens do not fit yet holds back all behind it, so that a heavy request never
-    starves behind light ones.
+    The oldest trial goes first so that trials end, and free memory and money. A request whose
+    tokens do not fit yet holds back all behind it, so that it never starves behind light ones.
     """
 
     def __init__(
@@ -63,7 +62,7 @@ class Limiter:
         window_s: float = WINDOW_S,
         place: str = "models.toml",
     ) -> None:
-        """``place`` is that of the model's entry, for the error of a request that never fits."""
+        """Make a limiter; ``place`` of the model's entry is named where a request never fits."""
         self._place = place
         self._tpm = tpm
         self._window_s = window_s
@@ -82,9 +81,9 @@ class Limiter:
         self._dispatcher: asyncio.Task[None] | None = None
 
     async def acquire(self, tokens: int, *, order: int = 0) -> Callable[[int], None] | None:
-        """Wait for a turn; ``tokens`` is the estimate of what the request will use.
+        """Wait for a turn; ``tokens`` is the estimated usage of the request.
 
-        Where tokens are limited, what is returned replaces it by those that the request used.
+        Where tokens are limited, returns a function that replaces the estimate by the usage.
         """
         if self._tpm is not None and tokens > self._tpm:
             raise UsageError(
@@ -94,7 +93,7 @@ class Limiter:
             )
         loop = asyncio.get_running_loop()
         turn = _Turn(order, next(self._arrivals), tokens, loop.create_future())
-        # Without a limit, and with nobody before it, it needs no dispatcher, which is a task more.
+        # Without a limit or a queue no dispatcher is needed, which would be a further task.
         limited = self._throttles or self._tpm is not None
         if limited or self._waiting or loop.time() < self._pause.until:
             turn.given.add_done_callback(lambda _: self._changed.set())
@@ -106,7 +105,7 @@ class Limiter:
         return None if self._tpm is None else partial(self._settle, turn)
 
     def pause(self, seconds: float) -> None:
-        """Dispatch nothing for a while: the server asked everybody on this key to wait."""
+        """Dispatch nothing for a while: the server asked all on this key to wait."""
         now = asyncio.get_running_loop().time()
         self._pause.until = max(self._pause.until, now + seconds)
 
@@ -122,13 +121,13 @@ class Limiter:
         loop = asyncio.get_running_loop()
         while self._waiting:
             turn = self._waiting[0]
-            # One that was cancelled is done before its turn, and nobody will use it.
+            # A cancelled request is done before its turn.
             if turn.given.done():
                 heapq.heappop(self._waiting)
                 continue
             wait = self._blocked_for(turn, loop.time())
             if wait > 0:
-                # A new turn, or a settlement, may change what can be done.
+                # A new request, or a settlement, may change the head of the queue.
                 self._changed.clear()
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(wait):
@@ -144,7 +143,7 @@ class Limiter:
             turn.given.set_result(None)
 
     def _blocked_for(self, turn: _Turn, now: float) -> float:
-        """Return the least wait in s of the head of the queue."""
+        """Return the minimum wait in s of the head of the queue."""
         while self._window and now - self._window[0].dispatched_at >= self._window_s:
             self._tokens_in_window -= self._window.popleft().tokens
         free_at = max(self._pause.until, *(throttle.free_at for throttle in self._throttles), 0.0)
@@ -155,11 +154,11 @@ class Limiter:
 
 
 class _Throttle(Throttler):
-    """asyncio-throttle, which also says when it has room again."""
+    """asyncio-throttle that reports when it has room again."""
 
     @property
     def free_at(self) -> float:
-        """The earliest next turn, on the event loop's clock, which is the throttle's too."""
+        """Earliest next turn on the event loop's clock, which the throttle uses, too."""
         full = len(self._task_logs) >= self.rate_limit
-        # A little later, since it keeps a turn until more than its period has passed.
+        # The throttle keeps a turn until more than its period has passed.
         return self._task_logs[0] + self.period + CLOCK_STEP_S if full else 0.0

@@ -1,4 +1,4 @@
-"""The models that ship, those that a user adds, and what each may be sent."""
+"""Models of the registry: those that ship, those of a user, and their parameters."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ CAP, EFFORT = "max_output_tokens", "reasoning_effort"
 
 
 def load_models(beside: Path | None = None) -> dict[str, ModelEntry]:
-    """Return the entries by name, each with a known format and provider; raises UsageError.
+    """Return the entries by name, each with a known format and provider; raise UsageError.
 
-    Those of a ``models.toml`` in the working directory, in its ``experiments``, or ``beside`` a
-    study are added to those that ship, and take the place of those of the same name.
+    Entries of a ``models.toml`` in the working directory, in its ``experiments``, or ``beside`` a
+    study are added to those that ship, and replace those of the same name.
     """
-    load_plugins()  # before the file is read: an error in a plug-in is none of the file's
+    load_plugins()  # first, so that an error in a plug-in is not reported as the file's
     entries: dict[str, ModelEntry] = {}
     for path in registry_files(beside):
         entries |= read_models(path)
@@ -36,7 +36,7 @@ def load_models(beside: Path | None = None) -> dict[str, ModelEntry]:
 
 
 def registry_files(beside: Path | None = None) -> list[Path]:
-    """Return the files of ``load_models``, in order: an entry takes the place of an earlier one."""
+    """Return the files of ``load_models``, in order: an entry replaces an earlier one."""
     folders = [*reversed(experiments()), Path(), *([] if beside is None else [beside])]
     return [path for path in dict.fromkeys(each / REGISTRY for each in folders) if path.is_file()]
 
@@ -54,7 +54,7 @@ def read_entries(path: Path) -> dict[str, ModelEntry]:
 
 
 def read_models(path: Path) -> dict[str, ModelEntry]:
-    """Return the entries of one file; raises UsageError."""
+    """Return the entries of one file; raise UsageError."""
     entries = read_entries(path)
     for name, entry in entries.items():
         try:
@@ -68,23 +68,23 @@ def read_models(path: Path) -> dict[str, ModelEntry]:
 
 
 def shutdown_notes(entries: Mapping[str, ModelEntry], today: date) -> Iterator[str]:
-    """Yield, for each model with an announced shutdown, when that is and what to do."""
+    """Yield a line for each model with an announced shutdown: when, and what to do."""
     for name, entry in entries.items():
         if entry.shutdown is None:
             continue
         days = (entry.shutdown - today).days
         closes = f"{name} closes in {days} day{'s' * (days != 1)}, on {entry.shutdown}"
         if days <= 0:
-            said = f"WARNING: {name} closed on {entry.shutdown}: only a recording answers for it"
+            note = f"WARNING: {name} closed on {entry.shutdown}: only a recording answers for it"
         elif days <= SOON_DAYS:
-            said = f"WARNING: {closes}: record it now (docs/recordings.md)"
+            note = f"WARNING: {closes}: record it now (docs/recordings.md)"
         else:
-            said = f"note: {closes}"
-        yield said + (f"; its successor is {entry.successor}" if entry.successor else "")
+            note = f"note: {closes}"
+        yield note + (f"; its successor is {entry.successor}" if entry.successor else "")
 
 
 def known_parameters(entries: Iterable[ModelEntry]) -> set[str]:
-    """Return the parameters that some model takes, by common names."""
+    """Return the common names of all parameters that some model takes."""
     return {CAP, EFFORT}.union(
         *(form.parameters for form in FORMATS.values()),
         *(provider.parameters for provider in PROVIDERS.values()),
@@ -93,9 +93,9 @@ def known_parameters(entries: Iterable[ModelEntry]) -> set[str]:
 
 
 def with_parameter(name: str, entry: ModelEntry, parameter: str, level: JsonValue) -> ModelEntry:
-    """Return the entry ``name`` with a parameter set; raises UsageError if the model rejects it.
+    """Return the entry ``name`` with a parameter set; raise UsageError if the model rejects it.
 
-    What is the provider's default already is not sent.
+    The provider's default is not sent.
     """
     if parameter == CAP:
         capped = validated(ModelEntry, {**dict(entry), CAP: level}, name)

@@ -1,26 +1,32 @@
-"""What attempts cost: by the registry's figures, or by the table of genai-prices."""
+"""Costs of attempts, by the prices of the registry or of genai-prices."""
 
 from __future__ import annotations
 
 import contextlib
+from dataclasses import replace
 from decimal import Decimal
 from functools import partial
+from typing import TYPE_CHECKING
 
+from merge_runner.llm.http_outcome import may_be_charged
 from merge_runner.providers import ModelEntry, Price
 from merge_runner.records import Usage
 
-# The provider names of genai-prices where they differ from ours.
+if TYPE_CHECKING:
+    from merge_runner.llm.endpoint_state import EndpointState
+    from merge_runner.llm.sender import Sent
+
+# Provider names of genai-prices where they differ from the registry's.
 GENAI_PRICES_PROVIDER = {"gemini": "google"}
 PER_MILLION = Decimal(1_000_000)
-# What is billed at more than the plain price, about twice at OpenAI.
+# Billed above the normal price, at OpenAI about twice.
 DEARER_TIERS = frozenset({"priority"})
 
 
 def cost_usd(entry: ModelEntry, usage: Usage, tier: str | None = None) -> float | None:
-    """Return the cost of an attempt in USD, None where the price or the tokens are unknown.
+    """Return the cost of tokens in USD, None where the price or a count is unknown.
 
-    ``tier`` is the service tier that the reply names; one without a price of its own is priced as
-    the plain one.
+    ``tier`` is the service tier that the reply names; one without a price has the normal price.
     """
     price, read, written = entry.price, usage.input_tokens, usage.output_tokens
     if price == "free":
@@ -29,10 +35,10 @@ def cost_usd(entry: ModelEntry, usage: Usage, tier: str | None = None) -> float 
         return None
     cached = usage.cached_input_tokens or 0
     if cached > read:
-        cached = 0  # the server counts wrongly: none is taken for cheap
+        cached = 0  # a wrong count: no token is priced as cached
     if isinstance(price, Price):
         cached_price = price.input if price.cached_input is None else price.cached_input
-        # Decimals of the written figures, so that sums of costs have no digits that nobody wrote.
+        # Decimals of the prices as written: binary fractions would add digits to sums.
         plain = (read - cached) * Decimal(str(price.input)) + cached * Decimal(str(cached_price))
         plain += written * Decimal(str(price.output))
         return float(plain / PER_MILLION * Decimal(str(price.tiers.get(tier or "", 1))))
@@ -52,8 +58,45 @@ def cost_usd(entry: ModelEntry, usage: Usage, tier: str | None = None) -> float 
         return None
 
 
+def attempt_usd(
+    sent: Sent, worst: Usage, endpoint: EndpointState, price_factor: float
+) -> float | None:
+    """Return the cost of an attempt by its usage, which an error may have too; None: unknown.
+
+    Output beyond the cap is billed even where the server does not report the input.
+    """
+    outcome, entry = sent.outcome, endpoint.entry
+    raw, usage = outcome.raw, outcome.reading.usage
+    if entry.price == "free":
+        return 0.0
+    if raw is None:
+        return None if outcome.charged else 0.0
+    if sent.took_s is None and raw.status != 200 and usage == Usage():
+        return 0.0  # a failed request of a batch is not billed
+    usd: float | None
+    if usage.input_tokens and usage.output_tokens is not None:
+        usd = cost_usd(entry, usage, outcome.reading.service_tier)
+    elif (usage.output_tokens or 0) > entry.max_output_tokens:
+        most = replace(worst, output_tokens=usage.output_tokens)
+        usd = cost_usd(entry, most, outcome.reading.service_tier)
+    else:
+        # Where no model ever answered, a web page is that of another server.
+        stray = raw.status == 200 and raw.is_web_page and not endpoint.has_answered
+        usd = None if may_be_charged(raw, endpoint.identity) and not stray else 0.0
+    return usd and usd * price_factor
+
+
+def worst_case(entry: ModelEntry, body: str) -> tuple[Usage, float]:
+    """Return an upper bound of the tokens of a request, and their cost in USD."""
+    # No tokeniser makes more tokens than bytes.
+    worst = Usage(input_tokens=len(body.encode()), output_tokens=entry.max_output_tokens)
+    tier = entry.parameters.get("service_tier")
+    in_tier_usd = cost_usd(entry, worst, tier) if isinstance(tier, str) else None
+    return worst, max(cost_usd(entry, worst) or 0.0, in_tier_usd or 0.0)
+
+
 def underpriced_tiers(entry: ModelEntry) -> set[str]:
-    """Return the service tiers whose replies cost more than the registry knows."""
+    """Return the service tiers that cost more than the registry's price."""
     million = Usage(1_000_000, 0, 1_000_000)
     plain_usd = cost_usd(entry, million)
     return {t for t in DEARER_TIERS if plain_usd and cost_usd(entry, million, t) == plain_usd}

@@ -1,11 +1,11 @@
-"""Reasoning that a reply's text holds before its answer, in whatever wire format it came.
+"""Separate the reasoning in a reply's text from the answer after it, in any wire format.
 
 Servers without a reasoning parser send a model's thoughts within the content, between tags or as
-channels of the harmony format. The rule: a tag in quotes is a mention and counts for nothing. A
-reply that begins with an opening tag is reasoning up to its last closing tag, and without one as a
-whole: it ended before the answer. In any other reply what stands before the last closing tag is
-reasoning if an answer follows, since chat templates may write the opening tag themselves; a tag in
-the midst of a line, with a space before it, is a word of that line. Any other text is an answer.
+channels of the harmony format. A tag in quotes is a mention and is ignored. A reply that begins
+with an opening tag is reasoning up to its last closing tag; without a closing tag all of it is
+reasoning, truncated before the answer. In any other reply the text before the last closing tag is
+reasoning if an answer follows, since chat templates may write the opening tag themselves; a tag
+within a line, after a space, is a word of that line. Any other text is an answer.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ _CLOSING = re.compile(
     r"(?:<\|constrain\|>[^<]{0,40})?<\|message\|>)",
     re.IGNORECASE,
 )
-# One of these is in each closing tag: most replies have none, and to look for them is far faster.
+# Each closing tag contains one of these. Most replies have none, and this check is far faster.
 _IN_A_CLOSING = ("</", "[/", "\u25c1/", "<|")
-# The same of a server that leaves out the special tokens.
+# The channels of a server that leaves out the special tokens.
 _BARE_FINAL = "assistantfinal"
 _BARE_CHANNELS = re.compile(rf"\s*(?:analysis|commentary).*{_BARE_FINAL}", re.DOTALL)
 _TEXT = re.compile(r"\S")
 _END_OF_CHANNEL = re.compile(r"<\|(?:end|return|call|start)\|>")
 _QUOTES = {"`": "`", '"': '"', "'": "'", "(": ")", "\u201c": "\u201d", "\u2018": "\u2019"}
 _FENCE = "```"
-# So much of a line is looked at on both sides of a tag.
+# Characters of a line that are checked on both sides of a tag.
 _BESIDE = 80
 
 
 class Parts(NamedTuple):
-    """A reply's text; it is ``cut`` where it ends within the reasoning."""
+    """Parts of a reply's text; ``cut``: it ends within the reasoning."""
 
     reasoning: str
     answer: str
@@ -73,7 +73,7 @@ def _without_opening(text: str) -> Parts:
 
 
 def _ends(text: str) -> list[re.Match[str]]:
-    """The closing tags that are no mention, the last one first."""
+    """Return the closing tags that are not mentions, the last one first."""
     if not any(part in text for part in _IN_A_CLOSING):
         return []
     return [end for end in reversed([*_CLOSING.finditer(text)]) if not _is_quoted(text, end)]

@@ -1,4 +1,4 @@
-"""The recorded replies of one model: all that a replay has, and what a live run looks up first."""
+"""Recorded replies of one model: a replay has no others, and a live run looks them up first."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Protocol
 
 from merge_runner.drivers.language_model import Question
 from merge_runner.errors import RecordingError
-from merge_runner.llm.cache import CachedCall
-from merge_runner.llm.call import Meter
-from merge_runner.llm.formats import WireFormat, read_reply
+from merge_runner.llm.attempts import Meter
+from merge_runner.llm.formats.wire import WireFormat, read_reply
+from merge_runner.llm.store import CachedCall
 from merge_runner.providers import ModelEntry
 from merge_runner.records import (
     ANSWERS,
@@ -25,8 +25,8 @@ from merge_runner.records import (
 )
 
 
-class Calls(Protocol):
-    """Recorded calls, as a cache has them."""
+class RecordedCalls(Protocol):
+    """Recorded calls by key."""
 
     def get(self, key: str, request: ChatRequest) -> CachedCall | None:
         """Return the call with the key of a request.
@@ -36,13 +36,13 @@ class Calls(Protocol):
         ...
 
     def in_recording(self, key: str) -> bool:
-        """Whether a recording that was named holds the call with this key."""
+        """Return whether a recording that was named holds the call with this key."""
         ...
 
 
 @dataclass(slots=True)
 class RecordedReplies:
-    """The replies in ``calls`` to the model ``name`` of a plan at an endpoint, as it is asked.
+    """Replies in ``calls`` of the model ``name`` of a plan at an endpoint.
 
     The ``meter`` counts those that a trial uses.
     """
@@ -51,16 +51,16 @@ class RecordedReplies:
     entry: ModelEntry
     endpoint: str
     wire: WireFormat
-    calls: Calls
+    calls: RecordedCalls
     meter: Meter = field(default_factory=Meter)
     own_names: frozenset[str | None] = field(init=False)
 
     def __post_init__(self) -> None:
-        """Derive the names under which the model may answer."""
+        """Derive the names that a reply may give its model."""
         self.own_names = frozenset({None, self.entry.id, *self.entry.aliases})
 
     def decide(self, question: Question) -> Decision:
-        """Return the decision by the recorded reply; raises ReplayMiss or CallFailed."""
+        """Return the decision of the recorded reply; raise ReplayMiss or CallFailed."""
         prompt = self.prompt(question)
         request = self.request(prompt, question.slot)
         try:
@@ -74,14 +74,14 @@ class RecordedReplies:
         return question.decide(prompt, reply)
 
     def prompt(self, question: Question) -> str:
-        """Return the prompt of a question, in the older words where these alone were asked."""
+        """Return the prompt of a question, in its older words where only these are recorded."""
         prompt, older, slot = question.prompt, question.older, question.slot
         if older is None or self.has_asked(prompt, slot) or not self.has_asked(older, slot):
             return prompt
         return older
 
     def has_asked(self, prompt: str, slot: Slot) -> bool:
-        """Return whether an answer is recorded, be it damaged; one that cannot be asked counts."""
+        """Return whether a reply is recorded; damaged or invalid counts."""
         try:
             request = self.request(prompt, slot)
             return self.calls.get(request.key, request) is not None
@@ -102,7 +102,7 @@ class RecordedReplies:
         )
 
     def read(self, recorded: CachedCall, earlier: int) -> ChatReply:
-        """Read an answer anew, as an audit does: an earlier version may have read it otherwise."""
+        """Read a recorded reply by the present rules, as an audit does: earlier ones may differ."""
         attempts, last = recorded.attempts, recorded.attempts[-1]
         payload = reply_object(last.reply or "{}") if last.http_status == 200 else {}
         reading = read_reply(self.wire, payload)
@@ -112,9 +112,9 @@ class RecordedReplies:
         return ChatReply(reading.text, last.outcome, recorded.request, attempts, earlier)
 
     def count(self, reply: ChatReply, *, shared: bool = False) -> None:
-        """Count an answer that a trial uses, and who gave it where it is another model.
+        """Count a reply that a trial uses, and the model that gave it where it is another one.
 
-        It is ``shared`` where this run has asked it for another trial.
+        ``shared``: this run has asked it for another trial.
         """
         last, meter = reply.attempts[-1], self.meter
         cached = reply.earlier == len(reply.attempts)

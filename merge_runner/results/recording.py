@@ -25,8 +25,9 @@ from typing import Any
 import duckdb
 
 from merge_runner.errors import RecordingError, UsageError
-from merge_runner.llm.cache import ATTEMPTS, CachedCall, Overlay, ResponseCache
-from merge_runner.llm.kinds import kinds_of
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.store import ATTEMPTS, CachedCall, Overlay
+from merge_runner.llm.templates import count_by_template
 from merge_runner.paths import refuse_another_kind
 from merge_runner.records import (
     DAMAGED,
@@ -184,7 +185,7 @@ def spilled(files: Iterable[Path]) -> Iterator[Overlay]:
     """
     with closing(sqlite3.connect("", check_same_thread=False)) as db:
         db.execute("CREATE TABLE entries (key TEXT PRIMARY KEY, entry TEXT)")
-        yield Spilled(db), kinds_of(_spill(files, db))
+        yield Spilled(db), count_by_template(_spill(files, db))
 
 
 def _spill(files: Iterable[Path], db: sqlite3.Connection) -> Iterator[tuple[ChatRequest, Attempt]]:

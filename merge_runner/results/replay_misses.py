@@ -11,7 +11,7 @@ from itertools import zip_longest
 from operator import attrgetter
 from pathlib import Path
 
-from merge_runner.llm.cache import CachedCall
+from merge_runner.llm.store import CachedCall
 from merge_runner.records import (
     ChatRequest,
 )

@@ -11,14 +11,17 @@ from typing import TYPE_CHECKING
 from merge_runner.errors import UsageError
 from merge_runner.llm.batch.providers import SERVICES, batch_terms
 from merge_runner.llm.batch.rounds import Rounds
+from merge_runner.llm.batch.sender import BatchSender
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.call import Call
+from merge_runner.llm.call import Calls
 from merge_runner.llm.client import LlmClient
+from merge_runner.llm.endpoint_state import EndpointState
 from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.llm.models import load_models
 from merge_runner.llm.prices import cost_usd
+from merge_runner.llm.sender import DirectSender
 from merge_runner.providers import resolve_endpoint
 from merge_runner.records import Usage
 from merge_runner.run.estimate import trial_costs
@@ -38,6 +41,7 @@ def live_clients(
     cache: ResponseCache,
     ledger: Ledger,
     *,
+    calls: Calls,
     stack: AsyncExitStack,
     rounds: Rounds | None = None,
     urls: Mapping[str, str] | None = None,
@@ -51,7 +55,7 @@ def live_clients(
     registered model go on from earlier clients, and get those that are made. Raises UsageError
     where a key is missing, or a cap could not be enforced.
     """
-    _check_money(plan, options, ledger)
+    _check_money(plan, ledger)
     _allow_files(options.connections + SPARE_FILES)
     connect = _connections(plan, options, {**os.environ, **(urls or {})}, rounds)
     limiters = {} if limiters is None else limiters
@@ -66,30 +70,23 @@ def live_clients(
         rpm, tpm = (limit and max(1, int(limit * share)) for limit in rates)
         pause, place = pauses[plan.endpoints[name]], plan.entries[name].place
         limiters.setdefault(model, Limiter(rpm=rpm, tpm=tpm, pause=pause, place=place))
-    budget = Budget(ledger, options.max_cost_usd, trial_costs(plan, earlier, batch=options.batch))
-    # Two names of one model may ask the same.
-    under_way: dict[str, Call] = {}
-    answered: set[str] = set()
+    budget = Budget(ledger, trial_costs(plan, earlier, batch=options.batch))
+    free = Budget(Ledger(cache, ""))
     clients = {}
     for name, entry in plan.entries.items():
         model, terms = plan.registered[name], batch_terms(entry)
+        wire = plan.parts.formats[entry.format]
+        # A round is submitted at once: no call of it waits for a probe.
+        verified = rounds is not None and rounds.submits
+        state = EndpointState(name, entry, plan.endpoints[name], wire, verified, name in earlier)
         clients[name] = LlmClient(
-            name=name,
-            entry=entry,
-            endpoint=plan.endpoints[name],
-            cache=cache,
-            transport=transports[model],
-            limiter=limiters[model],
-            budget=None if entry.price == "free" else budget,
+            state,
+            cache,
+            DirectSender(entry, wire, transports[model], limiters[model]),
+            free if entry.price == "free" else budget,
+            BatchSender(rounds, model, terms.price_factor) if rounds and terms else None,
             strict=options.strict_model,
-            # A round is asked at once: no call of it waits for another one's answer.
-            passed=rounds is not None and rounds.submits,
-            known=name in earlier,
-            rounds=rounds if terms else None,
-            model=model,
-            batch_price=terms.price_factor if terms else 1.0,
-            under_way=under_way,
-            answered=answered,
+            calls=calls,
         )
     return clients
 
@@ -126,11 +123,11 @@ def _connections(
     return connect
 
 
-def _check_money(plan: Plan, options: Options, ledger: Ledger) -> None:
+def _check_money(plan: Plan, ledger: Ledger) -> None:
     """Raise UsageError where a price is unknown under a cap, or what is spent is damaged."""
     for name, entry in plan.entries.items():
         unknown = cost_usd(entry, Usage(input_tokens=1, output_tokens=1)) is None
-        if options.max_cost_usd is not None and unknown:
+        if ledger.cap is not None and unknown:
             raise UsageError(
                 f"the price of {name} is unknown, so --max-cost cannot hold: give it a `price` in "
                 + entry.place

@@ -39,11 +39,13 @@ from merge_runner.errors import (
     TrialSuspended,
     UsageError,
 )
-from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.call import Meter, Wait
+from merge_runner.llm.attempts import Meter
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.call import Calls, Wait
 from merge_runner.llm.durable import Rows
-from merge_runner.llm.ledger import Asked, Ledger
+from merge_runner.llm.ledger import CallLabel, Cap, Ledger
 from merge_runner.llm.limiter import Limiter
+from merge_runner.llm.store import CachedCall
 from merge_runner.providers import base_urls
 from merge_runner.records import Attempt, Usage
 from merge_runner.registry import plugin_sources, using
@@ -176,6 +178,7 @@ class Task:
     specs: Sequence[TrialSpec]
     plan: Plan
     options: Options
+    cap: Cap | None
     urls: Mapping[str, str]
     earlier: Mapping[str, Usage | None]
     share: float
@@ -216,7 +219,7 @@ class Told:
     After the last one it is ``done``.
     """
 
-    asking: dict[int, tuple[float, Asked]] = field(default_factory=dict)
+    asking: dict[int, tuple[float, CallLabel]] = field(default_factory=dict)
     costs: dict[int, float] = field(default_factory=dict)
     done: bool = False
 
@@ -230,11 +233,11 @@ class Desk:
         self._begun = 0
         self._answers: dict[int, asyncio.Future[bool]] = {}
 
-    async def ask(self, usd: float, asked: Asked) -> tuple[int, bool]:
+    async def ask(self, usd: float, label: CallLabel) -> tuple[int, bool]:
         """Return an attempt's number and whether there is money for it; raises SweepStopped."""
         number = self._begun = self._begun + 1
         answer = self._answers[number] = asyncio.get_running_loop().create_future()
-        self.told.asking[number] = (usd, asked)
+        self.told.asking[number] = (usd, label)
         self.changed.set()
         try:
             async with asyncio.timeout(SILENT_S):
@@ -274,19 +277,21 @@ class ToldLedger(Ledger):
 
     is_shared_out = True
 
-    def __init__(self, store: ResponseCache, scope: str, desk: Desk) -> None:
-        super().__init__(store, scope)
+    def __init__(
+        self, store: ResponseCache, scope: str, desk: Desk, cap: Cap | None = None
+    ) -> None:
+        super().__init__(store, scope, cap)
         self._desk = desk
         self._numbers: dict[str, int] = {}  # by key of a call, which has one attempt at a time
 
-    async def ask(self, key: str, usd: float, asked: Asked) -> bool:
+    async def ask_coordinator(self, key: str, usd: float, label: CallLabel) -> bool:
         """Let the coordinator reserve an attempt; False if that exceeds the cap."""
-        number, is_paid = await self._desk.ask(usd, asked)
+        number, is_paid = await self._desk.ask(usd, label)
         if is_paid:
             self._numbers[key] = number
         return is_paid
 
-    def ended(self, key: str, usd: float | None) -> None:
+    def report_cost(self, key: str, usd: float | None) -> None:
         """Tell what an attempt that may be reserved has cost, where that is known."""
         number = self._numbers.pop(key, None)
         if number is not None and usd is not None:
@@ -357,15 +362,18 @@ async def _play(task: Task, kept: dict[str, Any]) -> Played:
     async with AsyncExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="merge-runner-")))
         replies = stack.enter_context(closing(ResponseCache(folder)))
-        ledger = ToldLedger(replies, task.plan.ledger, kept.setdefault(task.name, Desk()))
+        desk = kept.setdefault(task.name, Desk())
+        ledger = ToldLedger(replies, task.plan.ledger, desk, task.cap)
         overruns = [(driver, 0, 0, ratio) for driver, ratio in task.overruns]
         replies.put_now(*task.recorded, [partial(ledger.share, "", overruns, [])])
         try:
+            calls = Calls()
             clients = live_clients(
                 task.plan, task.options, task.earlier, replies, ledger,
-                stack=stack, urls=task.urls, share=task.share, limiters=limiters,
+                calls=calls, stack=stack, urls=task.urls, share=task.share, limiters=limiters,
             )  # fmt: skip
-            runner = LocalRunner(task.plan, clients, task.options.in_flight, task.first)
+            in_flight = task.options.in_flight
+            runner = LocalRunner(task.plan, clients, in_flight, task.first, calls=calls)
             played.meters = runner.meters
             work = asyncio.create_task(runner.play(task.specs, ended))
             stopped = asyncio.create_task(stopping.wait())
@@ -470,26 +478,29 @@ class DaskTasks:
             specs = specs + self._groups.popleft()
         recorded = await self._recorded(specs)
         name = f"task {secrets.token_hex(8)}"
-        cap_usd = self._options.max_cost_usd
-        if cap_usd is not None:
-            self._ledger.read()
+        self._ledger.read()
+        cap = self._ledger.cap
+        if cap is not None:
             kept_usd = sum(
-                max(0.0, (task.options.max_cost_usd or 0.0) - sum(self._begun[task.name].values()))
+                max(0.0, task.cap.usd - sum(self._begun[task.name].values()))
                 for task, _ in self._given.values()
+                if task.cap is not None
             )
-            cap_usd = max(0.0, cap_usd - self._ledger.committed_usd - kept_usd) / idle
+            share_usd = max(0.0, self._ledger.left_usd - kept_usd) / idle
+            cap = Cap(share_usd, f"a task's share of {cap.source}")
         task = Task(
             run=self._run,
             name=name,
             specs=specs,
             plan=self._sent,
-            options=replace(self._options, in_flight=in_flight, max_cost_usd=cap_usd),
+            options=replace(self._options, in_flight=in_flight),
+            cap=cap,
             urls=base_urls(self._plan.entries),
             earlier=self._earlier,
             share=1 / slots,
             first=self.first,
             recorded=recorded,
-            overruns=[*self._ledger.read().overruns.items()],
+            overruns=[*self._ledger.spending.overruns.items()],
         )
         self._begun[name], self._paid[name] = {}, []
         self._given[address] = task, asyncio.create_task(self._work(address, task))
@@ -519,8 +530,7 @@ class DaskTasks:
         What is spent stays so, whatever becomes of the worker.
         """
         write, begun, ledger = self._cache.write, self._begun[task.name], self._ledger
-        cap_usd, answers = self._options.max_cost_usd, dict[int, bool]()
-        drivers = dict[int, str]()
+        answers, drivers = dict[int, bool](), dict[int, str]()
         while True:
             told = (
                 await self._client.run(
@@ -529,14 +539,14 @@ class DaskTasks:
             )[address]
             if not isinstance(told, Told):
                 return  # lost, as the task is
-            drivers.update({number: asked.driver for number, (_, asked) in told.asking.items()})
+            drivers.update({number: label.driver for number, (_, label) in told.asking.items()})
             costs = [
                 partial(ledger.pay, task.name, number, usd, drivers[number])
                 for number, usd in told.costs.items()
             ]
             worst = [
-                partial(ledger.reserve, task.name, number, usd, cap_usd, asked)
-                for number, (usd, asked) in told.asking.items()
+                partial(ledger.reserve, task.name, number, usd, label)
+                for number, (usd, label) in told.asking.items()
             ]
             self._paid[task.name] += await asyncio.gather(*map(write, costs))
             paid = await asyncio.gather(*map(write, worst))

@@ -11,8 +11,8 @@ from statistics import median
 
 from merge_runner.llm.batch.providers import batch_terms
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.kinds import Answers, counted, kinds_of
 from merge_runner.llm.prices import cost_usd
+from merge_runner.llm.templates import AnswerCounts, answer_counts, count_by_template
 from merge_runner.prompts.blocks import render_prompt
 from merge_runner.providers import ModelEntry
 from merge_runner.records import SIDES, Usage, canonical_json
@@ -37,12 +37,12 @@ def earlier_answers(plan: Plan, cache: ResponseCache) -> dict[str, Usage | None]
     is missing. No mock model's answers count, and none that leaves its tokens out.
     """
     like = _asked_as(plan)
-    sums: dict[str, Answers] = {}
-    for kind, answers in chain.from_iterable(kinds.items() for kinds in counted(cache)):
-        asked = kind.model, kind.endpoint, kind.path, kind.body
+    sums: dict[str, AnswerCounts] = {}
+    for template, answers in chain.from_iterable(c.items() for c in answer_counts(cache)):
+        asked = template.model, template.endpoint, template.path, template.body
         for name in (name for name, wanted in like.items() if wanted[:2] == asked[:2]):
-            counts = kind.own and like[name] == asked
-            sums[name] = sums.get(name, Answers()).plus(answers if counts else Answers())
+            counts = template.own and like[name] == asked
+            sums[name] = sums.get(name, AnswerCounts()).plus(answers if counts else AnswerCounts())
     return {name: _mean(answers) for name, answers in sums.items()}
 
 
@@ -54,9 +54,9 @@ def usual_latencies_s(
     found: dict[str, list[float]] = {name: [] for name, usage in facts.items() if usage is not None}
     for call in cache.newest(MOST_READ) if found else ():
         last = call.attempts[-1]
-        (kind,) = kinds_of([(call.request, last)])
-        asked = kind.model, kind.endpoint, kind.path, kind.body
-        if kind.own and last.latency_s is not None:
+        (template,) = count_by_template([(call.request, last)])
+        asked = template.model, template.endpoint, template.path, template.body
+        if template.own and last.latency_s is not None:
             for name in (name for name in found if like[name] == asked):
                 found[name].append(last.latency_s)
         if all(len(latencies_s) >= ENOUGH for latencies_s in found.values()):
@@ -73,7 +73,7 @@ def _asked_as(plan: Plan) -> dict[str, tuple[str, str, str, str]]:
     return asked
 
 
-def _mean(answers: Answers) -> Usage | None:
+def _mean(answers: AnswerCounts) -> Usage | None:
     if not answers.measured:
         return None
     return Usage(

@@ -11,7 +11,7 @@ from functools import partial
 from merge_runner.drivers.language_model import Question
 from merge_runner.errors import ProviderDown, TrialSuspended
 from merge_runner.llm.batch.rounds import Rounds
-from merge_runner.llm.call import Wait
+from merge_runner.llm.call import Calls, Wait
 from merge_runner.llm.client import LlmClient
 from merge_runner.records import CallFailed, Decision, Side
 from merge_runner.run.guard import FirstDecisions
@@ -38,6 +38,7 @@ class LocalRunner:
     in_flight: int
     first: FirstDecisions = field(default_factory=FirstDecisions)
     rounds: Rounds | None = None
+    calls: Calls = field(default_factory=Calls)
     running: int = 0
     workers: None = None
     # The open questions of each trial that is running and has asked.
@@ -53,24 +54,22 @@ class LocalRunner:
     @property
     def waits(self) -> Sequence[Wait]:
         """What the calls wait for that are not in flight."""
-        return [wait for client in self.clients.values() for wait in client.waits]
+        return self.calls.waits
 
     @property
     def held(self) -> int:
         """How many of the running trials wait for money."""
-        return len(set().union(*(client.money.waiting for client in self.clients.values())))
+        return len(set().union(*(client.budget.waiting for client in self.clients.values())))
 
     def _is_idle(self) -> bool:
         """Whether no trial goes on by itself: all ask, and wait for the answers to others."""
-        idle = sum(client.idle_askers for client in self.clients.values())
         asking = +self._asking  # without the trials that ask nothing now
-        return self.running == len(asking) and asking.total() == idle
+        return self.running == len(asking) and asking.total() == self.calls.blocked_askers
 
     @property
     def unsaved(self) -> str:
         """What Ctrl-C waits for, in words."""
-        calls = sum(client.in_flight_calls for client in self.clients.values())
-        return f"{calls} calls in flight"
+        return f"{self.calls.in_flight} calls in flight"
 
     async def play(
         self, specs: Sequence[TrialSpec], ended: Ended, room: Room | None = None
@@ -111,7 +110,7 @@ class LocalRunner:
                 self.running -= 1
                 self._asking.pop(spec.order, None)
                 for client in self.clients.values():
-                    client.money.leave(spec.order)
+                    client.budget.leave(spec.order)
 
     async def _play(self, trial: Trial, order: int) -> TrialRecord:
         """Ask all that is pending side by side; where a driver raises, no other one goes on."""
@@ -129,7 +128,7 @@ class LocalRunner:
 
     async def drain(self) -> None:
         """Let calls in flight end and be saved, and drop those that still wait for a turn."""
-        await asyncio.gather(*(client.drain() for client in self.clients.values()))
+        await self.calls.drain()
 
     def _watch_for_outage(self, record: TrialRecord) -> None:
         """Stop when trials keep failing for one model that answers no call in between."""

@@ -15,7 +15,7 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from merge_runner.llm.call import Meter
+from merge_runner.llm.attempts import Meter
 from merge_runner.llm.ledger import Ledger
 from merge_runner.run.plan import Plan, usual_prompts
 from merge_runner.run.progress_file import (
@@ -56,7 +56,6 @@ class Progress:
     todo: Counter[str]
     done: Counter[str] = field(default_factory=Counter)
     stored: int = 0
-    cap_usd: float | None = None
     outcome_counts: Counter[str] = field(default_factory=Counter)
     began_at: datetime = field(default_factory=lambda: datetime.now(UTC))
     ended_at: datetime | None = None
@@ -90,8 +89,8 @@ class Progress:
         total = self.planned - self.stored
         trials = f"{ended + failed}/{total} ended{before}, {running}"
         cost = f"{meter.cost_usd:.2f} USD"
-        if self.cap_usd is not None:
-            cost += f", {self.ledger.committed_usd:.2f} of {self.cap_usd:g} over all runs"
+        if (cap := self.ledger.cap) is not None:
+            cost += f", {self.ledger.committed_usd:.2f} of {cap.usd:g} over all runs"
         left = "" if left_s is None else f", about {left_s:.0f} s left"
         rows = [
             *dict.fromkeys(("WARNING", text) for text in self._warnings()),

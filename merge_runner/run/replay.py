@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from merge_runner.drivers.language_model import Question
 from merge_runner.llm.call import Wait
-from merge_runner.llm.recorded import Calls, RecordedReplies
+from merge_runner.llm.recorded import RecordedCalls, RecordedReplies
 from merge_runner.records import Decision
 from merge_runner.run.guard import FirstDecisions
 from merge_runner.run.plan import Plan
@@ -22,7 +22,7 @@ class Replay:
     """Plays trials by recorded ``calls`` alone: no key, no connection, and nothing to wait for."""
 
     plan: Plan
-    calls: Calls
+    calls: RecordedCalls
     running: int = 0
     held: int = 0
     waits: Sequence[Wait] = ()

@@ -18,9 +18,10 @@ import duckdb
 
 from merge_runner.audit.checks import Audit, Finding, audited_database, check_rest, check_sweep
 from merge_runner.errors import MergeRunnerError, RecordingError, UsageError
-from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.formats import WireFormat
 from merge_runner.llm.http_outcome import RawReply, judge
+from merge_runner.llm.store import CachedCall
 from merge_runner.records import (
     ANSWERS,
     DAMAGED,

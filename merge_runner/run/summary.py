@@ -70,7 +70,7 @@ def as_dict(
         "set_aside_usd": round(spending.reserved_usd, 6),
         "attempts_of_unknown_cost": spending.open_attempts,
         "over_the_worst_case_usd": round(spending.overrun_usd, 6),
-        "dearest": spending.dearest,
+        "dearest": spending.largest_overruns,
         "underpriced": meter.underpriced,
         "damaged_entries": meter.damaged,
         "open_batches": progress.batches(),
@@ -111,7 +111,7 @@ def as_lines(summary: dict[str, Any]) -> Iterator[str]:
     yield from _costs(summary)
     yield from (f"open batch: {text}" for text in summary["open_batches"])
     for key in summary["damaged_entries"]:
-        yield f"WARNING: a recorded reply was damaged, set aside and asked again: {key}"
+        yield f"WARNING: a recorded reply was damaged, quarantined and asked again: {key}"
     if is_stored:
         yield from _faults(summary)
 
@@ -165,8 +165,8 @@ def _costs(summary: dict[str, Any]) -> Iterator[str]:
     unknown = f" and {number} calls of unknown cost" if number else ""
     made = (*summary["calls"].values(), summary["calls_shared"], summary["calls_recorded"])
     calls = calls_text(*made)
-    spent_usd, aside_usd = summary["sweep_cost_usd"], summary["set_aside_usd"]
-    apart = bool(aside_usd) or round(spent_usd, 4) != round(summary["cost_usd"], 4)
+    spent_usd, reserved_usd = summary["sweep_cost_usd"], summary["set_aside_usd"]
+    apart = bool(reserved_usd) or round(spent_usd, 4) != round(summary["cost_usd"], 4)
     alone = " in this run" if apart else ""
     text = f"calls: {calls}; cost {summary['cost_usd']:.4f} USD{alone}{unknown}"
     if (expected := summary["estimate"]) is not None:
@@ -174,8 +174,8 @@ def _costs(summary: dict[str, Any]) -> Iterator[str]:
     yield text
     if apart:
         ledger = command_at("merge-runner ledger", "--cache", summary["cache"], DEFAULT_CACHE)
-        why = f", and {aside_usd:.4f} set aside (`{ledger}` says why)"
-        yield f"this sweep over all its runs: {spent_usd:.4f} USD{why if aside_usd else ''}"
+        why = f", and {reserved_usd:.4f} reserved (`{ledger}` says why)"
+        yield f"this sweep over all its runs: {spent_usd:.4f} USD{why if reserved_usd else ''}"
         yield APART
     if over_usd := summary["over_the_worst_case_usd"]:
         yield (

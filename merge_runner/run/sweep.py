@@ -31,10 +31,12 @@ from merge_runner.errors import (
 )
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.client import LONG_WAIT_S
-from merge_runner.llm.http_outcome import TransportFailure, if_nobody, set_base_url
-from merge_runner.llm.kinds import counted, recorded_values
-from merge_runner.llm.ledger import Ledger, scopes
+from merge_runner.llm.call import Calls
+from merge_runner.llm.http_outcome import TransportFailure
+from merge_runner.llm.ledger import Cap, Ledger, scopes
+from merge_runner.llm.probe import LONG_WAIT_S
+from merge_runner.llm.refusals import if_nobody, set_base_url
+from merge_runner.llm.templates import answer_counts, recorded_values
 from merge_runner.paths import DEFAULT_DB, SHIPPED_RECORDINGS, command_at
 from merge_runner.providers import PROVIDERS, UNNAMED, ModelEntry, model_id, resolve_endpoint
 from merge_runner.records import ReplayMiss, canonical_json
@@ -135,7 +137,10 @@ async def play(
 
 def _has_replies(cache: ResponseCache, plan: Plan) -> bool:
     """Whether a model of a plan is recorded, or it has none; what is damaged may be of it."""
-    models, (_, kinds) = {entry.id or UNNAMED for entry in plan.entries.values()}, counted(cache)
+    models, (_, kinds) = (
+        {entry.id or UNNAMED for entry in plan.entries.values()},
+        answer_counts(cache),
+    )
     whole = sum(answers.answers for answers in kinds.values())
     return any(kind.model in models for kind in kinds) or cache.number > whole or not models
 
@@ -239,8 +244,7 @@ class Sweep:
             stored=len(self._stored),
             runner=runner,
             ledger=self._ledger,
-            cap_usd=self._options.max_cost_usd,
-            batches=self._rounds.standing if self._rounds else list,
+            batches=self._rounds.status_lines if self._rounds else list,
         )
 
     def _fail(self, exit_code: int, message: str) -> None:
@@ -284,11 +288,11 @@ class Sweep:
             facts=facts,
             latencies_s=usual_latencies_s(self._plan, self._cache, facts),
         )
-        cap_usd = self._options.max_cost_usd
-        if cap_usd is None or whole:
+        cap = self._ledger.cap
+        if cap is None or whole:
             return expected
         self._ledger.read()
-        return replace(expected, left_usd=max(0.0, cap_usd - self._ledger.committed_usd))
+        return replace(expected, left_usd=max(0.0, self._ledger.left_usd))
 
     async def _begin(self, store: Store) -> str:
         started_at = datetime.now(UTC).replace(tzinfo=None)
@@ -301,7 +305,7 @@ class Sweep:
             "config": canonical_json(
                 {
                     **self._plan.model_dump(mode="json"),
-                    "max_cost_usd": self._options.max_cost_usd,
+                    "max_cost_usd": cap.usd if (cap := self._ledger.cap) else None,
                     "typed": self._options.typed,
                     **({"run_name": name} if (name := self._options.name) else {}),
                 }
@@ -329,14 +333,16 @@ class Sweep:
         if options.dask is not None:
             client = await stack.enter_async_context(connected(options.dask))
             return DaskTasks(client, plan, options, earlier, self._cache, self._ledger, first)
+        calls = Calls()
         clients = live_clients(
-            plan, options, earlier, self._cache, self._ledger, stack=stack, rounds=rounds
-        )
+            plan, options, earlier, self._cache, self._ledger,
+            calls=calls, stack=stack, rounds=rounds,
+        )  # fmt: skip
         if rounds is not None:
             stack.push_async_callback(rounds.close)
         # A trial that waits for a round takes up nobody's time, but memory.
         in_flight = MOST_IN_ROUNDS if options.batch else options.in_flight
-        return LocalRunner(plan, clients, in_flight, first, rounds)
+        return LocalRunner(plan, clients, in_flight, first, rounds, calls)
 
     async def _play(self, progress: Progress, flusher: Flusher) -> bool:
         """Run the trials until all have ended, or the sweep is stopped or interrupted; store them.
@@ -486,8 +492,6 @@ async def open_sweep(
     ask. ``say`` shows a line to the user. Raises UsageError.
     """
     check_batches(plan, options)
-    if options.max_cost_usd is None:
-        options = replace(options, max_cost_usd=plan.study.file.budget.get("total_usd"))
     recorded = partial(spilled, options.recordings) if options.recordings else None
     with closing(ResponseCache(options.cache, overlay=recorded)) as cache:
         plan = await _with_names(plan, options, cache, say)
@@ -498,16 +502,15 @@ async def open_sweep(
             stored = [spec for key, spec in specs.items() if key in ended]
             refuse_changed_programs(options.db, plan, stored)
         todo = [spec for key, spec in specs.items() if key not in ended]
-        others: list[str] = []
-        if todo and not options.sends_nothing:
-            if options.dask is None:
-                for name, entry in plan.entries.items():
-                    resolve_endpoint(name, entry)  # raises where its key is missing
-            others = _others_under_the_cap(plan, options, cache, say)
+        live = bool(todo) and not options.sends_nothing
+        if live and options.dask is None:
+            for name, entry in plan.entries.items():
+                resolve_endpoint(name, entry)  # raises where its key is missing
+        cap = _cap(plan, options, cache, say, live=live)
+        if live:
             asked = plan.entries.items()
             cache.locks.take({f"{e.id} at {plan.endpoints[name]}" for name, e in asked})
-        ledger = Ledger(cache, plan.ledger, others)
-        yield Sweep(plan, options, cache, stored, todo, say, ledger)
+        yield Sweep(plan, options, cache, stored, todo, say, Ledger(cache, plan.ledger, cap))
 
 
 async def _with_names(
@@ -572,26 +575,29 @@ async def _served_name(name: str, entry: ModelEntry, *, say: Callable[[str], Non
     return listed[0]
 
 
-def _others_under_the_cap(
-    plan: Plan, options: Options, cache: ResponseCache, say: Callable[[str], None]
-) -> list[str]:
-    """The other ledgers whose money counts under the cap, where there is one and they hold any.
+def _cap(
+    plan: Plan, options: Options, cache: ResponseCache, say: Callable[[str], None], *, live: bool
+) -> Cap | None:
+    """Return the cap of a run, by --max-cost or by its study's budget; None: there is none.
 
-    They are those of sweeps that share the cap, and others of this study: it was run before its
-    file had a budget, or has none any more.
+    In a ``live`` run it is also over the ledgers of sweeps that share it, and over others of this
+    study: it was run before its file had a budget, or has none any more.
     """
-    if options.max_cost_usd is None:
-        return []
     own, study = plan.ledger, plan.study.name
+    usd, source = options.max_cost_usd, "--max-cost"
+    if usd is None:
+        usd, source = plan.study.file.budget.get("total_usd"), f"[budget] of {study}"
+    if usd is None:
+        return None
     others = [
         scope
-        for scope in scopes(cache)
+        for scope in (scopes(cache) if live else ())
         if scope != own
         and (scope in options.ledgers or (study in (own, scope) and scope.split("/")[0] == study))
     ]
     if spent_usd := sum(Ledger(cache, scope).read().committed_usd for scope in others):
         say(f"{spent_usd:.4f} USD of {', '.join(others)} count against the budget, too")
-    return others
+    return Cap(usd, source, (own, *others))
 
 
 def _played_as(spec: TrialSpec) -> str:

@@ -8,7 +8,8 @@ from typing import Protocol
 from merge_runner.drivers.base import MakeDriver
 from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.errors import TrialSuspended
-from merge_runner.llm.call import Meter, Wait
+from merge_runner.llm.attempts import Meter
+from merge_runner.llm.call import Wait
 from merge_runner.records import SIDES
 from merge_runner.run.guard import FirstDecisions
 from merge_runner.run.plan import Plan

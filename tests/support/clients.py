@@ -8,10 +8,14 @@ import pytest
 
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.call import Calls
 from merge_runner.llm.client import LlmClient
+from merge_runner.llm.endpoint_state import EndpointState
+from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import RawReply
-from merge_runner.llm.ledger import Ledger
+from merge_runner.llm.ledger import Cap, Ledger
 from merge_runner.llm.limiter import Limiter
+from merge_runner.llm.sender import DirectSender
 from merge_runner.providers import ModelEntry, Price
 from merge_runner.records import Slot
 from tests.support.virtual_time import now_s
@@ -89,26 +93,41 @@ def cache(opened):
     return opened
 
 
+def budget_of(ledger, cap_usd=None, *trial_usd):
+    """The budget of a ledger under a cap in USD."""
+    ledger.cap = None if cap_usd is None else Cap(cap_usd)
+    return Budget(ledger, *trial_usd)
+
+
+def client_of(
+    name, entry, identity, cache, transport, *, limiter=None, budget=None, batch=None, calls=None,
+    verified=True, has_answered=False,
+):  # fmt: skip
+    """A client of a model at an endpoint; without a budget it costs nothing."""
+    wire = FORMATS[entry.format]
+    return LlmClient(
+        EndpointState(name, entry, identity, wire, verified, has_answered),
+        cache,
+        DirectSender(entry, wire, transport, limiter or Limiter()),
+        budget or Budget(Ledger(cache, "")),
+        batch,
+        calls=calls or Calls(),
+    )
+
+
 @pytest.fixture
 def make(cache):
     """A client whose server gives these replies."""
 
-    def make(*replies, limiter=None, cap=None, cache=cache, passed=True, known=False, **changes):
-        under_way = changes.pop("under_way", {})
+    def make(*replies, limiter=None, cap=None, cache=cache, calls=None, **changes):
+        seen = {name: changes.pop(name) for name in ("verified", "has_answered") if name in changes}
         fields = {"provider": "openai", "format": "openai-chat", "id": "m-1", "price": "free"}
         entry = ModelEntry(**{**fields, "max_output_tokens": 100, **changes})
         entry = entry.with_place("[my-model] in models.toml")
-        return LlmClient(
-            name="my-model",
-            entry=entry,
-            endpoint="openai",
-            cache=cache,
-            transport=Server(*replies),
-            limiter=limiter or Limiter(),
-            budget=None if entry.price == "free" else Budget(Ledger(cache, "test"), cap),
-            passed=passed,
-            known=known,
-            under_way=under_way,
-        )
+        paid = None if entry.price == "free" else budget_of(Ledger(cache, "test"), cap)
+        return client_of(
+            "my-model", entry, "openai", cache, Server(*replies),
+            limiter=limiter, budget=paid, calls=calls, **seen,
+        )  # fmt: skip
 
     return make

@@ -3,12 +3,12 @@
 from collections import Counter
 from types import SimpleNamespace
 
-from merge_runner.llm.ledger import Spending
+from merge_runner.llm.ledger import Cap, Spending
 from merge_runner.run.plan import make_plan
 from merge_runner.run.progress import Progress
 
 SPENDING = Spending(spent_usd=4.0, reserved_usd=0.25)
-LEDGER = SimpleNamespace(spending=SPENDING, committed_usd=SPENDING.committed_usd)
+LEDGER = SimpleNamespace(spending=SPENDING, committed_usd=SPENDING.committed_usd, cap=Cap(20))
 
 
 def runner(*meters, running=0, waits=(), held=0):

@@ -18,7 +18,8 @@ from aiohttp import web
 from merge_runner.audit import checks
 from merge_runner.audit.checks import audit_sweep
 from merge_runner.errors import UsageError
-from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.store import CachedCall
 from merge_runner.records import SCRIPTED_FIELD, make_request
 from merge_runner.results.recording import export_recording, read_recording
 from merge_runner.results.store import query

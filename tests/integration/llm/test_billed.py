@@ -13,13 +13,10 @@ import pytest
 from aiohttp import web
 
 from merge_runner.errors import MergeRunnerError
-from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.client import LlmClient
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.ledger import Ledger
-from merge_runner.llm.limiter import Limiter
 from merge_runner.llm.prices import cost_usd
 from merge_runner.providers import Endpoint, ModelEntry, Price
 from merge_runner.records import Slot, Usage, canonical_json
@@ -29,6 +26,7 @@ from tests.integration.llm.test_scenarios import (  # noqa: F401 # fixtures
     OPENAI,
     _idle_connections_grow_old_in_virtual_time,
 )
+from tests.support.clients import budget_of, client_of
 from tests.support.harness import each
 from tests.support.mock_server import FaultPlan
 from tests.support.scenarios import SCENARIOS, ScenarioPlan, playing
@@ -98,32 +96,26 @@ def cache(folder):
     cache.close()
 
 
-async def asked(cache, till, faults, *, cap, name, calls=CALLS, passed=True):
+async def asked(cache, till, faults, *, cap, name, calls=CALLS, verified=True):
     """Ask for samples at once under a cap of so many worst cases; returns client and cap in USD."""
     sent = canonical_json(FORMATS[till.wire].request(till.entry, PROMPT).body).encode()
     worst = till.price(len(sent), OUTPUT_CAP)
     async with playing(faults, till.middle) as url:
         base_url = f"{url}/v1" if till.wire in OPENAI else url
         transport = HttpTransport(Endpoint("openai", name, base_url, {}), connections=calls)
-        client = LlmClient(
-            name="my-model",
-            entry=till.entry,
-            endpoint=name,
-            cache=cache,
-            transport=transport,
-            limiter=Limiter(),
-            budget=Budget(Ledger(cache, name), cap * worst, each(worst)),
-            passed=passed,
+        budget = budget_of(Ledger(cache, name), cap * worst, each(worst))
+        client = client_of(
+            "my-model", till.entry, name, cache, transport, budget=budget, verified=verified
         )
 
         async def ask(number):
             with contextlib.suppress(MergeRunnerError):
                 await client.ask(PROMPT, Slot("N_0_0", number, "left", 0, 0), order=number)
-            client.money.leave(number)
+            client.budget.leave(number)
 
         try:
             await asyncio.gather(*map(ask, range(calls)))
-            await client.drain()
+            await client.calls.drain()
         finally:
             await transport.close()
     return client, cap * worst
@@ -161,12 +153,12 @@ async def test_a_server_that_ignores_the_output_cap_does_not_pass_the_other_one(
     cache, wire, honest, dear, from_now_on
 ):
     till = Till(wire, writes=after(honest, *dear))
-    more = {"name": f"https://endless/{from_now_on}/{wire}", "calls": 60, "passed": False}
+    more = {"name": f"https://endless/{from_now_on}/{wire}", "calls": 60, "verified": False}
     client, cap_usd = await asked(cache, till, FaultPlan(), cap=10.5, **more)
     spending = client.budget.ledger.read()
     assert 0.6 * cap_usd < till.usd <= cap_usd
     assert spending.spent_usd == pytest.approx(till.usd)
-    assert spending.overruns[client.driver] == pytest.approx(from_now_on, rel=0.05)
+    assert spending.overruns[client.endpoint.driver] == pytest.approx(from_now_on, rel=0.05)
     assert any("does not keep to the cap of 16000 output" in note for note in client.meter.notes)
 
 
@@ -175,6 +167,6 @@ async def test_a_server_that_ignores_the_output_cap_does_not_pass_the_other_one(
 async def test_the_last_reply_alone_can_pass_the_cap_and_nothing_is_asked_after_it(cache, wire):
     till = Till(wire, writes=after(3, 64_000))
     name = f"https://at-the-end/{wire}"
-    client, cap_usd = await asked(cache, till, FaultPlan(), cap=1.5, name=name, passed=False)
+    client, cap_usd = await asked(cache, till, FaultPlan(), cap=1.5, name=name, verified=False)
     assert cap_usd < till.usd < cap_usd + till.price(40, 64_000)
     assert client.meter.outcomes.total() == 4

@@ -12,14 +12,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from merge_runner.errors import CacheFailed, RecordingError, TrialSuspended, UsageError
-from merge_runner.llm.budget import Budget
-from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.call import Meter
-from merge_runner.llm.ledger import Asked, Ledger
+from merge_runner.llm.attempts import Meter
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.ledger import CallLabel, Ledger
+from merge_runner.llm.store import CachedCall
 from merge_runner.records import Attempt, Slot, make_request
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import make_plan
 from tests.support.cases import cases
+from tests.support.clients import budget_of
 from tests.support.harness import each
 
 CAP = 100
@@ -48,7 +49,7 @@ def ledger(cache, request):
 
 
 def asked(worst, driver=""):
-    return Asked(driver, "", worst)
+    return CallLabel(driver, "", worst)
 
 
 def tried(actual, outcome="server_error"):
@@ -58,7 +59,7 @@ def tried(actual, outcome="server_error"):
 async def attempt(budget, trial, worst, actual, turns=0, model="m"):
     """Spend on one attempt as a client does."""
     await budget.admit(trial)
-    paid = await budget.set_aside(trial, f"key {model}", asked(worst))
+    paid = await budget.reserve(trial, f"key {model}", asked(worst))
     with contextlib.closing(paid):
         await paid.begin(1)
         for _ in range(turns):
@@ -76,14 +77,14 @@ def now(ledger, operation, *arguments):
 
 
 def set_aside(budget, trial, worst, driver=""):
-    return budget.set_aside(trial, f"key {trial}", asked(worst, driver))
+    return budget.reserve(trial, f"key {trial}", asked(worst, driver))
 
 
 @settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(calls, st.integers(0, 60))
 async def test_what_is_spent_and_set_aside_never_exceeds_the_cap(cache, plan, trial_usd):
     ledger = Ledger(cache, f"sweep {uuid4()}")
-    budget = Budget(ledger, CAP, each(trial_usd))
+    budget = budget_of(ledger, CAP, each(trial_usd))
     reserve = ledger.reserve
 
     def watched(*arguments):
@@ -119,7 +120,7 @@ class Trials:
 
     def begin_a_run(self):
         trial = [each(self.case["trial"])] if "trial" in self.case else []
-        self.budget = Budget(Ledger(self.cache, self.scope), self.case.get("cap"), *trial)
+        self.budget = budget_of(Ledger(self.cache, self.scope), self.case.get("cap"), *trial)
 
     async def job(self, trial, verb, worst=0, actual="0"):
         if verb == "begins":
@@ -170,16 +171,16 @@ async def test_money_goes_to_trials_in_their_order_and_never_beyond_the_cap(cach
 
 
 async def test_an_attempt_that_a_dead_process_began_counts_too(ledger, cache):
-    dead = Budget(ledger, 1.0)
+    dead = budget_of(ledger, 1.0)
     paid = await set_aside(dead, 1, 0.75)
     await paid.begin(1)
     assert [a.outcome for a in cache.look_up("key 1")[1]] == ["unknown"]
     with pytest.raises(TrialSuspended):
-        await set_aside(Budget(ledger, 1.0), 1, 0.5)
+        await set_aside(budget_of(ledger, 1.0), 1, 0.5)
 
 
 async def test_the_ledger_refuses_what_two_processes_reserved_at_once(ledger, cache):
-    both = [Budget(Ledger(cache, "shared"), 1.0) for _ in range(2)]
+    both = [budget_of(Ledger(cache, "shared"), 1.0) for _ in range(2)]
     # Neither knows of the other's yet.
     paid = [await set_aside(budget, trial, 0.75) for trial, budget in enumerate(both)]
     await paid[0].begin(1)
@@ -192,15 +193,15 @@ async def test_money_that_is_left_is_spent_although_an_older_trial_never_asks_fo
     ledger, monkeypatch
 ):
     monkeypatch.setattr("merge_runner.llm.budget.PATIENCE_S", 0.01)
-    budget = Budget(ledger, 4.0, each(2.0))
+    budget = budget_of(ledger, 4.0, each(2.0))
     await budget.admit(1)
     await budget.admit(2)
     await attempt(budget, 2, 3.0, 3.0)
 
 
 async def test_trials_that_wait_for_money_are_counted_once(ledger):
-    budget = Budget(ledger, 3.0, each(2.0))
-    client = SimpleNamespace(meter=Meter(), money=budget)
+    budget = budget_of(ledger, 3.0, each(2.0))
+    client = SimpleNamespace(meter=Meter(), budget=budget)
     runner = LocalRunner(make_plan("baseline"), {"one": client, "other": client}, 9)
     await budget.admit(1)
     both = [asyncio.create_task(budget.admit(trial)) for trial in (2, 2, 3)]
@@ -216,25 +217,25 @@ async def test_trials_that_wait_for_money_are_counted_once(ledger):
 
 @pytest.mark.parametrize("usd", [-9.0, -math.inf])
 async def test_spending_that_nobody_can_have_spent_is_not_believed(ledger, cache, usd):
-    await attempt(Budget(ledger), 1, 0.5, 0.25)
+    await attempt(budget_of(ledger), 1, 0.5, 0.25)
     cache.run_now([lambda execute: execute("UPDATE spent SET usd = ?", (usd,))])
     with pytest.raises(UsageError, match="so that no cap could hold"):
         ledger.read()
     cache.run_now([lambda execute: execute("DELETE FROM spent")])
 
 
-O3 = Asked("o3 at gateway", "L_4_0 rep 1 left, decision 3", 0.25)
+O3 = CallLabel("o3 at gateway", "L_4_0 rep 1 left, decision 3", 0.25)
 
 
 async def test_what_is_set_aside_is_told_with_the_reason_of_each_attempt(ledger):
     retried = enumerate(("timeout", "connection_lost", "server_error"), 1)
     for key, number, outcome in (("a", 1, "timeout"), *(("b", *one) for one in retried)):
-        now(ledger, ledger.reserve, key, number, 0.25, None, O3)
+        now(ledger, ledger.reserve, key, number, 0.25, O3)
         actual = 0.0 if outcome == "connection_lost" else None
         ended = Attempt(number, outcome, cost_usd=actual)
         now(ledger, ledger.settle, key, ended, O3.driver)
-    now(ledger, ledger.reserve, "d", 1, 0.125, None, O3)
-    now(ledger, ledger.reserve, "paid", 1, 0.25, None, O3)
+    now(ledger, ledger.reserve, "d", 1, 0.125, O3)
+    now(ledger, ledger.reserve, "paid", 1, 0.25, O3)
     now(ledger, ledger.settle, "paid", tried(0.1), O3.driver)
     reasons = ledger.reasons()
     assert [(r["outcome"], r["attempts"], r["usd"]) for r in reasons] == [
@@ -248,19 +249,19 @@ async def test_what_is_set_aside_is_told_with_the_reason_of_each_attempt(ledger)
 
 
 async def test_what_is_released_counts_no_longer(ledger, cache):
-    await attempt(Budget(ledger, 1.0), 1, 0.75, None)
+    await attempt(budget_of(ledger, 1.0), 1, 0.75, None)
     with pytest.raises(TrialSuspended):
-        await set_aside(Budget(ledger, 1.0), 1, 0.5)
+        await set_aside(budget_of(ledger, 1.0), 1, 0.5)
     ledger.release()
     again = Ledger(cache, ledger.scope)
     assert (again.spending.committed_usd, again.reasons()) == (0, [])
-    await set_aside(Budget(again, 1.0), 1, 0.5)
+    await set_aside(budget_of(again, 1.0), 1, 0.5)
 
 
 def test_what_is_settled_counts_at_once_whoever_has_reserved_or_released_it(ledger, cache):
     other = Ledger(cache, "another sweep")
     for key in ("line", "released", "own"):
-        now(other, other.reserve, key, 1, 0.25, None, O3)
+        now(other, other.reserve, key, 1, 0.25, O3)
     now(ledger, ledger.settle, "line", tried(0.125), O3.driver)
     assert (ledger.committed_usd, other.read().committed_usd) == (0, 0.625)
     now(other, other.settle, "own", tried(0.125), O3.driver)
@@ -274,9 +275,9 @@ async def test_a_task_s_share_gives_way_to_what_the_task_has_spent_and_open(ledg
     cache = ResponseCache(tmp_path)
     task = Ledger(cache, "task")
     for key in ("a", "b"):
-        now(task, task.reserve, key, 1, 0.25, None, O3)
+        now(task, task.reserve, key, 1, 0.25, O3)
     now(task, task.settle, "a", tried(0.5), O3.driver)
-    now(ledger, ledger.reserve, "task 1", 1, 2.0, None, O3)
+    now(ledger, ledger.reserve, "task 1", 1, 2.0, O3)
     now(ledger, ledger.share, "task 1", *task.rows())
     assert ledger.read() == task.read()
     assert (ledger.spending.spent_usd, ledger.spending.reserved_usd) == (0.5, 0.25)
@@ -299,7 +300,7 @@ async def test_a_reply_and_its_cost_are_kept_together_or_not_at_all(ledger, cach
         operations[fails](execute)
         raise RecordingError("nothing of this is kept")
 
-    now(ledger, ledger.reserve, request.key, 1, 0.25, None, O3)
+    now(ledger, ledger.reserve, request.key, 1, 0.25, O3)
     both = {**operations, fails: raising}
     with pytest.raises(RecordingError):
         await cache.write(lambda execute: [each(execute) for each in both.values()])
@@ -315,21 +316,21 @@ def test_money_that_cannot_be_written_is_no_damaged_record(tmp_path):
     ledger = Ledger(cache, "sweep")
     cache.run_now([lambda execute: execute("PRAGMA max_page_count = 1")])
     with pytest.raises(CacheFailed, match="cannot be written: database or disk is full"):
-        [now(ledger, ledger.reserve, str(n), 1, 0.25, None, O3) for n in range(1_000)]
+        [now(ledger, ledger.reserve, str(n), 1, 0.25, O3) for n in range(1_000)]
     cache.close()
 
 
 async def test_after_a_reply_that_cost_more_than_its_worst_case_as_much_is_set_aside(ledger, cache):
-    budget = Budget(ledger, 10.0)
-    with contextlib.closing(await budget.set_aside(1, "key", O3)) as paid:
+    budget = budget_of(ledger, 10.0)
+    with contextlib.closing(await budget.reserve(1, "key", O3)) as paid:
         await paid.begin(1)
         await paid.settle(tried(0.75), nothing)
     assert (ledger.spending.spent_usd, ledger.spending.overrun_usd) == (0.75, 0.5)
-    assert ledger.spending.dearest == "o3 at gateway up to 3.00 times as much"
-    next_run = Budget(Ledger(cache, ledger.scope), 10.0)
-    assert (await set_aside(next_run, 2, 0.25, "another driver")).aside_usd == 0.25
-    with contextlib.closing(await next_run.set_aside(1, "other", O3)) as paid:
-        assert paid.aside_usd == 0.75
+    assert ledger.spending.largest_overruns == "o3 at gateway up to 3.00 times as much"
+    next_run = budget_of(Ledger(cache, ledger.scope), 10.0)
+    assert (await set_aside(next_run, 2, 0.25, "another driver")).usd == 0.25
+    with contextlib.closing(await next_run.reserve(1, "other", O3)) as paid:
+        assert paid.usd == 0.75
         await paid.begin(1)
         # A reply within what is now set aside does not count as another overrun of it.
         await paid.settle(tried(0.5), nothing)
@@ -337,15 +338,15 @@ async def test_after_a_reply_that_cost_more_than_its_worst_case_as_much_is_set_a
 
 
 async def test_a_suspended_trial_says_what_the_cap_is_needed_for(ledger):
-    budget = Budget(ledger, 5.0, each(2.0))
+    budget = budget_of(ledger, 5.0, each(2.0))
     await attempt(budget, 1, 1.0, 0.5)
     await attempt(budget, 1, 0.5, None)
     await budget.admit(2)
     with pytest.raises(TrialSuspended) as caught:
         await set_aside(budget, 1, 5.0)
     assert str(caught.value) == (
-        "the next call may cost 5.0000 USD, and 1.0000 of 5 USD are spent or set aside (0.5000 "
-        "spent, 0.5000 set aside for 1 attempts whose cost is not known: `merge-runner ledger`); "
+        "the next call may cost 5.0000 USD, and 1.0000 of 5 USD are spent or reserved (0.5000 "
+        "spent, 0.5000 reserved for 1 attempts whose cost is not known: `merge-runner ledger`); "
         "3.0000 more are kept for the trials that have begun"
     )
 
@@ -366,11 +367,11 @@ async def test_however_an_attempt_ends_its_money_ends_in_the_right_place(
 ):
     """``money``: what is kept for the trial, set aside for ever, and spent."""
     kept_usd, reserved_usd, spent_usd = money
-    budget = Budget(ledger, 1.0, each(1.0))
+    budget = budget_of(ledger, 1.0, each(1.0))
     await budget.admit(1)
 
     async def ended():
-        with contextlib.closing(await budget.set_aside(1, "key", asked(0.5))) as paid:
+        with contextlib.closing(await budget.reserve(1, "key", asked(0.5))) as paid:
             if begun:
                 await paid.begin(1)
             if tried:

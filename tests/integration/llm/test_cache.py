@@ -18,10 +18,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from merge_runner.errors import MergeRunnerError, RecordingError, UsageError
-from merge_runner.llm import kinds
-from merge_runner.llm.cache import CachedCall, ResponseCache, import_folder
+from merge_runner.llm import templates
+from merge_runner.llm.cache import ResponseCache, import_folder
 from merge_runner.llm.cache_file import TABLES, TextDisk
 from merge_runner.llm.ledger import Ledger
+from merge_runner.llm.store import CachedCall
 from merge_runner.records import Attempt, ChatRequest, Slot, Usage, make_request
 from tests.support.cases import cases
 from tests.support.json_values import paths, replaced
@@ -45,7 +46,7 @@ def by_key(*entries):
 
 def counted(entries):
     """How many of these calls there are of each kind."""
-    return kinds.kinds_of((each.request, each.attempts[-1]) for each in entries)
+    return templates.count_by_template((each.request, each.attempts[-1]) for each in entries)
 
 
 def overlaid(entries):
@@ -81,7 +82,7 @@ def other(cache, folder):
 
 
 def endpoints(cache, model):
-    return sorted(kinds.recorded_values(cache, "endpoint", model=model))
+    return sorted(templates.recorded_values(cache, "endpoint", model=model))
 
 
 def left_out(cache):
@@ -100,7 +101,7 @@ def stock(cache, folder):
 
 def aside(cache, key):
     """The names of what is damaged of a call, and set aside."""
-    return cache.run_now([partial(cache.set_damage_aside, key)])[0]
+    return cache.run_now([partial(cache.quarantine, key)])[0]
 
 
 texts = st.text(st.characters(exclude_categories=["Cs"]))
@@ -268,13 +269,17 @@ def test_a_planted_value_is_refused_and_not_executed(cache, stock, tmp_path, pad
     stock[key] = [Bomb(tmp_path / "mark"), padding]
     with pytest.raises(RecordingError):
         cache.get(key)
-    assert left_out(cache) == ["the cache holds a pickle or names a file: it is not ours"]
+    assert left_out(cache) == [
+        "the cache holds a pickle or names a file: merge-runner did not write it"
+    ]
     assert not (tmp_path / "mark").exists()
 
 
 def test_no_key_is_unpickled_where_all_are_listed(cache, stock, tmp_path):
     stock[Bomb(tmp_path / "mark")] = entry().to_json()
-    assert left_out(cache) == ["the cache holds a key that is no text: it is not ours"]
+    assert left_out(cache) == [
+        "the cache holds a key that is no text: merge-runner did not write it"
+    ]
     with (
         diskcache.Cache(str(cache.folder), disk=TextDisk) as texts,
         pytest.raises(RecordingError, match="a key that is no text"),
@@ -539,27 +544,31 @@ def test_calls_are_counted_by_kind_once_whichever_process_kept_them(cache, other
     tokens = Usage(input_tokens=100, output_tokens=7)
     first = [entry(n, endpoint=server, usage=tokens) for n in (1, 2) for server in "ab"]
     cache.put_now(first, tried=[(entry(9).request.key, (Attempt(1, "timeout"),))])
-    assert kinds.counted(other) == kinds.counted(cache) == ({}, counted(first))
+    assert templates.answer_counts(other) == templates.answer_counts(cache) == ({}, counted(first))
     # A reply takes the place of what was tried last, which no longer has a row.
     later = [entry(9), entry(3, usage=tokens), entry(4, scripted=True)]
     for each in later:
         cache.put_now([each])
-    assert kinds.counted(cache) == kinds.counted(other) == ({}, counted([*first, *later]))
-    assert [kind.own for kind in counted(later)] == [True, True, False]
+    assert (
+        templates.answer_counts(cache)
+        == templates.answer_counts(other)
+        == ({}, counted([*first, *later]))
+    )
+    assert [template.own for template in counted(later)] == [True, True, False]
     monkeypatch.setattr(CachedCall, "from_json", lambda text: pytest.fail("it is read again"))
-    assert kinds.counted(cache) == ({}, counted([*first, *later]))
+    assert templates.answer_counts(cache) == ({}, counted([*first, *later]))
 
 
 @pytest.mark.parametrize("batch", [1, 2, 1000])
 def test_all_calls_are_counted_but_damaged_ones(cache, folder, monkeypatch, batch):
-    monkeypatch.setattr("merge_runner.llm.kinds.BATCH", batch)
+    monkeypatch.setattr("merge_runner.llm.templates.BATCH", batch)
     kept = [entry(number) for number in range(1, 6)]
     cache.put_now(kept)
     with contextlib.closing(sqlite3.connect(folder / "cache.db")) as database, database:
         for row, value in ((1, "'damaged'"), (3, "CAST(X'80' AS TEXT)")):
             damaged = f"UPDATE Cache SET value = {value} WHERE key = ?"
             database.execute(damaged, [kept[row].request.key])
-    assert kinds.counted(cache)[1] == counted(kept[::2])
+    assert templates.answer_counts(cache)[1] == counted(kept[::2])
     assert [*cache.newest(9)] == [kept[4], kept[2], kept[0]]
     assert [*cache.newest(1)] == [kept[4]]
 

@@ -11,12 +11,11 @@ import pytest
 from merge_runner.emulator.driver import answer
 from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.client import LlmClient
+from merge_runner.llm.delays import FIRST_BACKOFF_S, LONGEST_BACKOFF_S, backoff_s
 from merge_runner.llm.http import HttpTransport
-from merge_runner.llm.http_outcome import FIRST_BACKOFF_S, LONGEST_BACKOFF_S, backoff_s
-from merge_runner.llm.limiter import Limiter
 from merge_runner.providers import Endpoint, ModelEntry
 from merge_runner.records import CallFailed, Slot
+from tests.support.clients import client_of
 from tests.support.scenarios import CASES, ScenarioPlan, playing
 from tests.support.virtual_time import in_virtual_time, now_s
 
@@ -41,7 +40,7 @@ def cache(tmp_path_factory):
 
 
 @asynccontextmanager
-async def client_of(cache, wire, plan):
+async def emulated(cache, wire, plan):
     """A client of an emulator that plays a plan."""
     entry = ModelEntry(
         provider="openai",
@@ -58,14 +57,7 @@ async def client_of(cache, wire, plan):
         base_url = f"{url}/v1" if wire in OPENAI else url
         transport = HttpTransport(Endpoint("openai", identity, base_url, {}), connections=4)
         try:
-            yield LlmClient(
-                name="my-model",
-                entry=entry,
-                endpoint=identity,
-                cache=cache,
-                transport=transport,
-                limiter=Limiter(),
-            )
+            yield client_of("my-model", entry, identity, cache, transport)
         finally:
             await transport.close()
 
@@ -104,7 +96,7 @@ def attempts_until_deadline(case, jitter_s):
 @cases("answers")
 @in_virtual_time
 async def test_an_answer_is_kept_as_what_it_is(cache, case, wire):
-    async with client_of(cache, wire, always(case)) as client:
+    async with emulated(cache, wire, always(case)) as client:
         reply = await ask(client)
         waited_s = now_s()
         mismatches = client.meter.mismatches
@@ -122,7 +114,7 @@ async def test_an_answer_is_kept_as_what_it_is(cache, case, wire):
 @cases("stops")
 @in_virtual_time
 async def test_what_no_attempt_would_mend_is_not_tried_again(cache, case, wire):
-    async with client_of(cache, wire, always(case)) as client:
+    async with emulated(cache, wire, always(case)) as client:
         with pytest.raises(MergeRunnerError) as caught:
             await ask(client)
     message = str(caught.value)
@@ -136,7 +128,7 @@ async def test_what_no_attempt_would_mend_is_not_tried_again(cache, case, wire):
 @cases("passes")
 @in_virtual_time
 async def test_what_passes_is_tried_again_after_the_servers_delay(cache, case, wire):
-    async with client_of(cache, wire, always(case, first_alone=True)) as client:
+    async with emulated(cache, wire, always(case, first_alone=True)) as client:
         reply = await ask(client)
         waited_s = now_s() - case.takes_s
     assert [attempt.outcome for attempt in reply.attempts] == [case.outcome, "ok"]
@@ -148,7 +140,7 @@ async def test_what_passes_is_tried_again_after_the_servers_delay(cache, case, w
 @cases("passes", slice(1))
 @in_virtual_time
 async def test_what_does_not_pass_fails_at_the_deadline(cache, case, wire):
-    async with client_of(cache, wire, always(case)) as client:
+    async with emulated(cache, wire, always(case)) as client:
         with pytest.raises(CallFailed) as caught:
             await ask(client)
         waited_s = now_s()

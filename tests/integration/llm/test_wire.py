@@ -10,8 +10,9 @@ from uuid import UUID
 import httpx
 import pytest
 
+from merge_runner.llm.delays import server_delay_s
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.http_outcome import TransportFailure, server_delay_s
+from merge_runner.llm.http_outcome import TransportFailure
 from tests.integration.llm.test_http import endpoint_at
 from tests.integration.llm.test_http import transport_to as at_endpoint
 from tests.support.cases import cases

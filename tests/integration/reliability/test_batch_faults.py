@@ -168,7 +168,7 @@ def play(tmp_path, monkeypatch):
     """Plays a sweep of a provider; returns its digest and the server's counts."""
     brief = {"ENDING_S": 1.0, "ARRIVAL_S": (0.5, 0.5), "SHORTEST_POLL_S": 0.05}
     for name, value in (brief | {"backoff_s": lambda *_: 0.05}).items():
-        monkeypatch.setattr(f"merge_runner.llm.batch.rounds.{name}", value)
+        monkeypatch.setattr(f"merge_runner.llm.batch.lifecycle.{name}", value)
 
     async def run(provider, middles=(), plan=None, **options):
         fields = {"provider": provider, "format": FORMATS[provider], "price": PRICE, "batch": BATCH}

@@ -20,7 +20,7 @@ import pytest
 
 from merge_runner.errors import SweepStopped, UsageError
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.ledger import Asked, Ledger
+from merge_runner.llm.ledger import CallLabel, Ledger
 from merge_runner.run import cluster
 from merge_runner.run.cluster import connected
 from tests.support.cluster import SIX, SMALL, all_held, ended, held_from, repetition_of, workers_of
@@ -41,7 +41,7 @@ DEAR = MODEL.replace("price}, output = {price}", "price}, output = 2.0") + (
 @in_virtual_time
 async def test_a_coordinator_that_says_nothing_ends_its_workers_tasks():
     with pytest.raises(SweepStopped, match="the coordinator has said nothing for 300 s"):
-        await cluster.Desk().ask(1.0, Asked())
+        await cluster.Desk().ask(1.0, CallLabel())
     assert now_s() == 300
 
 
@@ -158,8 +158,8 @@ def test_the_share_of_a_task_stays_reserved_until_the_task_is_kept(tmp_path):
     with closing(ResponseCache(tmp_path)) as cache:
         ledger = Ledger(cache, "baseline")
         for name in ("lost", "kept"):
-            asked = Asked("Dask worker tcp://1", "L_4_0", 5.0)
-            reserve = partial(ledger.reserve, name, 1, 5.0, None, asked)
+            asked = CallLabel("Dask worker tcp://1", "L_4_0", 5.0)
+            reserve = partial(ledger.reserve, name, 1, 5.0, asked)
             assert cache.run_now([reserve]) == [True]
         assert (ledger.read().reserved_usd, ledger.read().open_attempts) == (10, 2)
         unclear = ("a key", 1, 0.5, "o3", "N_0_0", 0.5, "2026-01-01T00:00:00Z", "read_timeout")

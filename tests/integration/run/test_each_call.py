@@ -49,7 +49,7 @@ ELSEWHERE = (
 def drawn_path() -> set[str]:
     """The files of ``llm`` on the path of a call in docs/design.md."""
     _, _, text = (PROJECT / "docs/design.md").read_text().partition("## The path of a call")
-    return set(re.findall(r"llm/\w+\.py", text.split("```")[1]))
+    return set(re.findall(r"llm/[\w/]+\.py", text.split("```")[1]))
 
 
 class Counts:

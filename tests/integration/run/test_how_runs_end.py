@@ -14,7 +14,7 @@ import pytest
 
 from merge_runner.errors import StoreError, StoreLocked
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.ledger import Asked, Ledger
+from merge_runner.llm.ledger import CallLabel, Ledger
 from merge_runner.results.store import Store
 from merge_runner.run import sweep, writer
 from merge_runner.run.local_runner import LocalRunner
@@ -149,7 +149,7 @@ async def test_the_cap_is_kept_as_the_user_gave_it_whoever_else_spends_under_it(
     )
     (tmp_path / "models.toml").write_text(MODEL.format(name="dear", price=2.0))
     with closing(ResponseCache(options.cache)) as cache:
-        reserve = partial(Ledger(cache, "other").reserve, "key", 1, 0.49, None, Asked("o3"))
+        reserve = partial(Ledger(cache, "other").reserve, "key", 1, 0.49, CallLabel("o3"))
         assert cache.run_now([reserve]) == [True]
     plan = make_plan(str(tmp_path / "study.toml"))
     options = replace(options, max_cost_usd=cap, ledgers=(plan.ledger, "other"))

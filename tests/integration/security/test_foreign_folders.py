@@ -12,7 +12,8 @@ import duckdb
 import pytest
 
 from merge_runner.errors import RecordingError, UsageError
-from merge_runner.llm.cache import CachedCall, ResponseCache, import_folder
+from merge_runner.llm.cache import ResponseCache, import_folder
+from merge_runner.llm.store import CachedCall
 from merge_runner.records import Attempt
 from tests.support.raw_server import a_request
 
@@ -83,9 +84,9 @@ def test_a_file_that_a_row_names_is_neither_read_nor_deleted(folder, mode, leads
             [mode, names[leads], key],
         )
     cache = ResponseCache(folder)
-    with pytest.raises(RecordingError, match="not ours"):
+    with pytest.raises(RecordingError, match="did not write it"):
         cache.get(key)
-    assert cache.run_now([partial(cache.set_damage_aside, key)]) == [[key]]
+    assert cache.run_now([partial(cache.quarantine, key)]) == [[key]]
     assert cache.put_now([FIRST]) == [FIRST]
     assert list(cache.entries()) == [SECOND, FIRST]
     cache.run_now([partial(cache.remove, f"damaged {key}")])

@@ -7,15 +7,11 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from merge_runner.llm.formats import FORMATS, read_error
+from merge_runner.llm.delays import server_delay_s
+from merge_runner.llm.formats import FORMATS
+from merge_runner.llm.formats.server_error import read_error
 from merge_runner.llm.http import HttpTransport
-from merge_runner.llm.http_outcome import (
-    RawReply,
-    TransportFailure,
-    judge,
-    may_be_charged,
-    server_delay_s,
-)
+from merge_runner.llm.http_outcome import RawReply, TransportFailure, judge, may_be_charged
 from merge_runner.providers import Endpoint
 from tests.support.cases import table
 from tests.support.raw_server import CHAT, a_request, raw_server

@@ -6,7 +6,8 @@ import json
 from aiohttp import web
 from rich.console import Console
 
-from merge_runner.llm.call import Meter, Wait
+from merge_runner.llm.attempts import Meter
+from merge_runner.llm.call import Wait
 from merge_runner.run.progress import terminal_text
 from tests.support.harness import watched
 from tests.support.snapshots import progress, runner

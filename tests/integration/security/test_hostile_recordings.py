@@ -13,7 +13,8 @@ import duckdb
 import pytest
 
 from merge_runner.errors import MergeRunnerError, RecordingError, UsageError
-from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.store import CachedCall
 from merge_runner.records import Attempt, Slot, call_key
 from merge_runner.results.parquet import group_bytes
 from merge_runner.results.recording import (

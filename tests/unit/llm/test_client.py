@@ -9,11 +9,13 @@ import pytest
 
 from merge_runner.drivers.language_model import Question
 from merge_runner.errors import EndpointRefused, QuotaExhausted, TrialSuspended, UsageError
-from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.call import Meter
+from merge_runner.llm.attempts import Meter
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.call import Calls
 from merge_runner.llm.http_outcome import TransportFailure
-from merge_runner.llm.ledger import Asked
+from merge_runner.llm.ledger import CallLabel
 from merge_runner.llm.limiter import Limiter, Pause
+from merge_runner.llm.store import CachedCall
 from merge_runner.records import Attempt, CallFailed, ReplayMiss, Usage
 from merge_runner.run.cluster import Desk, ToldLedger
 from tests.support.clients import PRICE, answer, begun, error, raw, slot, ticks
@@ -32,8 +34,8 @@ def outcomes(attempts):
 
 
 async def held(client):
-    """A call that is sent, and answered once ``client.transport.open`` is set."""
-    client.transport.open.clear()
+    """A call that is sent, and answered once ``client.direct.transport.open`` is set."""
+    client.direct.transport.open.clear()
     return await begun(client.ask("prompt", slot()))
 
 
@@ -54,7 +56,7 @@ async def test_a_second_ask_is_answered_from_the_cache(make):
     assert (meter.calls_live, meter.calls_cached, meter.calls_shared) == (1, 1, 1)
     later = make(answer("second"))
     assert (await later.ask("prompt", slot())).text == "first"
-    assert later.transport.sent == []
+    assert later.direct.transport.sent == []
     assert (later.meter.calls_cached, later.meter.calls_shared) == (1, 0)
 
 
@@ -71,19 +73,19 @@ async def test_every_slot_is_a_sample_of_its_own(make):
     slots = [slot(repetition, side) for repetition in range(1, 11) for side in ("left", "right")]
     replies = await asyncio.gather(*(client.ask("prompt", each) for each in slots))
     assert len({reply.text for reply in replies}) == 20
-    assert [request.slot for request in client.transport.sent] == slots
-    assert len({request.body for request in client.transport.sent}) == 1
+    assert [request.slot for request in client.direct.transport.sent] == slots
+    assert len({request.body for request in client.direct.transport.sent}) == 1
 
 
 async def test_what_is_sent_is_what_is_kept(make, cache):
     client = make(answer())
     reply = await client.ask("Où?", slot())
-    (sent,) = client.transport.sent
+    (sent,) = client.direct.transport.sent
     assert sent == reply.request == cache.get(sent.key).request
     assert json.loads(sent.body)["messages"] == [{"role": "user", "content": "Où?"}]
     assert (sent.endpoint, sent.model, sent.path) == ("openai", "m-1", "/chat/completions")
     assert cache.get(sent.key).attempts == reply.attempts
-    assert reply.attempts[0].reply == client.transport.replies[0].body
+    assert reply.attempts[0].reply == client.direct.transport.replies[0].body
 
 
 async def test_passing_failures_are_tried_again_and_all_attempts_are_kept(make, cache):
@@ -126,7 +128,7 @@ async def test_a_damaged_reply_is_told_set_aside_and_asked_again(make, cache):
     assert caught.value.request.key == key
     assert (await client.ask("prompt", slot())).text == "new"
     assert client.meter.damaged == [key]
-    assert any(key in note and "set aside" in note for note in client.meter.notes)
+    assert any(key in note and "damaged" in note for note in client.meter.notes)
     with diskcache.Cache(str(cache.folder)) as stock:
         assert stock[f"damaged {key}"] == damaged
     assert (await make(answer("third")).ask("prompt", slot())).text == "new"
@@ -136,7 +138,7 @@ async def test_two_processes_that_ask_the_same_go_on_with_the_same_reply(make, t
     caches = [ResponseCache(tmp_path) for _ in range(2)]
     clients = [make(answer(f"from {n}"), cache=caches[n]) for n in range(2)]
     replies = await asyncio.gather(*(client.ask("prompt", slot()) for client in clients))
-    assert [len(client.transport.sent) for client in clients] == [1, 1]
+    assert [len(client.direct.transport.sent) for client in clients] == [1, 1]
     assert replies[0].text == replies[1].text
     assert replies[0].attempts == replies[1].attempts
     for own in caches:
@@ -144,10 +146,10 @@ async def test_two_processes_that_ask_the_same_go_on_with_the_same_reply(make, t
 
 
 async def test_two_entries_of_one_model_that_ask_the_same_make_one_call(make):
-    under_way = {}
-    clients = [make(answer(f"from {n}"), under_way=under_way) for n in range(2)]
+    calls = Calls()
+    clients = [make(answer(f"from {n}"), calls=calls) for n in range(2)]
     replies = await asyncio.gather(*(client.ask("prompt", slot()) for client in clients))
-    assert sum(len(client.transport.sent) for client in clients) == 1
+    assert sum(len(client.direct.transport.sent) for client in clients) == 1
     assert replies[0].text == replies[1].text
 
 
@@ -156,7 +158,7 @@ async def test_a_rejected_request_fails_this_call_alone(make, cache):
     with pytest.raises(CallFailed, match="bad temperature") as caught:
         await client.ask("prompt", slot())
     assert outcomes(caught.value.attempts) == ["server_error", "bad_request"]
-    assert caught.value.request == client.transport.sent[0]
+    assert caught.value.request == client.direct.transport.sent[0]
     assert list(cache.entries()) == []
     assert cache.look_up(caught.value.request.key)[1] == caught.value.attempts
     reply = await make(answer()).ask("prompt", slot())
@@ -165,7 +167,7 @@ async def test_a_rejected_request_fails_this_call_alone(make, cache):
     unknown = make(error(404, code="model_not_found"))  # which no other request would mend
     with pytest.raises(EndpointRefused, match="'m-1'"):
         await unknown.ask("prompt", slot(3))
-    assert len(unknown.transport.sent) == 1
+    assert len(unknown.direct.transport.sent) == 1
 
 
 async def test_an_answer_that_is_of_no_use_is_an_answer_and_kept(make):
@@ -180,7 +182,7 @@ async def test_an_answer_that_is_of_no_use_is_an_answer_and_kept(make):
         for cached in (False, True):
             got = await client.ask("prompt", slot(number))
             assert (got.outcome, got.text, got.cached) == (outcome, text, cached)
-        assert len(client.transport.sent) == 1
+        assert len(client.direct.transport.sent) == 1
 
 
 @pytest.mark.parametrize(
@@ -198,7 +200,7 @@ async def test_an_empty_answer_of_gemini_is_asked_at_most_twice_again(make, repl
     reply = await client.ask("prompt", slot())
     assert outcomes(reply.attempts) == expected.split()
     assert reply.outcome == expected.split()[-1]
-    assert len(client.transport.sent) == len(expected.split())
+    assert len(client.direct.transport.sent) == len(expected.split())
 
 
 @pytest.mark.parametrize("told", [{"prompt_tokens": 0}, {}, {"prompt_tokens": "many"}], ids=str)
@@ -215,15 +217,15 @@ async def test_more_output_than_there_can_be_is_paid_whatever_is_said_of_the_inp
 async def test_who_gives_up_does_not_lose_the_call_in_flight(make, cache):
     client = make(answer("paid for"))
     asked = await held(client)
-    assert client.in_flight_calls == 1
+    assert client.calls.in_flight == 1
     asked.cancel()
-    drained = await begun(client.drain())
+    drained = await begun(client.calls.drain())
     assert (asked.cancelled(), drained.done()) == (True, False)
-    client.transport.open.set()
+    client.direct.transport.open.set()
     await drained
-    assert client.in_flight_calls == 0
+    assert client.calls.in_flight == 0
     (kept,) = cache.entries()
-    assert kept.request == client.transport.sent[0]
+    assert kept.request == client.direct.transport.sent[0]
     assert outcomes(kept.attempts) == ["ok"]
 
 
@@ -232,9 +234,9 @@ async def test_one_of_two_who_gives_up_does_not_take_the_answer_from_the_other(m
     first, second = [await held(client) for _ in range(2)]
     first.cancel()
     await ticks()
-    client.transport.open.set()
+    client.direct.transport.open.set()
     assert (await second).text == "shared"
-    assert len(client.transport.sent) == 1
+    assert len(client.direct.transport.sent) == 1
 
 
 async def test_a_call_that_nobody_waits_for_any_more_takes_neither_a_turn_nor_money(make):
@@ -242,33 +244,33 @@ async def test_a_call_that_nobody_waits_for_any_more_takes_neither_a_turn_nor_mo
     asked = await begun(client.ask("prompt", slot()))
     asked.cancel()
     await ticks()
-    assert (client.waits, client.money.queued_usd) == ([], 0)
+    assert (client.calls.waits, client.budget.queued_usd) == ([], 0)
     assert (await client.ask("prompt", slot())).text == "M", "it can be asked anew"
-    assert (now_s(), len(client.transport.sent)) == (300, 1)
+    assert (now_s(), len(client.direct.transport.sent)) == (300, 1)
 
 
 async def test_who_asks_anew_for_a_call_that_is_just_given_up_gets_an_answer(make):
     client = make(answer(), limiter=paused())
     asked = await begun(client.ask("prompt", slot()))
-    (call,) = client.under_way.values()
+    (call,) = client.calls.under_way.values()
     asked.cancel()
     for _ in range(20):
         if not call.task.cancelling():
             await asyncio.sleep(0)
     assert not call.task.done()
     assert (await client.ask("prompt", slot())).text == "M"
-    assert client.under_way == {}
+    assert client.calls.under_way == {}
 
 
 async def test_a_call_in_flight_that_nobody_waits_for_any_more_is_not_tried_again(make, cache):
     client = make(error(503), answer())
     asked = await held(client)
-    (call,) = client.under_way.values()
+    (call,) = client.calls.under_way.values()
     asked.cancel()
     await ticks()
-    client.transport.open.set()
+    client.direct.transport.open.set()
     await asyncio.wait([call.task])
-    assert len(client.transport.sent) == 1
+    assert len(client.direct.transport.sent) == 1
     (attempts,) = cache.all_unanswered().values()
     assert outcomes(attempts) == ["overloaded"]
 
@@ -276,12 +278,12 @@ async def test_a_call_in_flight_that_nobody_waits_for_any_more_is_not_tried_agai
 async def test_drain_gives_up_calls_that_wait_for_their_turn(make):
     client = make(answer(), price=PRICE, cap=0.0015, limiter=paused())
     asked = [await begun(client.ask("prompt", slot(n))) for n in (1, 2)]
-    await client.drain()
+    await client.calls.drain()
     results = await asyncio.gather(*asked, return_exceptions=True)
     assert not any(hasattr(result, "text") for result in results)
-    assert (client.transport.sent, now_s()) == ([], 0)
+    assert (client.direct.transport.sent, now_s()) == ([], 0)
     # Their money is given back.
-    await client.budget.set_aside(0, "key", Asked("", "", 0.0015))
+    await client.budget.reserve(0, "key", CallLabel("", "", 0.0015))
     assert client.budget.ledger.read().committed_usd == 0
     with pytest.raises(CallFailed, match="stopped"):
         await client.ask("prompt", slot(3))
@@ -291,41 +293,45 @@ async def test_drain_gives_up_calls_that_wait_for_their_turn(make):
 @pytest.mark.parametrize("drains", [False, True])
 async def test_a_call_that_waits_for_its_coordinator_can_be_given_up(make, cache, drains, told):
     client, desk = make(answer(), price=PRICE), Desk()
-    client.money.ledger = ToldLedger(cache, "test", desk)
+    client.budget.ledger = ToldLedger(cache, "test", desk)
     asked = await begun(client.ask("prompt", slot()))
     if told:
         assert (await desk.exchange({})).asking.keys() == {1}
-    (waits,) = client.waits
+    (waits,) = client.calls.waits
     assert "coordinator" in waits.what
     if drains:
-        await client.drain()
+        await client.calls.drain()
     else:
         asked.cancel()
     await asyncio.wait([asked])
     await ticks()
-    assert (client.transport.sent, client.waits, client.money.queued_usd) == ([], [], 0)
+    assert (client.direct.transport.sent, client.calls.waits, client.budget.queued_usd) == (
+        [],
+        [],
+        0,
+    )
     assert (desk.told.asking, desk.told.costs) == ({}, {1: 0.0} if told else {})
-    assert client.money.ledger.read().open_attempts == 0
+    assert client.budget.ledger.read().open_attempts == 0
 
 
 @pytest.mark.parametrize("in_flight", [False, True])
 async def test_drain_does_not_wait_for_another_attempt(make, in_flight):
     client = make(error(503, retry_after="300"), answer())
     asked = await (held(client) if in_flight else begun(client.ask("prompt", slot())))
-    drained = await begun(client.drain())
-    client.transport.open.set()
+    drained = await begun(client.calls.drain())
+    client.direct.transport.open.set()
     await drained
     await asyncio.gather(asked, return_exceptions=True)
-    assert (len(client.transport.sent), now_s()) == (1, 0)
+    assert (len(client.direct.transport.sent), now_s()) == (1, 0)
 
 
 async def test_drain_does_not_lose_an_answer_that_is_just_being_saved(make, tmp_path):
     own = ResponseCache(tmp_path)
     client = make(answer("paid for"), cache=own)
     asked = [asyncio.create_task(client.ask("prompt", slot(n))) for n in (1, 2)]
-    while client.transport.answered < 2:
+    while client.direct.transport.answered < 2:
         await asyncio.sleep(0)
-    await client.drain()
+    await client.calls.drain()
     assert len(list(own.entries())) == 2
     assert [(await each).text for each in asked] == ["paid for", "paid for"]
     own.close()
@@ -335,18 +341,18 @@ async def test_a_call_knows_itself_whether_it_is_in_flight(make):
     """A cluster's worker takes its meter away twice a second; that gives no call up."""
     client = make(error(503, retry_after="300"), answer("paid for"))
     retrying = await begun(client.ask("prompt", slot(1)))
-    client.transport.open.clear()
+    client.direct.transport.open.clear()
     flying = asyncio.create_task(client.ask("prompt", slot(2)))
-    while client.in_flight_calls != 1 or len(client.transport.sent) < 2:
+    while client.calls.in_flight != 1 or len(client.direct.transport.sent) < 2:
         await asyncio.sleep(0)
-    client.meter = Meter()
-    assert [wait.what for wait in client.waits] == ["after HTTP 503: m"]
-    drained = await begun(client.drain())
-    client.transport.open.set()
+    client.recorded.meter = Meter()
+    assert [wait.what for wait in client.calls.waits] == ["after HTTP 503: m"]
+    drained = await begun(client.calls.drain())
+    client.direct.transport.open.set()
     await drained
     results = await asyncio.gather(retrying, flying, return_exceptions=True)
     assert [getattr(result, "text", None) for result in results] == [None, "paid for"]
-    assert (client.waits, client.in_flight_calls) == ([], 0)
+    assert (client.calls.waits, client.calls.in_flight) == ([], 0)
 
 
 async def test_a_model_that_was_not_asked_for_is_counted(make):
@@ -371,7 +377,7 @@ async def test_what_an_attempt_costs_comes_from_its_tokens(make):
 
 def worst_case_usd(client):
     """A token for each byte that is sent, and the whole cap."""
-    return len(client.transport.sent[0].body.encode()) * 2e-6 + 100 * 8e-6
+    return len(client.direct.transport.sent[0].body.encode()) * 2e-6 + 100 * 8e-6
 
 
 async def test_no_call_is_made_that_could_pass_the_cap(make):
@@ -384,11 +390,11 @@ async def test_no_call_is_made_that_could_pass_the_cap(make):
     too_little = make(answer(), price=PRICE, cap=2 * spent + worst * 0.999)
     with pytest.raises(TrialSuspended):
         await too_little.ask("prompt", slot(3))
-    assert too_little.transport.sent == []
+    assert too_little.direct.transport.sent == []
     # Calls in flight are waited for, and what they cost counts.
     client = make(answer(usage=(10, 5)), price=PRICE, cap=worst * 1.5)
     await asyncio.gather(*(client.ask("prompt", slot(n)) for n in range(4, 9)))
-    assert len(client.transport.sent) == 5
+    assert len(client.direct.transport.sent) == 5
 
 
 async def test_a_call_above_the_token_limit_gives_its_money_back(make):
@@ -405,7 +411,7 @@ async def test_an_attempt_that_is_refused_or_never_sent_is_not_charged(make):
     client = make(TransportFailure("timeout", "no reply"), answer(), price=PRICE, cap=0.0015)
     with pytest.raises(TrialSuspended):
         await client.ask("prompt", slot(2))
-    assert len(client.transport.sent) == 1
+    assert len(client.direct.transport.sent) == 1
 
 
 async def test_a_rate_limit_makes_all_calls_of_the_key_wait(make):
@@ -414,23 +420,23 @@ async def test_a_rate_limit_makes_all_calls_of_the_key_wait(make):
     other = make(answer(), limiter=Limiter(pause=shared), id="m-2")
     first = await begun(client.ask("prompt", slot()))
     await asyncio.gather(first, client.ask("prompt", slot(2)), other.ask("prompt", slot()))
-    assert client.transport.times == [0, 30, 30]
-    assert other.transport.times == [30]
+    assert client.direct.transport.times == [0, 30, 30]
+    assert other.direct.transport.times == [30]
 
 
 async def test_a_rate_limit_without_a_delay_makes_all_calls_wait_as_long_as_its_own(make):
     client = make(error(429), error(429), error(429), answer())
     asked = [await begun(client.ask("prompt", slot(n))) for n in (1, 2)]
-    assert client.transport.times == [0]
+    assert client.direct.transport.times == [0]
     await asyncio.gather(*asked)
-    assert client.transport.times[1] >= 0.5
+    assert client.direct.transport.times[1] >= 0.5
 
 
 async def test_a_failing_server_makes_only_its_own_call_wait(make):
     client = make(error(503, retry_after="30"), answer())
     first = await begun(client.ask("prompt", slot()))
     await asyncio.gather(first, client.ask("prompt", slot(2)))
-    assert client.transport.times == [0, 0, 30]
+    assert client.direct.transport.times == [0, 0, 30]
 
 
 async def test_a_limit_longer_than_the_deadline_ends_the_run_and_an_outage_its_call(make):
@@ -442,7 +448,7 @@ async def test_a_limit_longer_than_the_deadline_ends_the_run_and_an_outage_its_c
         client = make(error(status, "come back tomorrow", retry_after=f"{wait_s}"), answer())
         with pytest.raises(raised, match=rf"wait {wait_s} s.*come back tomorrow"):
             await client.ask("prompt", slot())
-        assert (len(client.transport.sent), now_s()) == (1, 0)
+        assert (len(client.direct.transport.sent), now_s()) == (1, 0)
 
 
 async def test_a_replay_misses_what_is_not_recorded(make):
@@ -482,13 +488,13 @@ async def test_the_actual_tokens_take_the_place_of_the_estimate(make):
     client = make(answer(usage=(10, 5)), limiter=Limiter(tpm=200))
     for repetition in range(1, 4):
         await client.ask("prompt", slot(repetition))
-    assert client.transport.times == [0, 0, 0]
+    assert client.direct.transport.times == [0, 0, 0]
 
 
 async def test_the_call_with_the_lowest_order_is_sent_first(make):
     client = make(answer(), limiter=paused())
     await asyncio.gather(*(client.ask("prompt", slot(n + 1), order=n) for n in (3, 1, 2, 0)))
-    assert [request.slot.repetition for request in client.transport.sent] == [1, 2, 3, 4]
+    assert [request.slot.repetition for request in client.direct.transport.sent] == [1, 2, 3, 4]
 
 
 async def test_a_dearer_service_tier_is_kept_priced_where_its_price_is_known_and_else_counted(make):
@@ -509,11 +515,11 @@ async def test_the_worst_case_of_a_dearer_tier_that_is_asked_for_is_its_own(make
     worst = []
     for parameters in ({}, {"service_tier": "priority"}):
         client = make(answer(), price=price, cap=100.0, parameters=parameters)
-        client.transport.open.clear()
+        client.direct.transport.open.clear()
         asked = await begun(client.ask("prompt", slot()))
-        while not client.transport.sent:
+        while not client.direct.transport.sent:
             await asyncio.sleep(0.01)
         worst.append(client.budget.ledger.read().reserved_usd)
-        client.transport.open.set()
+        client.direct.transport.open.set()
         await asked
     assert worst[1] > 1.9 * worst[0]

@@ -5,8 +5,9 @@ from datetime import UTC, datetime
 
 import pytest
 
-from merge_runner.llm.formats import FORMATS, read_error
-from merge_runner.llm.http_outcome import server_delay_s
+from merge_runner.llm.delays import server_delay_s
+from merge_runner.llm.formats import FORMATS
+from merge_runner.llm.formats.server_error import read_error
 from tests.support.cases import table
 
 NOW = datetime(2026, 10, 21, 7, 28, 0, tzinfo=UTC)

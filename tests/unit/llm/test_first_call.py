@@ -30,7 +30,7 @@ def cache(tmp_path):
 @pytest.fixture
 def begin(make):
     """A client whose run begins."""
-    return partial(make, passed=False)
+    return partial(make, verified=False)
 
 
 def reply_of(case):
@@ -45,22 +45,22 @@ def ask_all(client, number=5):
 
 async def test_the_others_wait_until_the_first_call_is_answered(begin):
     client = begin(answer())
-    client.transport.open.clear()
+    client.direct.transport.open.clear()
     asked = ask_all(client)
     await ticks()
-    assert len(client.transport.sent) == 1
-    assert [wait.what for wait in client.waits] == ["for the first answer of my-model"] * 4
-    client.transport.open.set()
+    assert len(client.direct.transport.sent) == 1
+    assert [wait.what for wait in client.calls.waits] == ["for the first answer of my-model"] * 4
+    client.direct.transport.open.set()
     await asyncio.gather(*asked)
-    assert len(client.transport.sent) == 5
-    assert set(client.transport.times) == {0}, "they then go at once"
+    assert len(client.direct.transport.sent) == 5
+    assert set(client.direct.transport.times) == {0}, "they then go at once"
 
 
 async def test_what_passes_is_tried_again_by_one_call_alone(begin):
     client = begin(error(503), error(429), TransportFailure("timeout", "no reply"), answer())
     await asyncio.gather(*ask_all(client))
-    assert len(client.transport.sent) == 3 + 5
-    first_three = client.transport.times[:4]
+    assert len(client.direct.transport.sent) == 3 + 5
+    first_three = client.direct.transport.times[:4]
     assert first_three == sorted(set(first_three)), "one at a time"
 
 
@@ -70,8 +70,8 @@ async def test_a_wrong_configuration_is_told_by_one_call(begin, case):
     tasks = ask_all(client)
     with pytest.raises(EndpointRefused, match=case["told"]) as caught:
         await tasks[0]
-    await client.drain()
-    assert (len(client.transport.sent), "\n" in str(caught.value)) == (1, False)
+    await client.calls.drain()
+    assert (len(client.direct.transport.sent), "\n" in str(caught.value)) == (1, False)
     results = await asyncio.gather(*tasks, return_exceptions=True)
     assert all(isinstance(result, BaseException) for result in results)
 
@@ -81,7 +81,7 @@ async def test_what_may_pass_is_told_after_three_of_them_within_seconds(begin, c
     client, reply = begin(reply_of(case)), reply_of(case)
     with pytest.raises(EndpointRefused, match=case["told"]):
         await client.ask("prompt", slot())
-    assert len(client.transport.sent) == 3
+    assert len(client.direct.transport.sent) == 3
     assert now_s() < 5
     passing = begin(reply, reply, answer())
     assert (await passing.ask("prompt", slot())).outcome == "ok"
@@ -92,15 +92,15 @@ async def test_in_the_midst_of_a_run_what_is_not_understood_is_asked_again(begin
     client = begin(answer(), *[raw(body)] * 4, answer())
     await client.ask("prompt", slot())
     assert (await client.ask("prompt", slot(2))).outcome == "ok"
-    assert len(client.transport.sent) == 6
+    assert len(client.direct.transport.sent) == 6
 
 
 async def test_an_endpoint_that_has_answered_before_is_given_three_tries_and_may_think_alone(begin):
-    client = begin(raw("data: {}", content_type="text/event-stream"), known=True)
+    client = begin(raw("data: {}", content_type="text/event-stream"), has_answered=True)
     with pytest.raises(EndpointRefused, match="SSE"):
         await client.ask("prompt", slot())
-    assert len(client.transport.sent) == 3
-    client = begin(answer(None, reasoning_content="hm"), known=True)
+    assert len(client.direct.transport.sent) == 3
+    client = begin(answer(None, reasoning_content="hm"), has_answered=True)
     assert (await client.ask("prompt", slot())).outcome == "empty"
 
 
@@ -111,11 +111,11 @@ async def test_a_first_call_that_waits_says_so_once_with_what_came_last_and_unti
     assert len(told) == 1
     assert "UTC, after HTTP 503: warming up" in told[0]
     silent = begin(answer(), deadline_s=600)
-    silent.transport.open.clear()
+    silent.direct.transport.open.clear()
     asked = await begun(silent.ask("prompt", slot(2)))
     await asyncio.sleep(6)
     assert ["nothing has come yet" in note for note in silent.meter.notes] == [True]
-    silent.transport.open.set()
+    silent.direct.transport.open.set()
     await asked
     await silent.ask("prompt", slot(3))
     await asyncio.sleep(9)
@@ -128,10 +128,10 @@ async def test_where_nobody_listens_the_run_ends_within_seconds(begin):
     with pytest.raises(ProviderDown, match=r"refused: check the network, or set OPENAI_BASE_URL"):
         await tasks[0]
     assert 5 <= now_s() < 12
-    sent = len(client.transport.sent)
+    sent = len(client.direct.transport.sent)
     await asyncio.sleep(60)
-    assert len(client.transport.sent) == sent, "no other call would fare better"
-    await client.drain()
+    assert len(client.direct.transport.sent) == sent, "no other call would fare better"
+    await client.calls.drain()
     await asyncio.gather(*tasks, return_exceptions=True)
 
 
@@ -149,10 +149,10 @@ async def test_no_answer_to_the_first_call_within_its_deadline_ends_the_run(begi
         ProviderDown, match=r"the first call of this run: no answer within 60 s.*down"
     ):
         await tasks[0]
-    sent = len(client.transport.sent)
-    await client.drain()
+    sent = len(client.direct.transport.sent)
+    await client.calls.drain()
     await asyncio.gather(*tasks, return_exceptions=True)
-    assert len(client.transport.sent) == sent
+    assert len(client.direct.transport.sent) == sent
 
 
 async def test_a_prompt_that_is_refused_for_its_content_fails_alone(begin):
@@ -168,18 +168,18 @@ async def test_an_answer_that_is_recorded_needs_no_first_call(begin):
     await begin(answer()).ask("prompt", slot())
     client = begin(error(401))
     assert (await client.ask("prompt", slot())).cached
-    assert client.transport.sent == []
+    assert client.direct.transport.sent == []
 
 
 async def test_a_first_call_that_is_given_up_lets_the_next_one_go(begin):
     client = begin(answer())
-    client.transport.open.clear()
+    client.direct.transport.open.clear()
     asked = ask_all(client, 2)
     await ticks()
-    next(iter(client.under_way.values())).task.cancel()
+    next(iter(client.calls.under_way.values())).task.cancel()
     await ticks()
-    assert len(client.transport.sent) == 2
-    client.transport.open.set()
+    assert len(client.direct.transport.sent) == 2
+    client.direct.transport.open.set()
     await asyncio.gather(*asked, return_exceptions=True)
 
 
@@ -189,21 +189,21 @@ async def test_a_web_page_is_free_where_no_model_ever_answered_and_may_be_charge
         with pytest.raises(EndpointRefused):
             await stray.ask("prompt", slot())
         assert stray.budget.ledger.read().committed_usd == 0
-    gateway = begin(WEB_PAGE, answer(), price=PRICE, cap=1.0, known=True)
+    gateway = begin(WEB_PAGE, answer(), price=PRICE, cap=1.0, has_answered=True)
     assert (await gateway.ask("prompt", slot())).outcome == "ok"
     assert gateway.budget.ledger.read().open_attempts == 1
 
 
 async def test_where_a_model_has_answered_before_one_refused_prompt_does_not_end_every_run(begin):
-    client = begin(error(400), error(400), answer(), known=True)
+    client = begin(error(400), error(400), answer(), has_answered=True)
     first, second, *others = await asyncio.gather(*ask_all(client), return_exceptions=True)
     assert isinstance(first, CallFailed)
     assert isinstance(second, CallFailed)
     assert [reply.outcome for reply in others] == ["ok"] * 3
-    changed = begin(error(400, "unknown parameter"), known=True)
+    changed = begin(error(400, "unknown parameter"), has_answered=True)
     tasks = [asyncio.create_task(changed.ask("another", slot(n))) for n in range(9)]
     with pytest.raises(EndpointRefused, match="unknown parameter"):
         await tasks[2]
-    await changed.drain()
+    await changed.calls.drain()
     await asyncio.gather(*tasks, return_exceptions=True)
-    assert len(changed.transport.sent) == 3
+    assert len(changed.direct.transport.sent) == 3

@@ -7,15 +7,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from merge_runner.llm.delays import server_delay_s
 from merge_runner.llm.formats import FORMATS, Reading, WireFormat, WireRequest
-from merge_runner.llm.http_outcome import (
-    RawReply,
-    judge,
-    may_be_charged,
-    reason_of,
-    server_delay_s,
-    why_refused,
-)
+from merge_runner.llm.http_outcome import RawReply, judge, may_be_charged
+from merge_runner.llm.refusals import reason_of, why_refused
 from merge_runner.providers import ModelEntry
 from merge_runner.records import Usage
 from tests.support.cases import by_format, cases, table

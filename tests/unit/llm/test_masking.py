@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from merge_runner.llm.http import MASK, Mask
+from merge_runner.llm.masking import MASK, Mask
 
 KEY = "sk-proj-AbC/d+9xYz_01=23.~"
 KEYS = st.text(st.characters(min_codepoint=33, max_codepoint=126), min_size=8, max_size=40)

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import pytest
 
-from merge_runner.llm.http_outcome import backoff_s
+from merge_runner.llm.delays import backoff_s
 from merge_runner.llm.limiter import Limiter
 from merge_runner.records import CallFailed
 from tests.support.clients import answer, error, slot
@@ -17,7 +17,7 @@ BUSY = error(503)
 
 def waits(client):
     """The waits in s between the attempts that the server saw."""
-    return [later - earlier for earlier, later in pairwise(client.transport.times)]
+    return [later - earlier for earlier, later in pairwise(client.direct.transport.times)]
 
 
 async def test_waits_double_from_half_a_second_to_a_minute(make):
@@ -48,7 +48,7 @@ async def test_attempts_and_waits_count_against_the_deadline(make):
     client = make(error(503, "no room", retry_after="30"), deadline_s=100.0, timeout_s=60)
     with pytest.raises(CallFailed, match=r"no answer within 100 s.*no room") as caught:
         await client.ask("prompt", slot())
-    assert client.transport.timeouts == pytest.approx([60, 60, 40, 10], abs=0.01)
+    assert client.direct.transport.timeouts == pytest.approx([60, 60, 40, 10], abs=0.01)
     assert [attempt.outcome for attempt in caught.value.attempts] == ["overloaded"] * 4
     assert now_s() < 91, "a wait that would pass the deadline is not begun"
 
@@ -58,11 +58,11 @@ async def test_the_wait_for_a_turn_does_not_count(make):
     client = make(again, again, answer(), deadline_s=50.0, limiter=Limiter(rpm=1))
     assert (await client.ask("prompt", slot())).outcome == "ok"
     assert now_s() > 100
-    assert client.transport.timeouts == pytest.approx([50, 40, 30], abs=0.01)
+    assert client.direct.transport.timeouts == pytest.approx([50, 40, 30], abs=0.01)
 
 
 async def test_a_wait_that_the_deadline_does_not_allow_is_told(make):
     client = make(error(503, retry_after="3600"), deadline_s=60.0)
     with pytest.raises(CallFailed, match="asks to wait 3600 s, longer than a call"):
         await client.ask("prompt", slot())
-    assert (len(client.transport.sent), now_s()) == (1, 0)
+    assert (len(client.direct.transport.sent), now_s()) == (1, 0)

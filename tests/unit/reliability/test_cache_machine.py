@@ -23,10 +23,11 @@ from hypothesis.stateful import (
 )
 
 from merge_runner.errors import TrialSuspended
-from merge_runner.llm.budget import Budget
-from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.ledger import Asked, Ledger
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.ledger import CallLabel, Cap, Ledger
+from merge_runner.llm.store import CachedCall
 from merge_runner.records import Attempt, Slot, make_request
+from tests.support.clients import budget_of
 
 QUESTIONS = 4
 PROCESSES = 2
@@ -48,7 +49,7 @@ class Process:
 
     def __init__(self, folder, cap_usd):
         self.cache = ResponseCache(folder)
-        self.budget = Budget(Ledger(self.cache, "s"), cap_usd)
+        self.budget = budget_of(Ledger(self.cache, "s"), cap_usd)
         self.in_flight_calls = {}  # its cache, the paid attempt and those before, by question
 
 
@@ -88,7 +89,7 @@ class CacheMachine(RuleBasedStateMachine):
         process = self.running[number]
         if question in process.in_flight_calls:
             return
-        process.cache.run_now([partial(process.cache.set_damage_aside, key)])
+        process.cache.run_now([partial(process.cache.quarantine, key)])
         known = process.cache.get(key)
         if question in self.answered:
             assert known == self.answered[question], "what is answered is not asked again"
@@ -103,8 +104,8 @@ class CacheMachine(RuleBasedStateMachine):
         """Set the worst case aside; None where there is no money, or none before others end."""
 
         async def at_once():
-            key, asked = REQUESTS[question].key, Asked("", "", WORST_USD)
-            waiting = asyncio.create_task(process.budget.set_aside(question, key, asked))
+            key, asked = REQUESTS[question].key, CallLabel("", "", WORST_USD)
+            waiting = asyncio.create_task(process.budget.reserve(question, key, asked))
             for _ in range(3):
                 await asyncio.sleep(0)
             if not waiting.done():
@@ -177,7 +178,7 @@ class CacheMachine(RuleBasedStateMachine):
         """The same command with a higher --max-cost."""
         self.cap_usd += more
         for process in self.running.values():
-            process.budget.cap_usd = self.cap_usd
+            process.budget.ledger.cap = Cap(self.cap_usd)
 
     @precondition(lambda self: (self.place / "cache.db").exists())
     @rule(data=st.data())

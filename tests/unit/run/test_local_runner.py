@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from merge_runner.errors import SweepStopped, TrialSuspended, UsageError
-from merge_runner.llm.call import Meter
+from merge_runner.llm.attempts import Meter
 from merge_runner.records import SIDES, CallFailed, ChatReply, ChatRequest, Slot
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import make_plan
@@ -20,7 +20,7 @@ class Client:
 
     def __init__(self, **errors):
         self.errors, self.asked, self.given_up = errors, [], []
-        self.meter, self.money = Meter(), SimpleNamespace(leave=lambda order: None)
+        self.meter, self.budget = Meter(), SimpleNamespace(leave=lambda order: None)
         self.recorded = SimpleNamespace(prompt=lambda question: question.prompt)
 
     async def ask(self, prompt, slot, *, order):

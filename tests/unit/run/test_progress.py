@@ -6,7 +6,8 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from merge_runner.llm.call import Meter, Wait
+from merge_runner.llm.attempts import Meter
+from merge_runner.llm.call import Wait
 from merge_runner.records import Attempt, Usage
 from merge_runner.run.estimate import Estimate
 from merge_runner.run.estimate_lines import estimate_lines
@@ -35,7 +36,7 @@ def test_every_figure_is_that_of_the_meters():
     meters[0].count_attempt(Attempt(1, "ok", usage=Usage(100, 0, 50), cost_usd=1.5))
     meters[1].count_attempt(Attempt(1, "timeout"))
     meters[1].mismatches["o3 -> gpt-4o"] = 2
-    shown = progress(runner(*meters, running=5), cap_usd=20, began_at=ago(60))
+    shown = progress(runner(*meters, running=5), began_at=ago(60))
     shown.planned += 7
     shown.stored += 7
     shown.outcome_counts.update(finished=2, failed=1, suspended=1)
@@ -110,7 +111,7 @@ def test_trials_that_wait_for_money_are_not_running():
 
 def test_a_log_says_in_short_what_is_new_and_its_last_line_once(capsys):
     waits = [Wait("for money " + "for ever " * 20), Wait("for another"), Wait("for another")]
-    shown = progress(runner(running=3, waits=waits), began_at=ago(10), cap_usd=20)
+    shown = progress(runner(running=3, waits=waits), began_at=ago(10))
     shown.runner.meters = {"emulator": Meter(calls_live=70)}
     log = Log()
     log.show(shown)

@@ -20,7 +20,7 @@ from merge_runner.run.progress_file import (
 
 NO_PROCESS = 2**22 + 1  # above the largest that Linux gives
 LONG_AGO = datetime(2026, 1, 1, tzinfo=UTC)
-LEDGER = SimpleNamespace(spending=Spending())
+LEDGER = SimpleNamespace(spending=Spending(), cap=None)
 
 
 def snapshot(sweep_id="s", **changes):

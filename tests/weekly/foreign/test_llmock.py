@@ -7,11 +7,10 @@ from llmock.scenarios import Delay, Fail, Match, Reply
 
 from merge_runner.errors import EndpointRefused
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.client import LlmClient
 from merge_runner.llm.http import HttpTransport
-from merge_runner.llm.limiter import Limiter
 from merge_runner.providers import Endpoint, ModelEntry
 from merge_runner.records import CallFailed, Slot
+from tests.support.clients import client_of as a_client
 from tests.weekly.foreign.conftest import PROVIDERS
 
 PASSING = (408, 409, 429, 500, 502, 503, 504, 529)
@@ -30,7 +29,7 @@ BACKOFF_S = 0.05  # a tenth of ours, so that tests end soon
 async def client_of(llmock, tmp_path, monkeypatch):
     """Makes clients of LLMock, one for each format and model."""
     monkeypatch.setenv("SSL_CERT_DIR", str(tmp_path))  # nothing here speaks TLS
-    monkeypatch.setattr("merge_runner.llm.http_outcome.FIRST_BACKOFF_S", BACKOFF_S)
+    monkeypatch.setattr("merge_runner.llm.delays.FIRST_BACKOFF_S", BACKOFF_S)
     cache = ResponseCache(tmp_path / "responses")
     transports = {
         wire: HttpTransport(Endpoint("openai", wire, llmock.base_url(name), {}), connections=16)
@@ -41,14 +40,7 @@ async def client_of(llmock, tmp_path, monkeypatch):
         entry = ModelEntry(
             provider="openai", format=wire, id=model, max_output_tokens=100, price="free", **changes
         )
-        return LlmClient(
-            name=model,
-            entry=entry,
-            endpoint=wire,
-            cache=cache,
-            transport=transports[wire],
-            limiter=Limiter(),
-        )
+        return a_client(model, entry, wire, cache, transports[wire])
 
     yield make
     for transport in transports.values():

@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from merge_runner.errors import UsageError
-from merge_runner.llm.batch.providers import BatchFailed
+from merge_runner.llm.batch.service import BatchFailed
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import judge
 from tests.support.batch_fixtures import KEY, endpoint_at, lines

@@ -5,7 +5,7 @@ import asyncio
 import httpx
 import pytest
 
-from merge_runner.llm.batch.providers import BatchFailed
+from merge_runner.llm.batch.service import BatchFailed
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import judge
 from tests.support.batch_fixtures import endpoint_at, lines

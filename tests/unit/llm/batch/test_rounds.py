@@ -14,17 +14,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from merge_runner.errors import CacheFailed, EndpointRefused, ProviderDown, QuotaExhausted
-from merge_runner.llm.batch.providers import BatchFailed, BatchStatus
 from merge_runner.llm.batch.rounds import Rounds
-from merge_runner.llm.budget import Budget
+from merge_runner.llm.batch.sender import BatchSender
+from merge_runner.llm.batch.service import BatchFailed, BatchStatus
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.client import LlmClient
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.ledger import Ledger
-from merge_runner.llm.limiter import Limiter
 from merge_runner.providers import ModelEntry, Price
 from merge_runner.records import CallFailed, Slot
-from tests.support.clients import answer, error
+from tests.support.clients import answer, budget_of, client_of, error
 from tests.support.virtual_time import in_virtual_time, now_s
 
 pytestmark = pytest.mark.usefixtures("virtual_time")
@@ -133,18 +131,9 @@ class Run:
         entry = ModelEntry(
             provider="openai", format="openai-chat", id="m-1", max_output_tokens=100, price=price
         )
-        self.client = LlmClient(
-            name="m",
-            entry=entry,
-            endpoint="openai",
-            cache=cache,
-            transport=self.alone,
-            limiter=Limiter(),
-            budget=Budget(self.ledger, cap),
-            rounds=self.rounds,
-            model="m",
-            batch_price=0.5,
-        )
+        budget = budget_of(self.ledger, cap)
+        batch = BatchSender(self.rounds, "m", 0.5)
+        self.client = client_of("m", entry, "openai", cache, self.alone, budget=budget, batch=batch)
 
     async def ask(self, repetitions=1, decision=0):
         """The replies to several at once, or what each of them raised."""
@@ -158,14 +147,14 @@ class Run:
 
             def is_idle():
                 waiting = sum(not each.done() for each in asks)
-                return bool(waiting) and waiting == self.client.idle_askers
+                return bool(waiting) and waiting == self.client.calls.blocked_askers
 
             watching = asyncio.create_task(self.rounds.watch(is_idle))
             stack.callback(watching.cancel)
             return await asyncio.gather(*asks, return_exceptions=True)
 
     async def end(self):
-        await self.client.drain()
+        await self.client.calls.drain()
         await self.rounds.close()
 
     async def left(self):
@@ -291,7 +280,7 @@ async def left_behind(cache, service, repetitions=1, **options):
     run = Run(cache, service, **options)
     asking = asyncio.create_task(run.ask(repetitions))
     await asyncio.sleep(5)
-    (line,) = run.rounds.standing()
+    (line,) = run.rounds.status_lines()
     assert re.fullmatch(
         f"{repetitions} calls? of m waits? in batch batch-0 since [0-9:]{{8}} UTC", line
     )
@@ -420,7 +409,7 @@ async def killed(run, repetitions, service):
     asking.cancel()
     for batch in run.rounds.batches.values():
         batch.work and batch.work.cancel()
-    await run.client.drain()
+    await run.client.calls.drain()
     service.step = ""
 
 

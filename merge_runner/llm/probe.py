@@ -1,0 +1,62 @@
+"""Probe request: the first call of a run to an endpoint is made alone."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+
+from merge_runner.errors import SweepStopped
+from merge_runner.llm.attempts import Meter
+from merge_runner.llm.call import Call, Calls, Wait
+from merge_runner.llm.endpoint_state import EndpointState
+
+# A shorter wait is over before a note of it is read.
+LONG_WAIT_S = 5.0
+
+
+@dataclass(slots=True)
+class Probe:
+    """Serialises the calls to an endpoint until the first valid reply.
+
+    So a wrong key, URL or parameter costs one call.
+    """
+
+    endpoint: EndpointState
+    calls: Calls
+    meter: Meter
+    _alone: asyncio.Lock = field(default_factory=asyncio.Lock)
+
+    @asynccontextmanager
+    async def turn(self, call: Call) -> AsyncIterator[None]:
+        """Wait until no other call probes; a run that stops lets no further call probe."""
+        self.calls.wait(call, Wait(f"for the first answer of {self.endpoint.driver}"))
+        await self._alone.acquire()
+        call.wait = None
+        if self.endpoint.verified:
+            self._alone.release()
+            yield
+            return
+        note = asyncio.get_running_loop().call_later(LONG_WAIT_S, self._note_wait, call)
+        is_released = True
+        try:
+            yield
+        except SweepStopped:
+            is_released = False  # the next call would only be refused in the same way
+            raise
+        finally:
+            note.cancel()
+            if is_released:
+                self._alone.release()
+
+    def _note_wait(self, call: Call) -> None:
+        """Note that a probe has waited for LONG_WAIT_S."""
+        driver, entry = self.endpoint.driver, self.endpoint.entry
+        left = timedelta(seconds=entry.deadline_s - LONG_WAIT_S)
+        last = f"after {call.last_failure}" if call.own_attempts else "nothing has come yet"
+        self.meter.notes.append(
+            f"{driver}: {call.label.slot}: the first call of this run waits for its answer "
+            f"until {datetime.now(UTC) + left:%H:%M:%S} UTC, {last}"
+        )

@@ -1,0 +1,85 @@
+"""Senders of attempts; the direct one sends each as a normal (synchronous) request."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+from merge_runner.errors import MergeRunnerError
+from merge_runner.llm.budget import Reservation
+from merge_runner.llm.call import Call, Wait
+from merge_runner.llm.delays import backoff_s
+from merge_runner.llm.formats.wire import WireFormat
+from merge_runner.llm.http_outcome import AttemptOutcome, TransportFailure, judge
+from merge_runner.llm.limiter import Limiter
+from merge_runner.providers import ModelEntry
+
+if TYPE_CHECKING:
+    from merge_runner.llm.http import HttpTransport
+
+
+class Sent(NamedTuple):
+    """Outcome of an attempt; in a batch it has no ``took_s``, and an ``error`` ends the run."""
+
+    outcome: AttemptOutcome
+    began: datetime
+    took_s: float | None = None
+    batch_id: str | None = None
+    error: MergeRunnerError | None = None
+
+
+class Sender(Protocol):
+    """Sends attempts at ``price_factor`` times the normal price."""
+
+    price_factor: float
+
+    async def send(self, call: Call, reservation: Reservation) -> Sent:
+        """Begin the reservation, send the next attempt of a call, and return its outcome.
+
+        Raises TrialSuspended where the money cannot be reserved.
+        """
+        ...
+
+
+@dataclass(slots=True)
+class DirectSender:
+    """Sends normal (synchronous) requests to one model, under its rate limits."""
+
+    entry: ModelEntry
+    wire: WireFormat
+    transport: HttpTransport
+    limiter: Limiter
+    price_factor: float = 1.0
+
+    async def send(self, call: Call, reservation: Reservation) -> Sent:
+        """Wait for a turn, begin the reservation, and send; see ``Sender``."""
+        # The wait comes first: a turn must be used at once, or the limits do not hold.
+        call.wait = Wait("for a turn under the rate limits")
+        # Providers count a request when they admit it: about four bytes a token, and the whole cap.
+        estimate = (call.worst.input_tokens or 0) // 4 + self.entry.max_output_tokens
+        settle = await self.limiter.acquire(estimate, order=call.order)
+        if reservation.budget.ledger.is_shared_out:
+            call.wait = Wait("for the coordinator, which shares --max-cost out")
+            await reservation.ask_coordinator()
+        call.wait = None
+        number = len(call.attempts) + 1
+        await reservation.begin(number)
+        began, clock_s = datetime.now(UTC), asyncio.get_running_loop().time
+        began_s, timeout_s = clock_s(), min(self.entry.timeout_s, call.left_s)
+        try:
+            raw = await self.transport.send(call.request, attempt=number, timeout_s=timeout_s)
+            outcome = judge(raw, self.wire)
+        except TransportFailure as exc:
+            outcome = AttemptOutcome(
+                exc.action, exc.outcome, str(exc), charged=exc.sent, reason=exc.reason
+            )
+        took_s = clock_s() - began_s
+        call.left_s -= took_s
+        usage = outcome.reading.usage
+        if settle is not None and usage.output_tokens is not None:
+            settle((usage.input_tokens or 0) + usage.output_tokens)
+        if outcome.pause:
+            self.limiter.pause(outcome.delay_s or backoff_s(len(call.own_attempts) + 1))
+        return Sent(outcome, began, took_s)

@@ -1,0 +1,324 @@
+"""Store of recorded replies and their costs: one SQLite file, from which nothing is evicted.
+
+An entry is the JSON of a request and all its attempts, the answering one last, after a checksum. It
+is durable before anyone sees it: each group of writes is one synchronous SQLite transaction. The
+file also holds the attempts of calls without an answer, the notes of batches, and damaged entries
+in quarantine. Two tables in it are the ledgers of all sweeps, so that a reply and its cost are kept
+together or not at all; a third counts calls by request template.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import sqlite3
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, closing
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from threading import Lock
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import diskcache
+from diskcache.core import MODE_RAW
+from pydantic import Field, TypeAdapter, ValidationError
+
+from merge_runner.errors import CacheFailed, MergeRunnerError, RecordingError, UsageError
+from merge_runner.llm.cache_file import FAILURES, FILE, NEW_CACHE, close_texts, open_texts, prepare
+from merge_runner.llm.durable import Execute, GroupWriter, ModelLocks, Operation, Rows, connect
+from merge_runner.records import DAMAGED, Attempt, ChatRequest, check_call
+
+if TYPE_CHECKING:
+    from merge_runner.llm.templates import TemplateCounts
+
+CHECKSUM_LENGTH = 32
+Attempts = tuple[Attempt, ...]
+ATTEMPTS = TypeAdapter(Attempts)
+# Prefixes of keys that are no call keys.
+UNANSWERED, _DAMAGED = "attempts ", "damaged "
+UNSEEN = "the run ended before a reply was seen; it may have been charged"
+_GET = "SELECT mode, filename, value FROM Cache WHERE key = ? AND raw = 1"
+# The rows of a call, and of its attempts in flight when their process ended.
+_LOOK_UP = """
+SELECT key, mode, filename, value FROM Cache WHERE raw = 1 AND key IN (?1, ?2)
+UNION ALL SELECT NULL, attempt, NULL, since FROM open WHERE call = ?1 AND outcome = 'in flight'
+"""
+_ADD = "INSERT INTO Cache (key, raw, mode, value) VALUES (?, 1, 1, ?) ON CONFLICT DO NOTHING"
+_KEYS = """
+SELECT CAST(key AS BLOB) FROM Cache WHERE typeof(key) = 'text' AND key >= ? AND key < ? ORDER BY key
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class CachedCall:
+    """A recorded call: its request, and all attempts, the answering one last."""
+
+    request: ChatRequest
+    attempts: Annotated[Attempts, Field(min_length=1)]
+
+    def to_json(self) -> str:
+        """Return the entry as one JSON text."""
+        return _STORED.dump_json(_Stored(1, self)).decode()
+
+    @classmethod
+    def from_json(cls, text: str) -> CachedCall:
+        """Read an entry; raise RecordingError."""
+        try:
+            return _STORED.validate_json(text, strict=True).entry
+        except ValidationError as exc:
+            why = exc.errors()[0]["msg"]
+            raise RecordingError(f"the recorded reply is damaged: {why}") from exc
+
+
+@dataclass(frozen=True, slots=True)
+class _Stored:
+    """An entry as it lies in the cache."""
+
+    version: Literal[1]
+    entry: CachedCall
+
+
+_STORED: TypeAdapter[_Stored] = TypeAdapter(_Stored)
+Overlay = tuple[Mapping[str, CachedCall], "TemplateCounts"]
+"""A recording: its entries by key, and their counts by request template."""
+
+
+class CallStore:
+    """Store of calls in a cache folder, read directly and written by a thread in groups.
+
+    ``locks`` keep other live runs from asking the same model. ``write`` runs an operation in the
+    next durable transaction, and returns its future result.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        overlay: Callable[[], AbstractContextManager[Overlay]] | None = None,
+        read_only: bool = False,
+        before: bool = False,
+    ) -> None:
+        """Open or make the folder; ``overlay`` opens a recording, which takes precedence.
+
+        ``read_only`` changes nothing in the folder, which must exist, and may have the format
+        ``before``; otherwise it is upgraded. Raises UsageError for a folder that cannot be used.
+        """
+        self.folder = folder
+        self.locks = ModelLocks(folder)
+        self._open_overlay, self._with_overlay = overlay, contextlib.ExitStack()
+        self._writer = GroupWriter(self._run_each)
+        self.write = self._writer.write
+        self.summed: object = None  # the ledger that knows its sums in the transaction under way
+        try:
+            prepare(folder, read_only=read_only, before=before)
+            self._opened = self._file
+            self._one_query = Lock()
+            with contextlib.ExitStack() as unless_opened:
+                self._reading = unless_opened.enter_context(closing(connect(folder / FILE)))
+                self._texts: Any = None if read_only else open_texts(folder)
+                unless_opened.pop_all()
+        except FAILURES as exc:
+            raise UsageError(f"the cache {folder} cannot be used: {exc}. {NEW_CACHE}") from exc
+
+    @cached_property
+    def recording(self) -> Overlay:
+        """The recording, opened on first use."""
+        opened = self._open_overlay
+        return self._with_overlay.enter_context(opened()) if opened else ({}, {})
+
+    def get(self, key: str, request: ChatRequest | None = None) -> CachedCall | None:
+        """Return the entry of a call, checked against its ``request`` where that is given.
+
+        Raises RecordingError where it is damaged or forged.
+        """
+        return self.recording[0].get(key) or self._kept(key, request)
+
+    def in_recording(self, key: str) -> bool:
+        """Return whether the recording holds an entry of a call key."""
+        return key in self.recording[0]
+
+    def look_up(
+        self, key: str, request: ChatRequest | None = None
+    ) -> tuple[CachedCall | None, Attempts]:
+        """Return the entry of a call, or the attempts of earlier runs, unseen ones included.
+
+        Raises RecordingError where they are damaged, or do not match the ``request``.
+        """
+        if recorded := self.recording[0].get(key):
+            return recorded, ()
+        rows = self.rows(_LOOK_UP, key, UNANSWERED + key)
+        if not rows:
+            return None, ()
+        texts = {name: row for name, *row in rows if name is not None}
+        if key in texts:
+            return verified(key, text_of(*texts[key]), request), ()
+        tried = _attempts(text_of(*texts[UNANSWERED + key])) if texts else ()
+        begun = sorted(row for row in rows if row[0] is None and row[1] > len(tried))
+        unseen = (
+            Attempt(number, "unknown", started_at=since, error=UNSEEN)
+            for number, (*_, since) in enumerate(begun, len(tried) + 1)
+        )
+        return None, (*tried, *unseen)
+
+    def run_now(self, operations: Sequence[Operation]) -> list[Any]:
+        """Run operations in one durable transaction, in this thread."""
+        try:
+            with self._texts.transact():
+                execute, self.summed = self._texts._sql, None
+                results = [operation(execute) for operation in operations]
+                if self._file != self._opened:
+                    raise FileNotFoundError("it is no longer there")
+                return results
+        except (diskcache.Timeout, *FAILURES) as exc:
+            # On a full disk SQLite rolls back itself, and diskcache's own attempt hides the reason.
+            hidden = exc.__context__ if isinstance(exc, sqlite3.Error) else None
+            raise self._failure("written", hidden or exc) from exc
+
+    def _run_each(self, operations: Sequence[Operation]) -> list[Any]:
+        """Run operations in one durable transaction; if that fails, each in its own.
+
+        The result of one that fails is its error.
+        """
+        try:
+            return self.run_now(operations)
+        except CacheFailed:
+            raise
+        except (MergeRunnerError, *DAMAGED) as exc:
+            alone = len(operations) == 1
+            return [exc] if alone else [self._run_each([each])[0] for each in operations]
+
+    def read(self, name: str) -> str | None:
+        """Return the text under a name, or None; raise RecordingError where it is damaged."""
+        rows = self.rows(_GET, name)
+        return text_of(*rows[0]) if rows else None
+
+    def replace(self, name: str, text: str, _: Execute) -> None:
+        """Store a text under a name that is no call key, after a checksum; an operation."""
+        self._texts.set(name, _behind_checksum(text))
+
+    def remove(self, name: str, _: Execute) -> None:
+        """Delete the text under a name that is no call key; an operation."""
+        self._texts.delete(name)
+
+    def names(self, prefix: str) -> list[str]:
+        """Return the names with a prefix; none is a call key."""
+        rows = self.rows(_KEYS, prefix, prefix + chr(0x10FFFF))
+        return [name.decode(errors="replace") for (name,) in rows]
+
+    def close(self) -> None:
+        """Close the folder and its recording, and free its locks."""
+        self._with_overlay.close()
+        self._writer.close()
+        self.locks.close()
+        self._reading.close()  # first, since the last one to write ends the journal
+        if self._texts is not None:
+            close_texts(self._texts)
+
+    def keep(self, entry: CachedCall, execute: Execute) -> CachedCall:
+        """Store an entry unless there is one, and return the stored one; an operation.
+
+        A damaged one is quarantined.
+        """
+        key, text = entry.request.key, _behind_checksum(entry.to_json())
+        if not execute(_ADD, (key, text)).rowcount:
+            try:
+                return self._kept(key) or entry
+            except RecordingError:
+                self._quarantine_row(key, execute)
+                execute(_ADD, (key, text))
+        if len(entry.attempts) > 1:
+            self._texts.delete(UNANSWERED + key)
+        return entry
+
+    def keep_attempts(self, key: str, attempts: Attempts, execute: Execute) -> None:
+        """Store the attempts of a call that has no answer yet; an operation."""
+        self.replace(UNANSWERED + key, ATTEMPTS.dump_json(attempts).decode(), execute)
+
+    def _quarantine_row(self, name: str, execute: Execute) -> None:
+        """Rename a damaged row and keep its content; an operation."""
+        renamed = _DAMAGED + name
+        if earlier := self.names(renamed):
+            renamed += f" {len(earlier) + 1}"
+        execute("UPDATE Cache SET key = ? WHERE key = ? AND raw = 1", [renamed, name])
+
+    def _kept(self, key: str, request: ChatRequest | None = None) -> CachedCall | None:
+        text = self.read(key)
+        return None if text is None else verified(key, text, request)
+
+    def _tried(self, key: str) -> Attempts:
+        return _attempts(self.read(UNANSWERED + key) or "[]")
+
+    def rows(self, sql: str, *values: object) -> Rows:
+        """Return the rows of a query; raise CacheFailed, or RecordingError for invalid text."""
+        try:
+            with self._one_query:
+                return self._reading.execute(sql, values).fetchall()
+        except FAILURES as exc:
+            raise self._failure("read", exc) from exc
+
+    def _failure(self, done: str, why: BaseException) -> CacheFailed | RecordingError:
+        """Return the error of a folder that cannot be used, or of invalid text."""
+        if "utf-8" in str(why).lower():  # the only trace in SQLite's message
+            return RecordingError("the recorded reply is damaged: it is no text")
+        reason = f"cannot be {done}: {str(why) or 'another program writes'}"
+        if self._file != self._opened:
+            reason = "was removed, moved or replaced while it was in use"
+        return CacheFailed(
+            f"the cache {self.folder} {reason}. When that is mended, or a copy of it put back, "
+            "run the same command again: what is in no cache is asked again"
+        )
+
+    @property
+    def _file(self) -> tuple[int, int] | None:
+        """Identity of the file in the folder, since SQLite goes on with a deleted one."""
+        with contextlib.suppress(OSError):
+            status = os.stat(self.folder / FILE)
+            return status.st_dev, status.st_ino
+        return None
+
+
+def both(first: Operation, then: Operation, execute: Execute) -> Any:  # noqa: ANN401 # of any
+    """Run two operations as one, and return the result of the first."""
+    result = first(execute)
+    then(execute)
+    return result
+
+
+def _attempts(text: str) -> Attempts:
+    try:
+        return ATTEMPTS.validate_json(text)
+    except ValidationError as exc:
+        raise RecordingError("the list of earlier attempts is damaged") from exc
+
+
+def verified(key: str, text: str, request: ChatRequest | None = None) -> CachedCall:
+    """Return the entry in a row; raise RecordingError unless it belongs to its key."""
+    entry = CachedCall.from_json(text)
+    try:
+        check_call(key, entry.request, entry.attempts, request)
+    except DAMAGED as exc:
+        raise RecordingError(f"the recorded reply is damaged: {exc}") from exc
+    return entry
+
+
+def _behind_checksum(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:CHECKSUM_LENGTH] + text
+
+
+def text_of(mode: object, filename: object, value: object) -> str:
+    """Return the text of a row after its checksum.
+
+    Raises RecordingError where it is damaged, or not written by merge-runner.
+    """
+    if filename is not None or mode != MODE_RAW:
+        raise RecordingError(
+            "the cache holds a pickle or names a file: merge-runner did not write it"
+        )
+    if not isinstance(value, str):
+        raise RecordingError("the recorded reply is damaged: it is no text")
+    content = value[CHECKSUM_LENGTH:]
+    if value != _behind_checksum(content):
+        raise RecordingError("the recorded reply is damaged: its checksum is wrong")
+    return content
