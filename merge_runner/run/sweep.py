@@ -50,7 +50,8 @@ from merge_runner.results.provenance import git_state, versions
 from merge_runner.results.recording import Miss, described, explain, recorded_part, spilled
 from merge_runner.results.store import Store, sweep_facts
 from merge_runner.run.clients import check_batches, live_clients, open_rounds
-from merge_runner.run.cluster import DaskTasks, connected
+from merge_runner.run.cluster import DaskTasks
+from merge_runner.run.cluster_connection import connected
 from merge_runner.run.estimate import Estimate, earlier_answers, estimate, usual_latencies_s
 from merge_runner.run.guard import MOST_INVALID, FirstDecisions
 from merge_runner.run.local_runner import LocalRunner

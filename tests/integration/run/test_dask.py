@@ -21,8 +21,8 @@ import pytest
 from merge_runner.errors import SweepStopped, UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.ledger import Asked, Ledger
-from merge_runner.run import cluster
-from merge_runner.run.cluster import connected
+from merge_runner.run import cluster_worker
+from merge_runner.run.cluster_connection import connected
 from tests.support.cluster import SIX, SMALL, all_held, ended, held_from, repetition_of, workers_of
 from tests.support.crossed_study import MODEL
 from tests.support.gate import HANGS_S, Gate
@@ -41,7 +41,7 @@ DEAR = MODEL.replace("price}, output = {price}", "price}, output = 2.0") + (
 @in_virtual_time
 async def test_a_coordinator_that_says_nothing_ends_its_workers_tasks():
     with pytest.raises(SweepStopped, match="the coordinator has said nothing for 300 s"):
-        await cluster.Desk().ask(1.0, Asked())
+        await cluster_worker.Desk().ask(1.0, Asked())
     assert now_s() == 300
 
 

@@ -15,7 +15,7 @@ from merge_runner.llm.http_outcome import TransportFailure
 from merge_runner.llm.ledger import Asked
 from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.records import Attempt, CallFailed, ReplayMiss, Usage
-from merge_runner.run.cluster import Desk, ToldLedger
+from merge_runner.run.cluster_worker import Desk, ToldLedger
 from tests.support.clients import PRICE, answer, begun, error, raw, slot, ticks
 from tests.support.virtual_time import now_s
 
