@@ -1,78 +1,113 @@
-"""Plays a task of a Dask cluster, on the event loop of its worker."""
+"""A chunk of trials on a worker of a Dask cluster, played on the worker's event loop."""
 
 from __future__ import annotations
 
 import asyncio
 import hashlib
 import pickle
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import AsyncExitStack, closing
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
 from functools import cache, partial
+from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import merge_runner
-from merge_runner.errors import (
-    MergeRunnerError,
-    SweepStopped,
-    TrialSuspended,
-    UsageError,
-)
-from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.call import Meter
-from merge_runner.llm.durable import Rows
+from merge_runner.errors import MergeRunnerError, SweepStopped, TrialSuspended, UsageError
+from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.llm.limiter import Limiter
-from merge_runner.records import Attempt, TrialRecord, TrialSpec, Usage
+from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.registry import plugin_sources, using
 from merge_runner.run.clients import live_clients
-from merge_runner.run.guard import FirstDecisions
+from merge_runner.run.cluster_chunk import Chunk, Played
 from merge_runner.run.local_runner import LocalRunner
-from merge_runner.run.plan import Options, Plan
+from merge_runner.run.plan import Plan
 from merge_runner.study.parts import catalogue_of
 
 if TYPE_CHECKING:
     from distributed import Worker
 
-# A coordinator that stands still is waited for; one that is gone has no use for what is asked.
+# The coordinator may be slow, or its machine suspended; one that is gone never answers.
 SILENT_S = 300
-# The calls with an answer, and by key the attempts at those without one.
-Recorded = tuple[Sequence[CachedCall], Sequence[tuple[str, tuple[Attempt, ...]]]]
 
 
-@dataclass(frozen=True, slots=True)
-class Task:
-    """Trials for one worker, what is recorded of their calls, and its ``share`` of the limits.
+class RemoteLedger(Ledger):
+    """Ledger of a chunk, whose attempts the coordinator reserves before they are sent.
 
-    What it spends is reserved under its ``name`` until it ends. ``urls`` are the coordinator's base
-    URLs.
+    ``tell`` sends it ``"reserve"`` with an attempt's worst case, and then ``"cost"`` with its cost,
+    each with the attempt's number.
     """
 
-    run: str
-    name: str
-    specs: Sequence[TrialSpec]
-    plan: Plan
-    options: Options
-    urls: Mapping[str, str]
-    earlier: Mapping[str, Usage | None]
-    share: float
-    first: FirstDecisions
-    recorded: Recorded
-    overruns: Sequence[tuple[str, float]]
+    is_shared_out = True
+
+    def __init__(self, store: ResponseCache, scope: str, tell: Callable[..., object]) -> None:
+        super().__init__(store, scope)
+        self._tell = tell
+        self._numbers = count(1)
+        self._waiting: dict[int, asyncio.Future[bool]] = {}
+        self._reserved: dict[str, tuple[int, Asked]] = {}  # a call has one attempt at a time
+
+    async def ask(self, key: str, usd: float, asked: Asked) -> bool:
+        """Let the coordinator reserve an attempt; False if that exceeds the cap."""
+        number = next(self._numbers)
+        answer = self._waiting[number] = asyncio.get_running_loop().create_future()
+        self._tell("reserve", number, usd, asked)
+        try:
+            async with asyncio.timeout(SILENT_S):
+                is_paid: bool = await answer
+        except TimeoutError as exc:
+            raise SweepStopped(f"the coordinator has said nothing for {SILENT_S} s") from exc
+        except asyncio.CancelledError:
+            self._tell("cost", number, 0.0, asked)  # it may be reserved
+            raise
+        finally:
+            del self._waiting[number]
+        if is_paid:
+            self._reserved[key] = number, asked
+        return is_paid
+
+    def answer(self, answers: Mapping[int, bool]) -> None:
+        """Take the coordinator's answers, by the attempts' numbers."""
+        for number, is_paid in answers.items():
+            if number in self._waiting and not self._waiting[number].done():
+                self._waiting[number].set_result(is_paid)
+
+    def ended(self, key: str, usd: float | None) -> None:
+        """Tell what an attempt that may be reserved has cost, where that is known."""
+        number, asked = self._reserved.pop(key, (0, Asked()))
+        if number and usd is not None:
+            self._tell("cost", number, usd, asked)
 
 
-@dataclass(slots=True)
-class Played:
-    """What a worker returns: ``spent`` and ``opened`` are rows of its ledger."""
+@dataclass
+class WorkerRun:
+    """State of a run on a worker, from one chunk to the next; limiters are by share and model."""
 
-    ended: list[tuple[TrialSpec, TrialRecord | TrialSuspended]] = field(default_factory=list)
-    recorded: Recorded = ((), ())
-    spent: Rows = field(default_factory=list)
-    opened: Rows = field(default_factory=list)
-    meters: Mapping[str, Meter] = field(default_factory=dict)
-    error: MergeRunnerError | None = None
+    stopping: asyncio.Event = field(default_factory=asyncio.Event)
+    limiters: dict[float, dict[str, Limiter]] = field(default_factory=dict)
+    plan: Plan | None = None
+    # By the name of the chunk under way.
+    ledgers: dict[str, RemoteLedger] = field(default_factory=dict)
+
+
+def _state(run: str, worker: Worker) -> WorkerRun:
+    state: WorkerRun = worker.extensions.setdefault(run, WorkerRun())
+    return state
+
+
+def answer(run: str, name: str, answers: Mapping[int, bool], *, dask_worker: Worker) -> None:
+    """Give a chunk the coordinator's answers."""
+    ledger = _state(run, dask_worker).ledgers.get(name)
+    if ledger is not None:
+        ledger.answer(answers)
+
+
+def stop(run: str, *, dask_worker: Worker) -> None:
+    """Let the calls of a run's chunk end, which then returns what there is."""
+    _state(run, dask_worker).stopping.set()
 
 
 @cache
@@ -85,114 +120,8 @@ def fingerprint() -> str:
     return f"{merge_runner.__version__} ({code.hexdigest()[:12]})"
 
 
-@dataclass(slots=True)
-class Told:
-    """What a task tells the coordinator: attempts to reserve, by number, and costs that are known.
-
-    After the last one it is ``done``.
-    """
-
-    asking: dict[int, tuple[float, Asked]] = field(default_factory=dict)
-    costs: dict[int, float] = field(default_factory=dict)
-    done: bool = False
-
-
-class Desk:
-    """Where a task waits until the coordinator has reserved its attempts."""
-
-    def __init__(self) -> None:
-        self.told = Told()
-        self.changed = asyncio.Event()
-        self._begun = 0
-        self._answers: dict[int, asyncio.Future[bool]] = {}
-
-    async def ask(self, usd: float, asked: Asked) -> tuple[int, bool]:
-        """Return an attempt's number and whether there is money for it; raises SweepStopped."""
-        number = self._begun = self._begun + 1
-        answer = self._answers[number] = asyncio.get_running_loop().create_future()
-        self.told.asking[number] = (usd, asked)
-        self.changed.set()
-        try:
-            async with asyncio.timeout(SILENT_S):
-                return number, await answer
-        except TimeoutError as exc:
-            raise SweepStopped(f"the coordinator has said nothing for {SILENT_S} s") from exc
-        except asyncio.CancelledError:
-            if self.told.asking.pop(number, None) is None:  # the coordinator may have reserved it
-                self.cost(number, 0.0)
-            raise
-        finally:
-            del self._answers[number]
-
-    def cost(self, number: int, usd: float) -> None:
-        """Tell what an attempt has cost."""
-        self.told.costs[number] = usd
-        self.changed.set()
-
-    def close(self) -> None:
-        """Tell that the task has ended."""
-        self.told.done = True
-        self.changed.set()
-
-    async def exchange(self, answers: Mapping[int, bool]) -> Told:
-        """Take the coordinator's answers, and return what is new since then."""
-        for number, answer in answers.items():
-            if number in self._answers and not self._answers[number].done():
-                self._answers[number].set_result(answer)
-        await self.changed.wait()
-        self.changed.clear()
-        told, self.told = self.told, Told(done=self.told.done)
-        return told
-
-
-class ToldLedger(Ledger):
-    """A worker's ledger, whose attempts the coordinator reserves before they begin."""
-
-    is_shared_out = True
-
-    def __init__(self, store: ResponseCache, scope: str, desk: Desk) -> None:
-        super().__init__(store, scope)
-        self._desk = desk
-        self._numbers: dict[str, int] = {}  # by key of a call, which has one attempt at a time
-
-    async def ask(self, key: str, usd: float, asked: Asked) -> bool:
-        """Let the coordinator reserve an attempt; False if that exceeds the cap."""
-        number, is_paid = await self._desk.ask(usd, asked)
-        if is_paid:
-            self._numbers[key] = number
-        return is_paid
-
-    def ended(self, key: str, usd: float | None) -> None:
-        """Tell what an attempt that may be reserved has cost, where that is known."""
-        number = self._numbers.pop(key, None)
-        if number is not None and usd is not None:
-            self._desk.cost(number, usd)
-
-
-async def exchange(name: str, answers: Mapping[int, bool], *, dask_worker: Worker) -> Told:
-    """Take the coordinator's answers to a task, and return what it asks and tells next."""
-    desk: Desk = dask_worker.extensions.setdefault(name, Desk())
-    told = await desk.exchange(answers)
-    if told.done:
-        del dask_worker.extensions[name]
-    return told
-
-
-def stop(run: str, *, dask_worker: Worker) -> None:
-    """Let the calls of a run's tasks end, and return what there is."""
-    dask_worker.extensions.setdefault(run, asyncio.Event()).set()
-
-
-async def play_task(program: str, pickled: bytes, name: str, *, dask_worker: Worker) -> Played:
-    """Play the Task of a name, which only a worker with the same ``program`` can read."""
-    desk: Desk = dask_worker.extensions.setdefault(name, Desk())
-    try:
-        return await _play_task(program, pickled, dask_worker)
-    finally:
-        desk.close()
-
-
-async def _play_task(program: str, pickled: bytes, dask_worker: Worker) -> Played:
+async def play_chunk(program: str, pickled: bytes, *, dask_worker: Worker) -> Played:
+    """Play a Chunk, which only a worker with the same ``program`` can read."""
     if fingerprint() != program:
         differs = UsageError(
             f"it has merge-runner {fingerprint()}, and the coordinator {program}: install the same "
@@ -201,29 +130,34 @@ async def _play_task(program: str, pickled: bytes, dask_worker: Worker) -> Playe
         return Played(error=differs)
     # Dask's profiler samples all threads; Python 3.11 can deadlock there.
     dask_worker.periodic_callbacks["profile"].stop()
-    task: Task = pickle.loads(pickled)  # noqa: S301 # whoever reaches a scheduler can run code
-    kept = dask_worker.extensions
+    chunk: Chunk = pickle.loads(pickled)  # noqa: S301 # whoever reaches a scheduler can run code
+    state = _state(chunk.setup.run, dask_worker)
     try:
-        if (plan := kept.get(f"{task.run} plan")) is None:
-            plan = kept[f"{task.run} plan"] = _rebuilt(task.plan)
+        if state.plan is None:
+            state.plan = _with_code(chunk.setup.plan)
     except MergeRunnerError as exc:
         return Played(error=type(exc)(str(exc)))
-    with using(plan.parts.catalogue):
-        return await _play(replace(task, plan=plan), kept)
+    chunk = replace(chunk, setup=replace(chunk.setup, plan=state.plan))
+
+    def tell(kind: str, number: int, usd: float, asked: Asked) -> None:
+        dask_worker.log_event(chunk.setup.run, (chunk.name, kind, number, usd, astuple(asked)))
+
+    with using(state.plan.parts.catalogue):
+        try:
+            return await _play(chunk, state, tell)
+        finally:
+            state.ledgers.pop(chunk.name, None)
 
 
-def _rebuilt(plan: Plan) -> Plan:
-    """The plan with its programs, and all that its study adds, made anew from their sources."""
+def _with_code(plan: Plan) -> Plan:
+    """Return the plan with its programs, and all that its study adds, made from their sources."""
     study = plan.study
     catalogue = catalogue_of(study.file, study.text, study.plugins)
     return plan.model_copy(update={"parts": plan.parts.with_code(plan.arms, catalogue)})
 
 
-async def _play(task: Task, kept: dict[str, Any]) -> Played:
-    stopping: asyncio.Event = kept.setdefault(task.run, asyncio.Event())
-    # What the last task asked within a minute counts for this one, too.
-    limiters: dict[str, Limiter] = kept.setdefault(f"{task.run} {task.share}", {})
-    played = Played()
+async def _play(chunk: Chunk, state: WorkerRun, tell: Callable[..., object]) -> Played:
+    setup, played = chunk.setup, Played()
 
     def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
         if isinstance(record, TrialSuspended):
@@ -233,18 +167,19 @@ async def _play(task: Task, kept: dict[str, Any]) -> Played:
     async with AsyncExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="merge-runner-")))
         replies = stack.enter_context(closing(ResponseCache(folder)))
-        ledger = ToldLedger(replies, task.plan.ledger, kept.setdefault(task.name, Desk()))
-        overruns = [(driver, 0, 0, ratio) for driver, ratio in task.overruns]
-        replies.put_now(*task.recorded, [partial(ledger.share, "", overruns, [])])
+        ledger = state.ledgers[chunk.name] = RemoteLedger(replies, setup.plan.ledger, tell)
+        overruns = [(driver, 0, 0, ratio) for driver, ratio in chunk.overruns]
+        replies.put_now(*chunk.recorded, [partial(ledger.share, "", overruns, [])])
         try:
             clients = live_clients(
-                task.plan, task.options, task.earlier, replies, ledger,
-                stack=stack, urls=task.urls, share=task.share, limiters=limiters,
+                setup.plan, setup.options, setup.earlier, replies, ledger,
+                stack=stack, urls=setup.urls, share=chunk.share,
+                limiters=state.limiters.setdefault(chunk.share, {}),
             )  # fmt: skip
-            runner = LocalRunner(task.plan, clients, task.options.in_flight, task.first)
+            runner = LocalRunner(setup.plan, clients, setup.options.in_flight, setup.first)
             played.meters = runner.meters
-            work = asyncio.create_task(runner.play(task.specs, ended))
-            stopped = asyncio.create_task(stopping.wait())
+            work = asyncio.create_task(runner.play(chunk.specs, ended))
+            stopped = asyncio.create_task(state.stopping.wait())
             await asyncio.wait([work, stopped], return_when=asyncio.FIRST_COMPLETED)
             work.cancel()
             stopped.cancel()
@@ -254,7 +189,7 @@ async def _play(task: Task, kept: dict[str, Any]) -> Played:
                 work.result()
         except MergeRunnerError as exc:
             played.error = type(exc)(str(exc))
-        known = {call.request.key for call in task.recorded[0]}
+        known = {call.request.key for call in chunk.recorded[0]}
         new = [call for call in replies.entries() if call.request.key not in known]
         played.recorded = new, [*replies.all_unanswered().items()]
         played.spent, played.opened = ledger.rows()

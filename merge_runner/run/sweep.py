@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import secrets
 import tempfile
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
@@ -24,6 +25,7 @@ from merge_runner.config import (
     PROVIDERS,
     UNNAMED,
     ModelEntry,
+    base_urls,
     driver_name,
     model_id,
     resolve_endpoint,
@@ -50,7 +52,8 @@ from merge_runner.results.provenance import git_state, versions
 from merge_runner.results.recording import Miss, described, explain, recorded_part, spilled
 from merge_runner.results.store import Store, sweep_facts
 from merge_runner.run.clients import check_batches, live_clients, open_rounds
-from merge_runner.run.cluster import DaskTasks
+from merge_runner.run.cluster import ClusterRunner
+from merge_runner.run.cluster_chunk import RunSetup
 from merge_runner.run.cluster_connection import connected
 from merge_runner.run.estimate import Estimate, earlier_answers, estimate, usual_latencies_s
 from merge_runner.run.guard import MOST_INVALID, FirstDecisions
@@ -331,7 +334,9 @@ class Sweep:
                     first.add(model, *decisions)
         if options.dask is not None:
             client = await stack.enter_async_context(connected(options.dask))
-            return DaskTasks(client, plan, options, earlier, self._cache, self._ledger, first)
+            urls = base_urls(plan.entries)
+            setup = RunSetup(secrets.token_hex(), plan, options, earlier, first, urls)
+            return ClusterRunner(client, setup, self._ledger)
         clients = live_clients(
             plan, options, earlier, self._cache, self._ledger, stack=stack, rounds=rounds
         )

@@ -21,8 +21,8 @@ import pytest
 from merge_runner.errors import SweepStopped, UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.ledger import Asked, Ledger
-from merge_runner.run import cluster_worker
 from merge_runner.run.cluster_connection import connected
+from merge_runner.run.cluster_worker import RemoteLedger
 from tests.support.cluster import SIX, SMALL, all_held, ended, held_from, repetition_of, workers_of
 from tests.support.crossed_study import MODEL
 from tests.support.gate import HANGS_S, Gate
@@ -39,9 +39,11 @@ DEAR = MODEL.replace("price}, output = {price}", "price}, output = 2.0") + (
 
 
 @in_virtual_time
-async def test_a_coordinator_that_says_nothing_ends_its_workers_tasks():
-    with pytest.raises(SweepStopped, match="the coordinator has said nothing for 300 s"):
-        await cluster_worker.Desk().ask(1.0, Asked())
+async def test_a_coordinator_that_says_nothing_ends_its_workers_tasks(tmp_path):
+    with closing(ResponseCache(tmp_path)) as cache:
+        ledger = RemoteLedger(cache, "baseline", lambda *_: None)
+        with pytest.raises(SweepStopped, match="the coordinator has said nothing for 300 s"):
+            await ledger.ask("a key", 1.0, Asked())
     assert now_s() == 300
 
 
