@@ -247,6 +247,7 @@ def _play(plan: Plan, options: Options, *, whole: bool, yes: bool, as_json: bool
 
     from merge_runner.run import sweep as running
     from merge_runner.run.estimate_lines import estimate_lines
+    from merge_runner.run.interrupt import INTERRUPTED
     from merge_runner.run.summary import as_lines
 
     _say_shutdowns(plan, options)
@@ -260,7 +261,7 @@ def _play(plan: Plan, options: Options, *, whole: bool, yes: bool, as_json: bool
         facts = asyncio.run(playing)
     except KeyboardInterrupt:  # before the trials began or after they ended
         say("interrupted: run the same command again to go on")
-        return running.INTERRUPTED
+        return INTERRUPTED
     as_text = json.dumps(facts, ensure_ascii=False) if as_json else "\n".join(as_lines(facts))
     print_out(as_text)
     for message in facts["messages"]:

@@ -6,43 +6,33 @@ import asyncio
 import secrets
 import tempfile
 from collections import Counter
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import (
-    AbstractContextManager,
     AsyncExitStack,
     asynccontextmanager,
     closing,
-    contextmanager,
 )
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from merge_runner.audit.checks import Audit, audit_sweep
 from merge_runner.config import (
-    PROVIDERS,
     UNNAMED,
-    ModelEntry,
     base_urls,
-    driver_name,
-    model_id,
     resolve_endpoint,
 )
 from merge_runner.errors import (
     MergeRunnerError,
     NoValidDecision,
-    ProviderDown,
     StoreError,
     TrialSuspended,
-    UsageError,
 )
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.client import LONG_WAIT_S
-from merge_runner.llm.http_outcome import TransportFailure, if_nobody, set_base_url
-from merge_runner.llm.kinds import counted, recorded_values
+from merge_runner.llm.kinds import counted
 from merge_runner.llm.ledger import Ledger, scopes
 from merge_runner.paths import DEFAULT_DB, SHIPPED_RECORDINGS, command_at
 from merge_runner.records import ReplayMiss, TrialRecord, TrialSpec, canonical_json
@@ -57,49 +47,22 @@ from merge_runner.run.cluster_chunk import RunSetup
 from merge_runner.run.cluster_connection import connected
 from merge_runner.run.estimate import Estimate, earlier_answers, estimate, usual_latencies_s
 from merge_runner.run.guard import MOST_INVALID, FirstDecisions
+from merge_runner.run.interrupt import GO_ON, INTERRUPTED, NEVER, Stopping
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import Options, Plan, usual_prompts
 from merge_runner.run.progress import REASONS_SHOWN, Progress, show_progress
 from merge_runner.run.progress_file import write_snapshot
 from merge_runner.run.replay import Replay
+from merge_runner.run.served_names import with_names
 from merge_runner.run.stored_replay import refuse_changed_programs
 from merge_runner.run.summary import as_dict
 from merge_runner.run.trials import Player
 from merge_runner.run.writer import AGAIN, BATCH, Flusher
 from merge_runner.text_safety import first_of
 
-INTERRUPTED = 130
-GO_ON = "Run the same command again to go on."
 SHOWN = 5
 # Trials under way in a batch run.
 MOST_IN_ROUNDS = 10_000
-Stopping = Callable[
-    [Callable[[], object] | None, Callable[[], object]], AbstractContextManager[None]
-]
-"""Within it, whoever may stop a run calls the first function to stop it, and the second one to drop
-what it then still waits for. The first is None where there is nothing left to stop."""
-
-
-def on_event(event: asyncio.Event | None) -> Stopping:
-    """A run is stopped by an event; None: it is not."""
-
-    @contextmanager
-    def waiting(stop: Callable[[], object] | None, _: Callable[[], object]) -> Iterator[None]:
-        async def wait(told: asyncio.Event, call: Callable[[], object]) -> None:
-            await told.wait()
-            call()
-
-        task = asyncio.create_task(wait(event, stop)) if event and stop else None
-        try:
-            yield
-        finally:
-            if task is not None:
-                task.cancel()
-
-    return waiting
-
-
-NEVER = on_event(None)
 
 
 async def play(
@@ -498,7 +461,7 @@ async def open_sweep(
         options = replace(options, max_cost_usd=plan.study.file.budget.get("total_usd"))
     recorded = partial(spilled, options.recordings) if options.recordings else None
     with closing(ResponseCache(options.cache, overlay=recorded)) as cache:
-        plan = await _with_names(plan, options, cache, say)
+        plan = await with_names(plan, options, cache, say)
         specs = {(spec.trial_id, spec.spec_hash): spec for spec in plan.trial_specs()}
         # A replay derives everything from the recorded replies alone, so it plays every trial.
         with unreadable_is_usage():
@@ -516,68 +479,6 @@ async def open_sweep(
             cache.locks.take({f"{e.id} at {plan.endpoints[name]}" for name, e in asked})
         ledger = Ledger(cache, plan.ledger, others)
         yield Sweep(plan, options, cache, stored, todo, say, ledger)
-
-
-async def _with_names(
-    plan: Plan, options: Options, cache: ResponseCache, say: Callable[[str], None]
-) -> Plan:
-    """The plan with its models' names, and in a replay the endpoints where they are recorded.
-
-    A model's name is as told, as recorded, or as its server says. Raises UsageError.
-    """
-    entries, endpoints = dict(plan.entries), dict(plan.endpoints)
-    for name, entry in entries.items():
-        named = model_id(entry)
-        if not named and options.sends_nothing:
-            # A server of one's own serves one model, or the recorded replies do not tell which.
-            models = recorded_values(cache, "model", provider=entry.provider)
-            named = models.pop() if len(models) == 1 else UNNAMED
-        entries[name] = entry.model_copy(
-            update={"id": named or await _served_name(name, entry, say=say)}
-        )
-        recorded: set[str] = set()
-        if options.replay:
-            recorded = recorded_values(cache, "endpoint", model=entries[name].id)
-        if recorded and endpoints[name] not in recorded:
-            endpoints[name], *others = sorted(recorded)
-            if others:
-                raise UsageError(
-                    f"replies of {name} are recorded from several endpoints: "
-                    f"{', '.join(sorted(recorded))}. Set the base URL variable of its provider to "
-                    "the one to replay."
-                )
-    arms = tuple(replace(arm, entries={n: entries[n] for n in arm.entries}) for arm in plan.arms)
-    return plan.model_copy(update={"arms": arms, "entries": entries, "endpoints": endpoints})
-
-
-async def _served_name(name: str, entry: ModelEntry, *, say: Callable[[str], None]) -> str:
-    """The one model that a server lists; raises ProviderDown where nobody listens, UsageError."""
-    # Imports httpx, which no replay needs.
-    from merge_runner.llm.http import LIST_TIMEOUT_S, listed_models
-
-    endpoint = resolve_endpoint(name, entry)
-    driver = driver_name(name, endpoint.identity)
-    until = datetime.now(UTC) + timedelta(seconds=LIST_TIMEOUT_S)
-    waits = f"{driver} has not listed its models yet: waits until {until:%H:%M:%S} UTC for that"
-    telling = asyncio.get_running_loop().call_later(LONG_WAIT_S, say, waits)
-    try:
-        listed = await listed_models(endpoint)
-        models = ", ".join(listed) or "no model"
-    except TransportFailure as exc:
-        if exc.outcome == "no_connection":
-            raise ProviderDown(f"{driver}: {exc}: {if_nobody(entry)}") from exc
-        wrong = f"; if that is another server, {set_base_url(entry)}"
-        listed, models = [], f"models that it does not list ({exc}{wrong})"
-    finally:
-        telling.cancel()
-    if len(listed) != 1:
-        variable = PROVIDERS.require(entry.provider).model_env
-        raise UsageError(
-            f"{driver} serves {models}: name one with "
-            f"{variable}, or with `id` of {entry.place}, which takes precedence"
-        )
-    say(f"{driver} serves {listed[0]}, which is asked")
-    return listed[0]
 
 
 def _others_under_the_cap(
