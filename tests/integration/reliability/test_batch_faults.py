@@ -200,6 +200,6 @@ async def test_no_fault_of_a_batch_server_changes_a_result(play, case):
 
 
 async def test_a_trial_begins_where_one_ends_if_no_more_may_be_under_way(play, monkeypatch):
-    monkeypatch.setattr("merge_runner.run.sweep.MOST_IN_ROUNDS", 1)
+    monkeypatch.setattr("merge_runner.run.players.MOST_IN_ROUNDS", 1)
     digest, count = await play("openai", batch=True)
     assert (digest, count) == await play("openai")

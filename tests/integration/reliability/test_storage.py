@@ -148,7 +148,7 @@ async def test_what_was_dropped_is_played_again_and_failed_trials_are_kept_as_th
     said, is_free, written = [], [], Store.write
     monkeypatch.setattr(Store, "write", write)
     monkeypatch.setattr("merge_runner.run.writer.BATCH", 2)
-    monkeypatch.setattr("merge_runner.run.sweep.BATCH", 2)
+    monkeypatch.setattr("merge_runner.run.playing.BATCH", 2)
     async with watched(fails) as server:
         monkeypatch.setenv("EMULATOR_BASE_URL", f"{server.url}/v1")
         conditions = ["L_4_0", "N_0_0", "R_-4_8", "L_4_8", "R_-4_0"]
