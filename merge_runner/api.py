@@ -22,7 +22,8 @@ from merge_runner.registry import Catalogue, Registry, collecting, remember
 from merge_runner.run.estimate import Estimate
 from merge_runner.run.estimate_lines import estimate_lines
 from merge_runner.run.interrupt import on_event
-from merge_runner.run.plan import Options, Plan, make_plan
+from merge_runner.run.options import Options
+from merge_runner.run.plan import Plan, make_plan
 from merge_runner.run.summary import as_lines
 from merge_runner.run.sweep import play, unsent
 from merge_runner.study.crossing import level_text

@@ -27,7 +27,8 @@ from merge_runner.text_safety import say
 
 if TYPE_CHECKING:
     from merge_runner.run.estimate import Estimate
-    from merge_runner.run.plan import Options, Plan
+    from merge_runner.run.options import Options
+    from merge_runner.run.plan import Plan
 
 # Trials that failed, or are not recorded, are no reason to leave the next sweep out.
 GRID = (
@@ -120,7 +121,8 @@ def sweep(
 
     Example: merge-runner sweep baseline --model o3 --dry-run
     """
-    from merge_runner.run.plan import Options, make_plan
+    from merge_runner.run.options import Options
+    from merge_runner.run.plan import make_plan
     from merge_runner.run.recorded_plans import recorded_plans
 
     studies = studies or ["baseline"]

@@ -22,7 +22,8 @@ from merge_runner.llm.models import load_models
 from merge_runner.llm.prices import cost_usd
 from merge_runner.records import Usage
 from merge_runner.run.estimate import trial_costs
-from merge_runner.run.plan import Options, Plan
+from merge_runner.run.options import Options
+from merge_runner.run.plan import Plan
 
 if TYPE_CHECKING:
     from merge_runner.llm.http import HttpTransport

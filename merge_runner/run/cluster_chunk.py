@@ -20,7 +20,8 @@ from merge_runner.llm.durable import Operation, Rows
 from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.records import Attempt, TrialRecord, TrialSpec, Usage
 from merge_runner.run.guard import FirstDecisions
-from merge_runner.run.plan import Options, Plan
+from merge_runner.run.options import Options
+from merge_runner.run.plan import Plan
 from merge_runner.run.replay import Replay
 
 # The calls with an answer, and by key the attempts at those without one.

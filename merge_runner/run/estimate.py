@@ -16,7 +16,8 @@ from merge_runner.llm.kinds import Answers, counted, kinds_of
 from merge_runner.llm.prices import cost_usd
 from merge_runner.prompts.blocks import render_prompt
 from merge_runner.records import SIDES, Usage, canonical_json
-from merge_runner.run.plan import Options, Plan, usual_prompts
+from merge_runner.run.options import Options
+from merge_runner.run.plan import Plan, usual_prompts
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 from merge_runner.study.crossing import Arm

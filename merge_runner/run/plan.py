@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import math
-import re
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
-from decimal import Decimal
-from itertools import chain, product
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -24,13 +22,10 @@ from merge_runner.config import (
     validated,
 )
 from merge_runner.drivers.pace import model_pace
-from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError
-from merge_runner.llm.formats import FORMATS, WireFormat
 from merge_runner.llm.models import load_models
-from merge_runner.prompts.blocks import VARIANTS, Prompt, blocks_of, decomposed, prompt_of
+from merge_runner.prompts.blocks import decomposed
 from merge_runner.records import (
-    MOST_REPETITIONS,
     SIDES,
     SPEC_VERSION,
     Side,
@@ -40,13 +35,10 @@ from merge_runner.records import (
 )
 from merge_runner.registry import Catalogue, Registry, require, using
 from merge_runner.results.database import read_database
+from merge_runner.run.parts import Parts, find_parts
+from merge_runner.run.selection import grid_conditions, selected_conditions, selected_repetitions
 from merge_runner.scenarios.merge.conditions import (
-    CONDITIONS,
-    HUMAN_CONDITIONS,
     MEAN_SPEED_MPS,
-    NUMBER,
-    Condition,
-    condition_name,
 )
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
@@ -57,136 +49,20 @@ from merge_runner.study.crossing import (
     Arm,
     chosen_models,
     cross,
-    file_prompts,
     listed_levels,
 )
 from merge_runner.study.file import (
-    EVERY_CONDITION,
-    EVERY_PROMPT,
     MEASURES,
-    StudyFile,
     StudySource,
 )
 from merge_runner.study.parts import load_study
 from merge_runner.text_safety import in_a_name
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    pass
 
-    from duckdb import DuckDBPyConnection
-
-USUAL_GRID = "h=-6:6:2,dv=-1.6:1.6:0.4"
-"""Projected headways in m and relative velocities in m/s, left minus right: FROM:TO:STEP."""
-MOST_VALUES = 100  # of an axis
-_AXIS = re.compile(
-    f"(?P<name>h|dv)=(?P<first>{NUMBER})(:(?P<last>{NUMBER}):(?P<step>{NUMBER}))?", re.ASCII
-)
 # A trial takes about 10 s at 10 m/s over the last 100 m: 10 or 11 prompts a driver.
 _PROMPTS_PER_DRIVER = 10.5
-
-
-@dataclass(frozen=True, slots=True)
-class Options:
-    """How a sweep runs; nothing here changes a result.
-
-    ``rpm`` and ``tpm`` override the registry's. ``max_cost_usd`` is a cap over ``ledgers``, too,
-    those of other sweeps. ``dask`` names the cluster that plays the trials; None: this process. A
-    ``dry_run`` sends nothing, a ``quiet`` run shows no progress, and one that is to ``keep_going``
-    asks a model on that gives no valid decision. In a ``batch`` run all trials ask together, at a
-    lower price. ``typed`` are the command's words after the program's name, with which it goes on.
-    ``name`` is what its user calls the run.
-    """
-
-    db: Path
-    cache: Path
-    in_flight: int = 200
-    rpm: int | None = None
-    tpm: int | None = None
-    max_cost_usd: float | None = None
-    ledgers: Sequence[str] = ()
-    replay: bool = False
-    recordings: Sequence[Path] = ()
-    strict_model: bool = False
-    keep_going: bool = False
-    quiet: bool = False
-    dask: str | None = None
-    dry_run: bool = False
-    batch: bool = False
-    typed: Sequence[str] = ()
-    name: str = ""
-
-    @property
-    def connections(self) -> int:
-        """How many connections a model may need: both drivers of a trial may ask at once."""
-        return 2 * self.in_flight
-
-    @property
-    def sends_nothing(self) -> bool:
-        """Whether no model may be asked."""
-        return self.replay or self.dry_run
-
-    def rates(self, entry: ModelEntry) -> tuple[int | None, int | None]:
-        """The requests and tokens a minute that a model may get; None: no limit."""
-        return self.rpm or entry.rpm, self.tpm or entry.tpm
-
-
-@dataclass(frozen=True, eq=False)
-class Parts:
-    """What the names in a plan stand for.
-
-    It is found when the plan is made, and not looked up again: another study may give the same
-    names to other things. ``prompts`` are by variant; ``programs``, and the wire ``formats`` of
-    models, are those of its arms. The ``catalogue`` is all that its study adds.
-    """
-
-    conditions: Mapping[str, Condition] = field(default_factory=dict)
-    prompts: Mapping[str, Prompt] = field(default_factory=dict)
-    programs: Mapping[str, Program] = field(default_factory=dict)
-    formats: Mapping[str, WireFormat] = field(default_factory=dict)
-    catalogue: Catalogue = field(default_factory=Catalogue)
-
-    @property
-    def replays_humans(self) -> bool:
-        """Whether a program replays imported human trials."""
-        return any(program.data is not None for program in self.programs.values())
-
-    def with_code(self, arms: Iterable[Arm], catalogue: Catalogue, hint: str = "") -> Parts:
-        """The same with the programs and wire formats of arms; raises UsageError, with a hint."""
-        asked = {name: arm.entries.get(name) for arm in arms for name in arm.asked.values()}
-        with using(catalogue):
-            return replace(
-                self,
-                programs={n: PROGRAMS.require(n, hint) for n, entry in asked.items() if not entry},
-                formats={e.format: FORMATS[e.format] for e in asked.values() if e},
-                catalogue=catalogue,
-            )
-
-    def without_code(self) -> Parts:
-        """The same without what is in a study's plug-ins, which are not everywhere."""
-        return Parts(self.conditions, self.prompts)
-
-    def with_humans(self, connection: DuckDBPyConnection | None) -> Parts:
-        """The same with the human trials of a database, which are replayed; None: it has none."""
-        programs = {name: each.replaying(connection) for name, each in self.programs.items()}
-        return replace(self, programs=programs)
-
-
-def find_parts(
-    arms: Sequence[Arm], conditions: Iterable[str], catalogue: Catalogue, hint: str = ""
-) -> Parts:
-    """What the names in arms and conditions stand for where a catalogue is in use.
-
-    Raises UsageError, with a ``hint``, where that is not known.
-    """
-    with using(catalogue):
-        parts = Parts(
-            {name: CONDITIONS.require(name, hint) for name in conditions},
-            {
-                name: prompt_of(name)
-                for name in dict.fromkeys(chain.from_iterable(map(_read, arms)))
-            },
-        )
-    return parts.with_code(arms, catalogue, hint)
 
 
 class Plan(BaseModel):
@@ -383,11 +259,6 @@ class Plan(BaseModel):
         }
 
 
-def _read(arm: Arm) -> list[str]:
-    """The variants of the prompts that language models read in an arm."""
-    return [arm.prompt(side) for side in SIDES if arm.asked[side] in arm.entries]
-
-
 def usual_prompts(arm: Arm) -> float:
     """How many prompts a trial of an arm usually takes a language model."""
     most = math.ceil(arm.scenario.timeout_steps / model_pace(arm.scenario).interval_steps)
@@ -434,8 +305,8 @@ def make_plan(
         hint = "as the study's primary one; a median is not tested"
         require(dict.fromkeys([*MEASURES, *tested]), "measure", file.primary, hint)
         registry = load_models(study.path.parent)
-        wanted = _repetitions(study, variants, repetitions)
-        names = _conditions(file, conditions)
+        wanted = selected_repetitions(study, variants, repetitions)
+        names = selected_conditions(file, conditions)
         arms = cross(
             file, drivers, wanted, registry, only or {}, conditions=len(names), mirror=mirror
         )
@@ -478,32 +349,6 @@ def _first_decision(arm: Arm) -> Arm:
     return replace(arm, scenario=validated(ScenarioConfig, given, "scenario"))
 
 
-def grid_conditions(text: str) -> list[str]:
-    """The names of the conditions of a grid such as USUAL_GRID, or ``usual``.
-
-    ``h`` or ``dv`` may be one number, or be left out for that of the usual grid. Raises UsageError.
-    """
-    parts = USUAL_GRID if text == "usual" else f"{USUAL_GRID},{text}"
-    points = list(product(*dict(map(_axis, parts.split(","))).values()))
-    for point in points:
-        Condition(*point)  # raises where a vehicle would not drive forwards
-    return [condition_name(*point) for point in points]
-
-
-def _axis(text: str) -> tuple[str, list[float]]:
-    """Name and values of a part of a grid, computed in decimals: 3 * 0.4 is 1.2."""
-    if axis := _AXIS.fullmatch(text.strip()):
-        first = Decimal(axis["first"])
-        last, step = Decimal(axis["last"] or first), Decimal(axis["step"] or 1)
-        if step > 0 and 0 <= (last - first) / step < MOST_VALUES:
-            count = int((last - first) / step) + 1
-            return axis["name"], [float(first + i * step) for i in range(count)]
-    raise UsageError(
-        f"--grid: {text!r} is no axis of 1 to {MOST_VALUES} values; write --grid usual, or --grid "
-        f"{USUAL_GRID}: FROM:TO:STEP or one number for each, with at most four decimals"
-    )
-
-
 def _check_arms(arms: Sequence[Arm], parts: Parts, *, first: bool) -> None:
     """Check all crossings of arms and conditions.
 
@@ -521,31 +366,3 @@ def _check_arms(arms: Sequence[Arm], parts: Parts, *, first: bool) -> None:
             program = parts.programs[asked]
             if program.data is not None:
                 program.data.check(program, arm.scenario, name, arm.repetitions)
-
-
-def _conditions(file: StudyFile, chosen: Sequence[str] | None) -> tuple[str, ...]:
-    wanted = next(c for c in (chosen, file.conditions, HUMAN_CONDITIONS) if c is not None)
-    names = (HUMAN_CONDITIONS if each == EVERY_CONDITION else (each,) for each in wanted)
-    if conditions := tuple(dict.fromkeys(chain.from_iterable(names))):
-        return conditions
-    raise UsageError(f"no condition is left; valid: {', '.join(CONDITIONS)}")
-
-
-def _repetitions(
-    study: StudySource, variants: Sequence[str] | None, chosen: int | None
-) -> dict[str, int]:
-    """The wanted prompts with their repetitions per condition; raises UsageError."""
-    if chosen is not None and not 1 <= chosen <= MOST_REPETITIONS:
-        raise UsageError(f"--reps is a whole number from 1 to {MOST_REPETITIONS}")
-    given, wanted = study.file.repetitions, {}
-    for variant in file_prompts(study.file) if variants is None else variants:
-        VARIANTS.require(variant)
-        blocks_of(variant)  # raises where it names a block that there is not
-        wanted[variant] = chosen or given.get(variant, given.get(EVERY_PROMPT, 0))
-    if wanted and all(wanted.values()):
-        return wanted
-    lacking = "".join(f" {variant}" for variant, repetitions in wanted.items() if not repetitions)
-    raise UsageError(
-        f"the sweep {study.name} has no variant{lacking}; valid: {', '.join(VARIANTS)}. With "
-        "--reps N any variant can be run."
-    )

@@ -11,7 +11,8 @@ from merge_runner.errors import RecordingError, UsageError
 from merge_runner.records import DAMAGED
 from merge_runner.results.database import read_database
 from merge_runner.results.recording import read_provenance, sweep_rows
-from merge_runner.run.plan import Plan, find_parts, make_plan
+from merge_runner.run.parts import find_parts
+from merge_runner.run.plan import Plan, make_plan
 from merge_runner.study.crossing import MOST_TRIALS
 from merge_runner.study.file import study_files
 from merge_runner.study.parts import load_study

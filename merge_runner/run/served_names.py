@@ -23,7 +23,8 @@ from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LONG_WAIT_S
 from merge_runner.llm.http_outcome import TransportFailure, if_nobody, set_base_url
 from merge_runner.llm.kinds import recorded_values
-from merge_runner.run.plan import Options, Plan
+from merge_runner.run.options import Options
+from merge_runner.run.plan import Plan
 
 
 async def with_names(

@@ -23,7 +23,8 @@ from merge_runner.results.database import unreadable_is_usage
 from merge_runner.results.recording import Miss, explain, spilled
 from merge_runner.results.store import Store
 from merge_runner.run.clients import check_batches
-from merge_runner.run.plan import Options, Plan
+from merge_runner.run.options import Options
+from merge_runner.run.plan import Plan
 from merge_runner.run.served_names import with_names
 from merge_runner.run.stored_replay import refuse_changed_programs
 

@@ -38,7 +38,8 @@ from merge_runner.registry import Catalogue, in_use, require, using
 from merge_runner.results.database import read_database
 from merge_runner.results.recording import leaves
 from merge_runner.results.rows import Stored, in_order, rows_of
-from merge_runner.run.plan import Plan, find_parts
+from merge_runner.run.parts import find_parts
+from merge_runner.run.plan import Plan
 from merge_runner.run.replay import Replay
 from merge_runner.study.crossing import Arm
 from merge_runner.study.parts import declared_catalogue

@@ -14,7 +14,7 @@ from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, command_at
 from merge_runner.records import ReplayMiss, Status
 from merge_runner.results.export import write_table
 from merge_runner.run.estimate import Estimate, usd_text
-from merge_runner.run.plan import Options
+from merge_runner.run.options import Options
 from merge_runner.text_safety import first_of
 
 if TYPE_CHECKING:

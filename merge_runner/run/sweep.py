@@ -28,7 +28,8 @@ from merge_runner.results.store import Store
 from merge_runner.run.clients import open_rounds
 from merge_runner.run.estimate import Estimate, earlier_answers, estimate, usual_latencies_s
 from merge_runner.run.interrupt import NEVER, Stopping
-from merge_runner.run.plan import Options, Plan, usual_prompts
+from merge_runner.run.options import Options
+from merge_runner.run.plan import Plan, usual_prompts
 from merge_runner.run.players import open_player
 from merge_runner.run.playing import play_and_store
 from merge_runner.run.progress import Progress, show_progress

@@ -16,7 +16,8 @@ from aiohttp import web
 from merge_runner.emulator.server import HOST
 from merge_runner.records import SCRIPTED_FIELD, SLOT_HEADER
 from merge_runner.registry import GROUP
-from merge_runner.run.plan import Options, Plan
+from merge_runner.run.options import Options
+from merge_runner.run.plan import Plan
 from merge_runner.run.session import open_session
 from merge_runner.run.sweep import run
 from tests.support.mock_server import application

@@ -13,7 +13,7 @@ import merge_runner as package
 from merge_runner.cli import complete_app
 from merge_runner.cli.app import alone
 from merge_runner.cli.packages import GROUP, command_modules, load_commands
-from merge_runner.run.plan import Options
+from merge_runner.run.options import Options
 
 COMMANDS = {
     *("sweep", "replay", "sql", "digest", "models", "emulate", "recording", "audit"),

@@ -9,7 +9,8 @@ import pytest
 from aiohttp import web
 
 from merge_runner.results.store import results_digest
-from merge_runner.run.plan import Options, make_plan
+from merge_runner.run.options import Options
+from merge_runner.run.plan import make_plan
 from tests.integration.reliability.test_batches import PRICE, account, answered
 from tests.support.harness import a_model, run_sweep, watched
 from tests.support.mock_server import BatchPlan, FaultPlan

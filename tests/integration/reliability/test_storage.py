@@ -17,7 +17,8 @@ from merge_runner.errors import StoreLocked
 from merge_runner.records import SLOT_HEADER
 from merge_runner.results.database import SCHEMA_VERSION
 from merge_runner.results.store import Store, results_digest
-from merge_runner.run.plan import Options, make_plan
+from merge_runner.run.options import Options
+from merge_runner.run.plan import make_plan
 from tests.support.gate import HANGS_S, Gate
 from tests.support.harness import run_sweep, watched
 

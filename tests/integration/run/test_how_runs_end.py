@@ -18,7 +18,8 @@ from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.results.store import Store
 from merge_runner.run import run_record, writer
 from merge_runner.run.local_runner import LocalRunner
-from merge_runner.run.plan import Options, make_plan
+from merge_runner.run.options import Options
+from merge_runner.run.plan import make_plan
 from merge_runner.run.progress import Progress
 from merge_runner.run.progress_file import read_snapshot
 from tests.support.crossed_study import MODEL

@@ -1,0 +1,60 @@
+"""How a sweep runs, as its user asks for it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from merge_runner.config import (
+    ModelEntry,
+)
+
+if TYPE_CHECKING:
+    pass
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How a sweep runs; nothing here changes a result.
+
+    ``rpm`` and ``tpm`` override the registry's. ``max_cost_usd`` is a cap over ``ledgers``, too,
+    those of other sweeps. ``dask`` names the cluster that plays the trials; None: this process. A
+    ``dry_run`` sends nothing, a ``quiet`` run shows no progress, and one that is to ``keep_going``
+    asks a model on that gives no valid decision. In a ``batch`` run all trials ask together, at a
+    lower price. ``typed`` are the command's words after the program's name, with which it goes on.
+    ``name`` is what its user calls the run.
+    """
+
+    db: Path
+    cache: Path
+    in_flight: int = 200
+    rpm: int | None = None
+    tpm: int | None = None
+    max_cost_usd: float | None = None
+    ledgers: Sequence[str] = ()
+    replay: bool = False
+    recordings: Sequence[Path] = ()
+    strict_model: bool = False
+    keep_going: bool = False
+    quiet: bool = False
+    dask: str | None = None
+    dry_run: bool = False
+    batch: bool = False
+    typed: Sequence[str] = ()
+    name: str = ""
+
+    @property
+    def connections(self) -> int:
+        """How many connections a model may need: both drivers of a trial may ask at once."""
+        return 2 * self.in_flight
+
+    @property
+    def sends_nothing(self) -> bool:
+        """Whether no model may be asked."""
+        return self.replay or self.dry_run
+
+    def rates(self, entry: ModelEntry) -> tuple[int | None, int | None]:
+        """The requests and tokens a minute that a model may get; None: no limit."""
+        return self.rpm or entry.rpm, self.tpm or entry.tpm

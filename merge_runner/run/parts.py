@@ -1,0 +1,92 @@
+"""The objects that the names in a plan stand for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain
+from typing import TYPE_CHECKING
+
+from merge_runner.drivers.registry import PROGRAMS, Program
+from merge_runner.llm.formats import FORMATS, WireFormat
+from merge_runner.prompts.blocks import Prompt, prompt_of
+from merge_runner.records import (
+    SIDES,
+)
+from merge_runner.registry import Catalogue, using
+from merge_runner.scenarios.merge.conditions import (
+    CONDITIONS,
+    Condition,
+)
+from merge_runner.study.crossing import (
+    Arm,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from duckdb import DuckDBPyConnection
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """What the names in a plan stand for.
+
+    It is found when the plan is made, and not looked up again: another study may give the same
+    names to other things. ``prompts`` are by variant; ``programs``, and the wire ``formats`` of
+    models, are those of its arms. The ``catalogue`` is all that its study adds.
+    """
+
+    conditions: Mapping[str, Condition] = field(default_factory=dict)
+    prompts: Mapping[str, Prompt] = field(default_factory=dict)
+    programs: Mapping[str, Program] = field(default_factory=dict)
+    formats: Mapping[str, WireFormat] = field(default_factory=dict)
+    catalogue: Catalogue = field(default_factory=Catalogue)
+
+    @property
+    def replays_humans(self) -> bool:
+        """Whether a program replays imported human trials."""
+        return any(program.data is not None for program in self.programs.values())
+
+    def with_code(self, arms: Iterable[Arm], catalogue: Catalogue, hint: str = "") -> Parts:
+        """The same with the programs and wire formats of arms; raises UsageError, with a hint."""
+        asked = {name: arm.entries.get(name) for arm in arms for name in arm.asked.values()}
+        with using(catalogue):
+            return replace(
+                self,
+                programs={n: PROGRAMS.require(n, hint) for n, entry in asked.items() if not entry},
+                formats={e.format: FORMATS[e.format] for e in asked.values() if e},
+                catalogue=catalogue,
+            )
+
+    def without_code(self) -> Parts:
+        """The same without what is in a study's plug-ins, which are not everywhere."""
+        return Parts(self.conditions, self.prompts)
+
+    def with_humans(self, connection: DuckDBPyConnection | None) -> Parts:
+        """The same with the human trials of a database, which are replayed; None: it has none."""
+        programs = {name: each.replaying(connection) for name, each in self.programs.items()}
+        return replace(self, programs=programs)
+
+
+def find_parts(
+    arms: Sequence[Arm], conditions: Iterable[str], catalogue: Catalogue, hint: str = ""
+) -> Parts:
+    """What the names in arms and conditions stand for where a catalogue is in use.
+
+    Raises UsageError, with a ``hint``, where that is not known.
+    """
+    with using(catalogue):
+        parts = Parts(
+            {name: CONDITIONS.require(name, hint) for name in conditions},
+            {
+                name: prompt_of(name)
+                for name in dict.fromkeys(chain.from_iterable(map(_read, arms)))
+            },
+        )
+    return parts.with_code(arms, catalogue, hint)
+
+
+def _read(arm: Arm) -> list[str]:
+    """The variants of the prompts that language models read in an arm."""
+    return [arm.prompt(side) for side in SIDES if arm.asked[side] in arm.entries]
