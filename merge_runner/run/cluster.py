@@ -23,11 +23,7 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from merge_runner.errors import (
-    MergeRunnerError,
-    SweepStopped,
-    TrialSuspended,
-)
+from merge_runner.errors import MergeRunnerError, SweepStopped, TrialSuspended
 from merge_runner.llm.call import Meter, Wait
 from merge_runner.llm.ledger import Ledger
 from merge_runner.records import TrialRecord, TrialSpec

@@ -9,11 +9,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from merge_runner.errors import (
-    MergeRunnerError,
-    RecordingError,
-    TrialSuspended,
-)
+from merge_runner.errors import MergeRunnerError, RecordingError, TrialSuspended
 from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.call import Meter
 from merge_runner.llm.durable import Operation, Rows

@@ -5,14 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from merge_runner.config import (
-    ModelEntry,
-)
-
-if TYPE_CHECKING:
-    pass
+from merge_runner.config import ModelEntry
 
 
 @dataclass(frozen=True, slots=True)

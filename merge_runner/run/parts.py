@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import TYPE_CHECKING
@@ -10,20 +11,15 @@ from typing import TYPE_CHECKING
 from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.llm.formats import FORMATS, WireFormat
 from merge_runner.prompts.blocks import Prompt, prompt_of
-from merge_runner.records import (
-    SIDES,
-)
+from merge_runner.records import SIDES
 from merge_runner.registry import Catalogue, using
-from merge_runner.scenarios.merge.conditions import (
-    CONDITIONS,
-    Condition,
-)
-from merge_runner.study.crossing import (
-    Arm,
-)
+from merge_runner.results.database import read_database
+from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
+from merge_runner.study.crossing import Arm
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+    from pathlib import Path
 
     from duckdb import DuckDBPyConnection
 
@@ -67,6 +63,13 @@ class Parts:
         """The same with the human trials of a database, which are replayed; None: it has none."""
         programs = {name: each.replaying(connection) for name, each in self.programs.items()}
         return replace(self, programs=programs)
+
+    def with_humans_of(self, db: Path | None) -> Parts:
+        """Return the same with the human trials of a file, where any are replayed."""
+        if db is None or not self.replays_humans:
+            return self
+        with read_database(db) if db.is_file() else nullcontext() as connection:
+            return self.with_humans(connection)
 
 
 def find_parts(

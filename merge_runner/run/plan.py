@@ -1,15 +1,14 @@
-"""What a sweep consists of: its trials in order, their ids and what their hash covers."""
+"""A sweep before it runs: its arms, its conditions, and its trials in order."""
 
 from __future__ import annotations
 
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, InstanceOf, computed_field
 
@@ -24,42 +23,16 @@ from merge_runner.config import (
 from merge_runner.drivers.pace import model_pace
 from merge_runner.errors import UsageError
 from merge_runner.llm.models import load_models
-from merge_runner.prompts.blocks import decomposed
-from merge_runner.records import (
-    SIDES,
-    SPEC_VERSION,
-    Side,
-    TrialSpec,
-    canonical_json,
-    spec_hash,
-)
+from merge_runner.records import SIDES, TrialSpec, spec_hash
 from merge_runner.registry import Catalogue, Registry, require, using
-from merge_runner.results.database import read_database
 from merge_runner.run.parts import Parts, find_parts
 from merge_runner.run.selection import grid_conditions, selected_conditions, selected_repetitions
-from merge_runner.scenarios.merge.conditions import (
-    MEAN_SPEED_MPS,
-)
+from merge_runner.run.spec import spec_text, trial_id
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
-from merge_runner.study.crossing import (
-    FOCAL,
-    OPPONENT,
-    PROMPT,
-    Arm,
-    chosen_models,
-    cross,
-    listed_levels,
-)
-from merge_runner.study.file import (
-    MEASURES,
-    StudySource,
-)
+from merge_runner.study.crossing import Arm, chosen_models, cross, listed_levels
+from merge_runner.study.file import MEASURES, StudySource
 from merge_runner.study.parts import load_study
-from merge_runner.text_safety import in_a_name
-
-if TYPE_CHECKING:
-    pass
 
 # A trial takes about 10 s at 10 m/s over the last 100 m: 10 or 11 prompts a driver.
 _PROMPTS_PER_DRIVER = 10.5
@@ -121,16 +94,6 @@ class Plan(BaseModel):
         return sum(arm.repetitions for arm in self.arms) * len(self.conditions)
 
     @property
-    def usual_calls(self) -> dict[str, float]:
-        """How many calls all trials usually take, by the model's name in ``entries``."""
-        calls = dict.fromkeys(self.entries, 0.0)
-        for arm in self.arms:
-            for name in arm.asked.values():
-                if name in arm.entries:
-                    calls[name] += arm.repetitions * usual_prompts(arm) * len(self.conditions)
-        return calls
-
-    @property
     def scripted(self) -> bool:
         """Whether the emulator takes part."""
         return any(arm.is_scripted for arm in self.arms)
@@ -161,32 +124,22 @@ class Plan(BaseModel):
         return {spec_hash(text): text for text in texts}
 
     def spec(self, arm: Arm, condition: str) -> str:
-        """What determines a trial of an arm, but for its condition's headway and relative velocity.
-
-        These stand in its row, where a change of them is refused; another mean speed does not.
-        """
-        mean_speed_mps = self.parts.conditions[condition].mean_speed_mps
-        return canonical_json(
-            {
-                "spec_version": SPEC_VERSION,
-                "scenario": arm.scenario.model_dump(),
-                "prompt_blocks": self._prompt_blocks(arm),
-                "left": self._driver(arm, "left"),
-                "right": self._driver(arm, "right"),
-                "sample_set": self.sample_set,
-                **({} if mean_speed_mps == MEAN_SPEED_MPS else {"mean_speed_mps": mean_speed_mps}),
-            }
+        """Return the canonical JSON that the spec hash of an arm's trials covers."""
+        return spec_text(
+            arm, self.parts, condition, endpoints=self.endpoints, sample_set=self.sample_set
         )
 
     def trial_specs(self) -> list[TrialSpec]:
-        """All trials, repetition by repetition, so that an unfinished sweep is balanced, too.
+        """Return all trials, repetition by repetition: an unfinished sweep is balanced, too.
 
         Within a repetition the order is random, by the order seed, so that no condition or arm
         always comes first: a service that drifts over hours affects all of them alike.
         """
         specs = [
             TrialSpec(
-                trial_id=self.trial_id_of(arm, condition, repetition),
+                trial_id=trial_id(
+                    arm, condition, repetition, sample_set=self.sample_set, seat=self.seat
+                ),
                 spec_hash=hashed,
                 source="first_decision" if self.seat else "llm" if arm.entries else "driver",
                 model_left=arm.sides["left"],
@@ -209,58 +162,17 @@ class Plan(BaseModel):
             for repetition in range(1, arm.repetitions + 1)
         ]
 
-        def place(spec: TrialSpec) -> tuple[int, str]:
-            # The same way on every machine.
+        def shuffle_key(spec: TrialSpec) -> tuple[int, str]:
+            # The same order on every machine.
             drawn_for = f"{self.order_seed}/{spec.repetition}/{spec.arm}/{spec.condition}"
             return spec.repetition, hashlib.sha256(drawn_for.encode()).hexdigest()
 
-        return [replace(spec, order=order) for order, spec in enumerate(sorted(specs, key=place))]
-
-    def trial_id_of(self, arm: Arm, condition: str, repetition: int) -> str:
-        """The id of a trial of an arm."""
-        seat = "seat/" if self.seat else ""
-        set_ = f"/set{self.sample_set}" if self.sample_set else ""
-        # The prompt and the opponent stand in it already.
-        levels = "".join(
-            f"/{name}={in_a_name(level)}"
-            for name, level in sorted(arm.factors.items())
-            if name not in (PROMPT, OPPONENT)
-        )
-        prompt, _ = decomposed(arm.variant)
-        focal = f"/{FOCAL}={arm.focal}" if arm.focal else ""
-        return f"{seat}{arm.model}/{prompt}/{condition}/rep{repetition:02d}{set_}{levels}{focal}"
-
-    def _prompt_blocks(self, arm: Arm) -> dict[str, str]:
-        """The digests of the prompt's blocks; one that a single driver is told names its side."""
-        left, right = (
-            self.parts.prompts[arm.prompt(side)].digests if arm.asked[side] in arm.entries else None
-            for side in SIDES
-        )
-        if left is None or right is None:
-            return left or right or {}
-        both = left.items() & right.items()
-        return dict(both) | {
-            f"{name}@{side}": digest
-            for side, digests in (("left", left), ("right", right))
-            for name, digest in digests.items() - both
-        }
-
-    def _driver(self, arm: Arm, side: Side) -> dict[str, object]:
-        name = arm.asked[side]
-        entry = arm.entries.get(name)
-        if entry is None:
-            return self.parts.programs[name].in_spec(name)
-        sent = self.parts.formats[entry.format].request(entry, "")
-        return {
-            "endpoint": self.endpoints[name],
-            "path": sent.path,
-            "headers": sent.headers,
-            "body": sent.body,
-        }
+        specs.sort(key=shuffle_key)
+        return [replace(spec, order=order) for order, spec in enumerate(specs)]
 
 
 def usual_prompts(arm: Arm) -> float:
-    """How many prompts a trial of an arm usually takes a language model."""
+    """Return the usual number of prompts of a trial of an arm to a language model."""
     most = math.ceil(arm.scenario.timeout_steps / model_pace(arm.scenario).interval_steps)
     return min(_PROMPTS_PER_DRIVER, most)
 
@@ -282,7 +194,7 @@ def make_plan(
     trust: bool = False,
     own: Catalogue | None = None,
 ) -> Plan:
-    """The plan of a study's file and what a user asks for; None or nothing keeps the file's value.
+    """Return the plan of a study's file and a user's choices; None or nothing keeps the file's.
 
     ``first``: only the first situations, in the conditions or on a ``grid`` (``grid_conditions``).
     ``own`` are parts beside those that the study itself adds (``study.parts.load_study``, which
@@ -300,10 +212,7 @@ def make_plan(
     drivers = chosen_models(file, asked)
     pairs = (dict.fromkeys(both_sides(name).values()) for name in drivers)
     with using(catalogue):
-        metrics = [item for each in Registry.made if each.kind == "metric" for item in each.items()]
-        tested = [name for name, metric in metrics if metric.estimator != "median"]
-        hint = "as the study's primary one; a median is not tested"
-        require(dict.fromkeys([*MEASURES, *tested]), "measure", file.primary, hint)
+        _check_primary(file.primary)
         registry = load_models(study.path.parent)
         wanted = selected_repetitions(study, variants, repetitions)
         names = selected_conditions(file, conditions)
@@ -312,10 +221,7 @@ def make_plan(
         )
         entries = {name: entry for arm in arms for name, entry in arm.entries.items()}
         endpoints = {name: endpoint_identity(entry) for name, entry in entries.items()}
-    parts = find_parts(arms, names, catalogue)
-    if parts.replays_humans and db is not None:
-        with read_database(db) if db.is_file() else nullcontext() as connection:
-            parts = parts.with_humans(connection)
+    parts = find_parts(arms, names, catalogue).with_humans_of(db)
     _check_arms(arms, parts, first=first)
     if first:
         arms = list(map(_first_decision, arms))
@@ -336,13 +242,20 @@ def make_plan(
     )
 
 
+def _check_primary(measure: str) -> None:
+    """Raise UsageError unless a study's primary measure can be tested."""
+    metrics = [item for each in Registry.made if each.kind == "metric" for item in each.items()]
+    tested = [name for name, metric in metrics if metric.estimator != "median"]
+    hint = "as the study's primary one; a median is not tested"
+    require(dict.fromkeys([*MEASURES, *tested]), "measure", measure, hint)
+
+
 def _first_decision(arm: Arm) -> Arm:
-    """The arm in trials whose time is up before their drivers would decide again.
+    """Return the arm with a timeout before its drivers would decide a second time.
 
     Such a trial is planned, played, kept and checked as any other; its calls have the texts and the
     slots, and so the keys, of the first decisions of the study's sweep. Its source is
-    ``first_decision``, which tables of trials that were driven to their end leave out
-    (``merge_runner_analysis.frames.TRIALS``).
+    ``first_decision``, which tables of whole trials leave out.
     """
     given = arm.scenario.model_dump(exclude_unset=True)
     given["timeout_s"] = 1 / arm.scenario.prompt_rate_hz

@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import secrets
-from contextlib import (
-    AsyncExitStack,
-)
+from contextlib import AsyncExitStack
 
-from merge_runner.config import (
-    base_urls,
-)
+from merge_runner.config import base_urls
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.results.store import Store
 from merge_runner.run.clients import live_clients

@@ -8,10 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
-from merge_runner.errors import (
-    StoreError,
-    TrialSuspended,
-)
+from merge_runner.errors import StoreError, TrialSuspended
 from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.results.recording import Miss
 from merge_runner.run.interrupt import GO_ON, INTERRUPTED, Stopping

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from contextlib import nullcontext
 from pathlib import Path
 
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.records import DAMAGED
-from merge_runner.results.database import read_database
 from merge_runner.results.recording import read_provenance, sweep_rows
 from merge_runner.run.parts import find_parts
 from merge_runner.run.plan import Plan, make_plan
@@ -49,10 +47,7 @@ def recorded_plans(file: Path, *, db: Path, trust: bool) -> Iterator[Plan]:
 
 def _with_parts(plan: Plan, db: Path, *, trust: bool) -> Plan:
     _, catalogue = load_study(plan.study, trust=trust)
-    parts = find_parts(plan.arms, plan.conditions, catalogue)
-    if parts.replays_humans:
-        with read_database(db) if db.is_file() else nullcontext() as connection:
-            parts = parts.with_humans(connection)
+    parts = find_parts(plan.arms, plan.conditions, catalogue).with_humans_of(db)
     return plan.model_copy(update={"parts": parts})
 
 

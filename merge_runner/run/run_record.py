@@ -9,11 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from merge_runner.audit.checks import Audit, audit_sweep
-from merge_runner.errors import (
-    MergeRunnerError,
-    NoValidDecision,
-    StoreError,
-)
+from merge_runner.errors import MergeRunnerError, NoValidDecision, StoreError
 from merge_runner.paths import DEFAULT_DB, command_at
 from merge_runner.records import canonical_json
 from merge_runner.results.database import in_thread

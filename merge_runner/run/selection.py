@@ -6,13 +6,10 @@ import re
 from collections.abc import Sequence
 from decimal import Decimal
 from itertools import chain, product
-from typing import TYPE_CHECKING
 
 from merge_runner.errors import UsageError
 from merge_runner.prompts.blocks import VARIANTS, blocks_of
-from merge_runner.records import (
-    MOST_REPETITIONS,
-)
+from merge_runner.records import MOST_REPETITIONS
 from merge_runner.scenarios.merge.conditions import (
     CONDITIONS,
     HUMAN_CONDITIONS,
@@ -20,18 +17,8 @@ from merge_runner.scenarios.merge.conditions import (
     Condition,
     condition_name,
 )
-from merge_runner.study.crossing import (
-    file_prompts,
-)
-from merge_runner.study.file import (
-    EVERY_CONDITION,
-    EVERY_PROMPT,
-    StudyFile,
-    StudySource,
-)
-
-if TYPE_CHECKING:
-    pass
+from merge_runner.study.crossing import file_prompts
+from merge_runner.study.file import EVERY_CONDITION, EVERY_PROMPT, StudyFile, StudySource
 
 USUAL_GRID = "h=-6:6:2,dv=-1.6:1.6:0.4"
 """Projected headways in m and relative velocities in m/s, left minus right: FROM:TO:STEP."""

@@ -15,10 +15,7 @@ from merge_runner.config import (
     model_id,
     resolve_endpoint,
 )
-from merge_runner.errors import (
-    ProviderDown,
-    UsageError,
-)
+from merge_runner.errors import ProviderDown, UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LONG_WAIT_S
 from merge_runner.llm.http_outcome import TransportFailure, if_nobody, set_base_url

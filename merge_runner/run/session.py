@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Callable
-from contextlib import (
-    asynccontextmanager,
-    closing,
-)
+from contextlib import asynccontextmanager, closing
 from dataclasses import dataclass, field, replace
 from functools import partial
 
-from merge_runner.config import (
-    resolve_endpoint,
-)
-from merge_runner.errors import (
-    MergeRunnerError,
-)
+from merge_runner.config import resolve_endpoint
+from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.ledger import Ledger, scopes
 from merge_runner.records import ReplayMiss, TrialRecord, TrialSpec

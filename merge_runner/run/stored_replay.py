@@ -41,6 +41,7 @@ from merge_runner.results.rows import Stored, in_order, rows_of
 from merge_runner.run.parts import find_parts
 from merge_runner.run.plan import Plan
 from merge_runner.run.replay import Replay
+from merge_runner.run.spec import trial_id
 from merge_runner.study.crossing import Arm
 from merge_runner.study.parts import declared_catalogue
 from merge_runner.text_safety import one_line
@@ -150,7 +151,7 @@ def _audit(
             text = f"it disagrees with itself in {', '.join(wrong)}"
             problems.append(Finding("config", text, sweep_id))
         planned = {
-            plan.trial_id_of(arm, condition, repetition): ""
+            trial_id(arm, condition, repetition, sample_set=plan.sample_set, seat=plan.seat): ""
             for arm in plan.arms
             for condition in plan.conditions
             for repetition in range(1, arm.repetitions + 1)

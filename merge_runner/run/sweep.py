@@ -6,17 +6,12 @@ import asyncio
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import (
-    AsyncExitStack,
-    closing,
-)
+from contextlib import AsyncExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from merge_runner.config import (
-    UNNAMED,
-)
+from merge_runner.config import UNNAMED
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.kinds import counted
