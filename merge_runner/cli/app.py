@@ -13,10 +13,14 @@ from typing import Annotated
 import typer
 
 from merge_runner import __version__
-from merge_runner.cli import commands
 from merge_runner.cli.help import Program
+from merge_runner.cli.inspect import audit, digest, forget, sql
+from merge_runner.cli.models import emulate, models
+from merge_runner.cli.money import ledger
 from merge_runner.cli.options import flag, print_out
 from merge_runner.cli.packages import load_commands
+from merge_runner.cli.recording import recording_app
+from merge_runner.cli.run import init, replay, sweep
 from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner.text_safety import say
 
@@ -47,14 +51,14 @@ app.callback(invoke_without_command=True)(common)
 # The groups of the menu, in which the commands of the analysis take their places, too.
 PLAY, LOOK, KEEP, CHECK = "Play", "Look", "Keep", "Check"
 for _panel, _commands in {
-    PLAY: (commands.sweep, commands.replay, commands.init, commands.models, commands.emulate),
-    LOOK: (commands.sql,),
-    KEEP: (commands.forget,),
-    CHECK: (commands.audit, commands.digest, commands.ledger),
+    PLAY: (sweep, replay, init, models, emulate),
+    LOOK: (sql,),
+    KEEP: (forget,),
+    CHECK: (audit, digest, ledger),
 }.items():
     for _command in _commands:
         app.command(rich_help_panel=_panel)(_command)
-app.add_typer(commands.recording_app, name="recording", rich_help_panel=KEEP)
+app.add_typer(recording_app, name="recording", rich_help_panel=KEEP)
 # To run one of these, the commands of other packages are not looked up.
 OWN = {info.callback.__name__ for info in app.registered_commands if info.callback}
 OWN |= {str(info.name) for info in app.registered_groups}

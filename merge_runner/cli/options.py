@@ -106,6 +106,9 @@ StudyOption = Annotated[
 ]
 
 
+NOT_BOTH = "--sweep names a run, --study all runs of a study: leave one of them out"
+
+
 def use_study(file: str | None, *, trust: bool) -> None:
     """Use what the study of ``--study`` adds, once the user agrees to its code."""
     if file is not None:
