@@ -7,7 +7,7 @@ import shlex
 import sys
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
-from functools import wraps
+from functools import partial, wraps
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -22,6 +22,8 @@ from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
 from merge_runner.text_safety import say
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
     from merge_runner.run.estimate import Estimate
     from merge_runner.run.options import Options
     from merge_runner.run.plan import Plan
@@ -111,9 +113,7 @@ def sweep(
     """
     from merge_runner.run.options import Options
     from merge_runner.run.plan import make_plan
-    from merge_runner.run.recorded_plans import recorded_plans
 
-    studies = studies or ["baseline"]
     if not isfinite(max_cost_usd or 0):
         raise UsageError("--max-cost is a number of USD")
     if show_prompts and not dry_run:
@@ -137,50 +137,68 @@ def sweep(
         typed=sys.argv[1:],
         name=run_name,
     )
+    make = partial(
+        make_plan,
+        models=models or (),
+        repetitions=repetitions,
+        conditions=cli.listed(conditions),
+        variants=cli.listed(variants),
+        sample_set=sample_set,
+        order_seed=order_seed,
+        only=cli.levels(only or (), "--only"),
+        db=db,
+        mirror=mirror,
+        first=first,
+        grid=grid,
+        trust=trust,
+    )
+    sizes = (repetitions, grid, conditions, variants)
+    chosen = any((*sizes, models, only, mirror, first, sample_set, order_seed))
+    whole = any(size is not None for size in sizes)
+    if dry_run:
+        play = partial(_estimate, show_prompts=show_prompts, as_json=as_json)
+    else:
+        play = partial(_play, whole=whole, yes=yes, as_json=as_json)
+    plans = partial(_plans, make=make, options=options, chosen=chosen, trust=trust)
+    sys.exit(_play_all(studies or ["baseline"], plans, play, options))
 
-    def plans(name: str) -> list[Plan]:
-        if name.endswith(".parquet"):
-            chosen = (models, only, mirror, repetitions, conditions, variants, first, grid)
-            _refuse_a_part(name, chosen=any((*chosen, sample_set, order_seed)), replay=replay)
-            return [*recorded_plans(Path(name), db=db, trust=trust)]
-        plan = make_plan(
-            name,
-            models or (),
-            repetitions,
-            cli.listed(conditions),
-            cli.listed(variants),
-            sample_set=sample_set,
-            order_seed=order_seed,
-            only=cli.levels(only or (), "--only"),
-            db=db,
-            mirror=mirror,
-            first=first,
-            grid=grid,
-            trust=trust,
-        )
-        if dask is not None and (replay or plan.replays_humans):
-            raise UsageError("a replay needs no cluster: leave --dask out")
-        return [plan]
 
+def _play_all(
+    studies: Sequence[str],
+    plans: Callable[[str], list[Plan]],
+    play: Callable[[Plan, Options], int],
+    options: Options,
+) -> int:
+    """Play studies one after the other; return the first exit code that is not 0."""
     if len(studies) > 1:  # all are looked at before the first one is played
         ledgers = [plan.ledger for name in studies for plan in plans(name)]
-        options = replace(options, ledgers=() if max_cost_usd is None else ledgers)
-    whole = any(part is not None for part in (repetitions, grid, conditions, variants))
+        options = replace(options, ledgers=() if options.max_cost_usd is None else ledgers)
     codes = []
     for name in studies:
         if len(studies) > 1:
             say(f"{name}:")
         files = [Path(name)] if name.endswith(".parquet") else []
         played = replace(options, recordings=(*files, *options.recordings))
-        codes += [
-            _estimate(plan, played, show_prompts=show_prompts, as_json=as_json)
-            if dry_run
-            else _play(plan, played, whole=whole, yes=yes, as_json=as_json)
-            for plan in plans(name)
-        ]
+        codes += [play(plan, played) for plan in plans(name)]
+        # Trials that failed, or are not recorded, are no reason to leave the next sweep out.
         if codes[-1] not in (0, 1, 4):
             break
-    sys.exit(next(filter(None, codes), 0))
+    return next(filter(None, codes), 0)
+
+
+def _plans(
+    name: str, *, make: Callable[[str], Plan], options: Options, chosen: bool, trust: bool
+) -> list[Plan]:
+    """Return the plan of a study, or those in a recording; ``chosen``: only a part is wanted."""
+    from merge_runner.run.recorded_plans import recorded_plans
+
+    if name.endswith(".parquet"):
+        _refuse_a_part(name, chosen=chosen, replay=options.replay)
+        return [*recorded_plans(Path(name), db=options.db, trust=trust)]
+    plan = make(name)
+    if options.dask is not None and (options.replay or plan.replays_humans):
+        raise UsageError("a replay needs no cluster: leave --dask out")
+    return [plan]
 
 
 def _refuse_a_part(recording: str, *, chosen: bool, replay: bool) -> None:
@@ -213,7 +231,7 @@ def _say_shutdowns(plan: Plan, options: Options) -> None:
 
 
 def _estimate(plan: Plan, options: Options, *, show_prompts: bool, as_json: bool) -> int:
-    """Print what it would take to play a plan; return the exit code."""
+    """Print the estimate of a plan; return the exit code."""
     import asyncio
 
     from merge_runner.run import estimate_lines as lines
@@ -242,12 +260,12 @@ def _play(plan: Plan, options: Options, *, whole: bool, yes: bool, as_json: bool
 
     _say_shutdowns(plan, options)
 
-    def leave(expected: Estimate) -> None:
+    def ask(expected: Estimate) -> None:
         lines = "\n".join(estimate_lines(expected))
         agree(lines, "Go ahead?", otherwise="nothing was sent", yes=yes)
 
     try:
-        playing = running.play(plan, options, whole=whole, say=say, agree=leave, stopping=on_signal)
+        playing = running.play(plan, options, whole=whole, say=say, agree=ask, stopping=on_signal)
         facts = asyncio.run(playing)
     except KeyboardInterrupt:  # before the trials began or after they ended
         say("interrupted: run the same command again to go on")
