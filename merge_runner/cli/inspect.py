@@ -88,7 +88,7 @@ def audit(
     cli.use_study(study, trust=trust)
     skipped: list[str] = []
     if recording is not None:
-        if any(each is not None for each in (sweep_id, cache, study)):
+        if any(option is not None for option in (sweep_id, cache, study)):
             raise UsageError(
                 "--recording is checked by itself: without --sweep, --study and --cache"
             )
@@ -98,15 +98,16 @@ def audit(
             raise UsageError(cli.NOT_BOTH)
         named = [sweep_id] if sweep_id is not None else cli.runs_of_study(study, db)
         audits = audit_database(db, named, cache)
-        told = {"calls.cached"} if cache is not None else set(NOT_REPLAYED)
-        skipped = [name for name in NOT_REPLAYED if name in told or "calls" not in name]
-    ok = all(found.ok for found in audits)
+        of_calls = {"calls.cached"} if cache is not None else set(NOT_REPLAYED)
+        skipped = [name for name in NOT_REPLAYED if name in of_calls or "calls" not in name]
+    ok = all(result.ok for result in audits)
     if as_json:
-        whole = {"ok": ok, "not_replayed": skipped, "audits": [found.as_dict() for found in audits]}
+        as_dicts = [result.as_dict() for result in audits]
+        whole = {"ok": ok, "not_replayed": skipped, "audits": as_dicts}
         print_out(json.dumps(whole, ensure_ascii=False))
     else:
-        for found in audits:
-            print_out("\n".join(found.lines()))
+        for result in audits:
+            print_out("\n".join(result.lines()))
         if skipped:
             print_out(f"not checked, since no replay tells it: {', '.join(skipped)}")
     sys.exit(0 if ok else 1)
@@ -132,10 +133,12 @@ def forget(
         raise UsageError(
             f"the sweep {busy.sweep_id} is running into {db}: stop it, or wait for its end"
         )
-    ids, going = store.to_forget(db, sweeps)
-    agree(f"these go from {db}: {going}", "Remove them?", otherwise="nothing was removed", yes=yes)
+    ids, removed = store.to_forget(db, sweeps)
+    agree(
+        f"these go from {db}: {removed}", "Remove them?", otherwise="nothing was removed", yes=yes
+    )
     store.forget(db, ids)
     say(
-        f"removed: {going}. Their replies stay in the cache: the same `merge-runner sweep` plays "
+        f"removed: {removed}. Their replies stay in the cache: the same `merge-runner sweep` plays "
         "the trials again without a call"
     )

@@ -13,7 +13,7 @@ from merge_runner.errors import UsageError, unknown_name
 from merge_runner.paths import DEFAULT_CACHE
 
 if TYPE_CHECKING:
-    pass
+    from merge_runner.llm.cache import ResponseCache
 
 
 def ledger(
@@ -39,27 +39,12 @@ def ledger(
         if release is not None:
             if release not in names:
                 raise unknown_name("sweep", release, names, f"with a ledger in {cache}")
-            chosen = Ledger(opened, release)
-            spending = chosen.read()
-            agree(
-                f"{spending.reserved_usd:.4f} USD are set aside for {spending.open_attempts} "
-                f"attempts at {release}. If the provider did charge for them, --max-cost may be "
-                "passed by as much",
-                "Release it?",
-                otherwise="nothing was released",
-                yes=yes,
-            )
-            if not opened.locks.take_all():
-                raise UsageError(
-                    f"another merge-runner works with {cache}: what it has in flight cannot be "
-                    "released; try again when it has ended"
-                )
-            chosen.release()
+            _release(opened, release, yes=yes)
             names = [release]
         ledgers = [Ledger(opened, name) for name in names]
         rows = [
-            {"sweep": each.scope, **asdict(each.read()), "reasons": each.reasons()}
-            for each in ledgers
+            {"sweep": ledger.scope, **asdict(ledger.read()), "reasons": ledger.reasons()}
+            for ledger in ledgers
         ]
         # Without a process nothing is awaited, but by a batch: the next run asks for that.
         if opened.locks.take_all():
@@ -70,12 +55,34 @@ def ledger(
         print_out(json.dumps(rows, ensure_ascii=False))
         return
     reasons = [{"sweep": row["sweep"], **reason} for row in rows for reason in row.pop("reasons")]
-    told = "\n".join(filter(None, map(as_table, (_shown_spending(rows), reasons))))
-    print_out(f"{told}\n{APART}" if told else "Nothing is spent.")
+    text = "\n".join(filter(None, map(as_table, (_shown_spending(rows), reasons))))
+    print_out(f"{text}\n{APART}" if text else "Nothing is spent.")
+
+
+def _release(cache: ResponseCache, name: str, *, yes: bool) -> None:
+    """Release what is set aside under the name of a sweep, once the user agrees."""
+    from merge_runner.llm.ledger import Ledger
+
+    ledger = Ledger(cache, name)
+    spending = ledger.read()
+    agree(
+        f"{spending.reserved_usd:.4f} USD are set aside for {spending.open_attempts} "
+        f"attempts at {name}. If the provider did charge for them, --max-cost may be "
+        "passed by as much",
+        "Release it?",
+        otherwise="nothing was released",
+        yes=yes,
+    )
+    if not cache.locks.take_all():
+        raise UsageError(
+            f"another merge-runner works with {cache.folder}: what it has in flight cannot be "
+            "released; try again when it has ended"
+        )
+    ledger.release()
 
 
 def _shown_spending(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """What the ledgers hold, for a reader: without columns that are 0 or empty in all of them."""
+    """Return the rows for a reader: without columns that are 0 or empty in all of them."""
     kept = [name for name in rows[0] if any(row[name] for row in rows)] if rows else []
     heads = {"open_attempts": "attempts of unknown cost"}
     return [{heads.get(name, name): row[name] for name in kept} for row in rows]

@@ -44,17 +44,17 @@ def recording_export(
     if sweeps and study is not None:
         raise UsageError(cli.NOT_BOTH)
     rows, keys = recorded_sweeps(db, sweeps or cli.runs_of_study(study, db) or ())
-    found = " and ".join(row["sweep_id"] for row in rows)
+    sweep_ids = " and ".join(row["sweep_id"] for row in rows)
     if not keys:
         others = " or ".join(f"--sweep {sweep_id}" for sweep_id in sweeps_with_calls(db))
         raise UsageError(
-            f"the sweep {found} made no call: there is nothing to record. "
+            f"the sweep {sweep_ids} made no call: there is nothing to record. "
             + (f"Name one that did: {others}" if others else f"None in {db} did: programs drove")
         )
     provenance = provenance_of(rows)
     with closing(ResponseCache(cache, read_only=True)) as opened:
         calls = export_recording(file, opened, keys, provenance)
-    say(f"{calls} calls of {found} are in {file}")
+    say(f"{calls} calls of {sweep_ids} are in {file}")
     if plugins := carried_plugins(provenance):
         say(f"with them the whole source of the study's plug-ins: {', '.join(plugins)}")
 
@@ -87,8 +87,8 @@ def recording_verify(file: RecordingFile) -> None:
     """
     from merge_runner.results.recording import summarise
 
-    found = summarise(file)
-    say(f"{file} is whole: {found['calls']} calls, as they were exported")
+    summary = summarise(file)
+    say(f"{file} is whole: {summary['calls']} calls, as they were exported")
 
 
 @recording_app.command("info")
@@ -102,6 +102,6 @@ def recording_info(
     """
     from merge_runner.results.recording import summarise, summary_lines
 
-    found = summarise(file)
-    as_text = json.dumps(found, indent=2, ensure_ascii=False) if as_json else ""
-    print_out(as_text or "\n".join(summary_lines(file, found)))
+    summary = summarise(file)
+    as_text = json.dumps(summary, indent=2, ensure_ascii=False) if as_json else ""
+    print_out(as_text or "\n".join(summary_lines(file, summary)))
