@@ -1,4 +1,4 @@
-"""The program: its commands in the order of ``--help``, and what becomes of an error."""
+"""The program: its commands in the order of ``--help``, and its exit codes."""
 
 from __future__ import annotations
 
@@ -28,6 +28,8 @@ from merge_runner.text_safety import say
 OUTPUT_ERRORS = (errno.ENOSPC, errno.EFBIG, errno.EIO)
 # An error of Click, whose name Typer keeps to itself.
 USAGE: type[typer.BadParameter] = typer.BadParameter.__mro__[2]
+# A user can act on some of them: see _code_and_line.
+EXPECTED = (MergeRunnerError, ModuleNotFoundError, OSError, RuntimeError)
 COMPLETION = "_MERGE_RUNNER_COMPLETE"  # set by the shell's script that typer installs
 
 
@@ -70,10 +72,10 @@ def complete_app() -> typer.Typer:
     return app
 
 
-def alone(command: str | None) -> typer.Typer:
-    """The program with the options of one command, since making those of all takes as long again.
+def app_with_one_command(command: str | None) -> typer.Typer:
+    """Return the program with the options of one command: making those of all takes as long again.
 
-    The others are there by their names and by what they say of themselves.
+    The others are there by their names and their help.
     """
     light = copy(app)
     light.registered_commands = [copy(info) for info in app.registered_commands]
@@ -99,24 +101,24 @@ def main() -> None:
         command = next(words, None)
         if completing or sys.argv[1:2] != [command] or command not in OWN:
             load_commands()
-        run = app if completing else alone(command)
+        run = app if completing else app_with_one_command(command)
         sys.exit(run(prog_name="merge-runner", standalone_mode=False))
     except typer.Abort:
         say("Aborted!")
         sys.exit(1)
-    except Exception as exc:
-        if isinstance(exc, USAGE):
-            exc.show()  # in plain lines: in Typer's boxes a script could not find them
-            sys.exit(exc.exit_code)
-        code, text = _told(exc)
-        if debug or not text:
+    except USAGE as exc:
+        exc.show()  # in plain lines: in Typer's boxes a script could not find them
+        sys.exit(exc.exit_code)
+    except EXPECTED as exc:
+        code, line = _code_and_line(exc)
+        if debug or not line:
             raise
-        say(text)
+        say(line)
         sys.exit(code)
 
 
-def _told(exc: Exception) -> tuple[int, str]:
-    """The exit code and the line of an error that a user can act on; no line for any other."""
+def _code_and_line(exc: Exception) -> tuple[int, str]:
+    """Return the exit code and the line of an error that a user can act on; no line for others."""
     match exc:
         case MergeRunnerError():
             return exc.exit_code, f"error: {exc}"
