@@ -72,7 +72,7 @@ class ClusterRunner:
 
     @property
     def unsaved(self) -> str:
-        """What Ctrl-C waits for, in words."""
+        """Text of what an interrupted run saves before it ends."""
         return f"the replies of {len(self._assigned)} tasks"
 
     async def play(self, specs: Iterable[TrialSpec], ended: Ended, room: Room) -> None:
@@ -110,7 +110,7 @@ class ClusterRunner:
                 await self._collect()
 
     def _take(self, event: tuple[float, tuple[Any, ...]]) -> None:
-        """Hand what a worker tells, with its time, to the chunk that it names first."""
+        """Hand an event of a worker, with its time, to the chunk that it names first."""
         name, *told = event[1]
         for assignment in self._assigned.values():
             if assignment.chunk.name == name:

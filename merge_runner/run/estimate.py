@@ -1,4 +1,4 @@
-"""What a sweep will take, before anything is sent."""
+"""The estimate of a sweep: calls, tokens, cost and time, before anything is sent."""
 
 from __future__ import annotations
 
@@ -52,17 +52,17 @@ def usual_latencies_s(
 ) -> dict[str, float]:
     """Return the median latency of the answers that ``facts`` measured, of the newest of them."""
     like = _asked_as(plan)
-    found: dict[str, list[float]] = {name: [] for name, usage in facts.items() if usage is not None}
-    for call in cache.newest(MOST_READ) if found else ():
+    latencies: dict[str, list[float]] = {name: [] for name, usage in facts.items() if usage}
+    for call in cache.newest(MOST_READ) if latencies else ():
         last = call.attempts[-1]
         (kind,) = kinds_of([(call.request, last)])
         asked = kind.model, kind.endpoint, kind.path, kind.body
         if kind.own and last.latency_s is not None:
-            for name in (name for name in found if like[name] == asked):
-                found[name].append(last.latency_s)
-        if all(len(latencies_s) >= ENOUGH for latencies_s in found.values()):
+            for name in (name for name in latencies if like[name] == asked):
+                latencies[name].append(last.latency_s)
+        if all(len(latencies_s) >= ENOUGH for latencies_s in latencies.values()):
             break
-    return {name: median(latencies_s) for name, latencies_s in found.items() if latencies_s}
+    return {name: median(latencies_s) for name, latencies_s in latencies.items() if latencies_s}
 
 
 def _asked_as(plan: Plan) -> dict[str, tuple[str, str, str, str]]:
@@ -124,9 +124,9 @@ def estimate(
 ) -> Estimate:
     """Return the estimate for the ``trials`` that a live run of a plan has yet to ask for.
 
-    ``calls`` is roughly how many each model has yet to answer, by arm. ``facts`` is what the cache
-    knows about each model's earlier answers to similar requests at its endpoint, ``latencies_s``
-    their median, in place of what the registry says.
+    ``calls`` are roughly those that each model has yet to answer, by arm. ``facts`` are the mean
+    tokens of each model's earlier answers to similar requests at its endpoint, and ``latencies_s``
+    their median latencies, in place of those of the registry.
     """
     number = read = written = 0
     usd = singly_usd = 0.0
@@ -167,20 +167,20 @@ def estimate(
         measured=any(map(facts.get, plan.entries)),
         planned=plan.trials,
         stored=stored,
-        usd_by_model={model: _cents(each) for model, each in by_model.items()},
+        usd_by_model={model: _cents(model_usd) for model, model_usd in by_model.items()},
         output_caps=dict(caps),
     )
 
 
 def _cents(usd: float) -> float | None:
-    """An amount in USD to the cent; None where a price is unknown, which is NaN."""
+    """Round an amount in USD to the cent; None where it is NaN, as of an unknown price."""
     return None if math.isnan(usd) else round(usd, 2)
 
 
 def trial_costs(
     plan: Plan, facts: Mapping[str, Usage | None], *, batch: bool = False
 ) -> Callable[[int], float]:
-    """Return what tells by a trial's order the USD that it is expected to cost, perhaps in batches.
+    """Return a function from a trial's order to its expected cost in USD, perhaps in batches.
 
     They are its usual calls, with a margin, and one worst case, which the last call must be able to
     reserve. ``facts`` is as for ``estimate``.

@@ -51,23 +51,23 @@ class LocalRunner:
 
     @property
     def waits(self) -> Sequence[Wait]:
-        """What the calls wait for that are not in flight."""
+        """The reasons why calls wait that are not in flight."""
         return [wait for client in self.clients.values() for wait in client.waits]
 
     @property
     def held(self) -> int:
-        """How many of the running trials wait for money."""
+        """The number of running trials that wait for money."""
         return len(set().union(*(client.money.waiting for client in self.clients.values())))
 
     def _is_idle(self) -> bool:
-        """Whether no trial goes on by itself: all ask, and wait for the answers to others."""
+        """Return whether all trials wait for answers to others, so that none goes on by itself."""
         idle = sum(client.idle_askers for client in self.clients.values())
         asking = +self._asking  # without the trials that ask nothing now
         return self.running == len(asking) and asking.total() == idle
 
     @property
     def unsaved(self) -> str:
-        """What Ctrl-C waits for, in words."""
+        """Text of what an interrupted run saves before it ends."""
         calls = sum(client.in_flight_calls for client in self.clients.values())
         return f"{calls} calls in flight"
 

@@ -1,4 +1,4 @@
-"""How a sweep runs, as its user asks for it."""
+"""The options of a run, as its user gives them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from merge_runner.config import ModelEntry
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """How a sweep runs; nothing here changes a result.
+    """The options of a run; none of them changes a result.
 
     ``rpm`` and ``tpm`` override the registry's. ``max_cost_usd`` is a cap over ``ledgers``, too,
     those of other sweeps. ``dask`` names the cluster that plays the trials; None: this process. A
@@ -41,14 +41,14 @@ class Options:
 
     @property
     def connections(self) -> int:
-        """How many connections a model may need: both drivers of a trial may ask at once."""
+        """The number of connections that a model may need: both drivers may ask at once."""
         return 2 * self.in_flight
 
     @property
     def sends_nothing(self) -> bool:
-        """Whether no model may be asked."""
+        """True where no model may be asked."""
         return self.replay or self.dry_run
 
     def rates(self, entry: ModelEntry) -> tuple[int | None, int | None]:
-        """The requests and tokens a minute that a model may get; None: no limit."""
+        """Return the requests and tokens a minute that a model may get; None: no limit."""
         return self.rpm or entry.rpm, self.tpm or entry.tpm

@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """What the names in a plan stand for.
+    """The objects that the names in a plan stand for.
 
-    It is found when the plan is made, and not looked up again: another study may give the same
-    names to other things. ``prompts`` are by variant; ``programs``, and the wire ``formats`` of
-    models, are those of its arms. The ``catalogue`` is all that its study adds.
+    They are resolved when the plan is made, and not looked up again: another study may give the
+    same names to other things. ``prompts`` are by variant; ``programs``, and the wire ``formats``
+    of models, are those of its arms. The ``catalogue`` is all that its study adds.
     """
 
     conditions: Mapping[str, Condition] = field(default_factory=dict)
@@ -41,11 +41,11 @@ class Parts:
 
     @property
     def replays_humans(self) -> bool:
-        """Whether a program replays imported human trials."""
+        """True where a program replays imported human trials."""
         return any(program.data is not None for program in self.programs.values())
 
     def with_code(self, arms: Iterable[Arm], catalogue: Catalogue, hint: str = "") -> Parts:
-        """The same with the programs and wire formats of arms; raises UsageError, with a hint."""
+        """Return the same with the programs and wire formats of arms; raises UsageError."""
         asked = {name: arm.entries.get(name) for arm in arms for name in arm.asked.values()}
         with using(catalogue):
             return replace(
@@ -56,12 +56,12 @@ class Parts:
             )
 
     def without_code(self) -> Parts:
-        """The same without what is in a study's plug-ins, which are not everywhere."""
+        """Return the same without the code of plug-ins, which are not installed everywhere."""
         return Parts(self.conditions, self.prompts)
 
     def with_humans(self, connection: DuckDBPyConnection | None) -> Parts:
-        """The same with the human trials of a database, which are replayed; None: it has none."""
-        programs = {name: each.replaying(connection) for name, each in self.programs.items()}
+        """Return the same with the human trials of a database to replay; None: there are none."""
+        programs = {n: program.replaying(connection) for n, program in self.programs.items()}
         return replace(self, programs=programs)
 
     def with_humans_of(self, db: Path | None) -> Parts:
@@ -75,9 +75,9 @@ class Parts:
 def find_parts(
     arms: Sequence[Arm], conditions: Iterable[str], catalogue: Catalogue, hint: str = ""
 ) -> Parts:
-    """What the names in arms and conditions stand for where a catalogue is in use.
+    """Return the objects that the names in arms and conditions stand for, by a catalogue.
 
-    Raises UsageError, with a ``hint``, where that is not known.
+    Raises UsageError, with a ``hint``, for an unknown name.
     """
     with using(catalogue):
         parts = Parts(
@@ -91,5 +91,5 @@ def find_parts(
 
 
 def _read(arm: Arm) -> list[str]:
-    """The variants of the prompts that language models read in an arm."""
+    """Return the variants of the prompts that language models read in an arm."""
     return [arm.prompt(side) for side in SIDES if arm.asked[side] in arm.entries]

@@ -95,17 +95,17 @@ class Plan(BaseModel):
 
     @property
     def scripted(self) -> bool:
-        """Whether the emulator takes part."""
+        """True where the emulator, a mock model, takes part."""
         return any(arm.is_scripted for arm in self.arms)
 
     @property
     def is_free(self) -> bool:
-        """Whether no model costs anything."""
+        """True where no model costs anything."""
         return all(entry.price == "free" for entry in self.entries.values())
 
     @property
     def replays_humans(self) -> bool:
-        """Whether imported human trials are replayed, which only this process has read."""
+        """True where imported human trials are replayed, which only this process has read."""
         return self.parts.replays_humans
 
     @property
@@ -115,11 +115,11 @@ class Plan(BaseModel):
         return ", ".join(dict.fromkeys(pairs))
 
     def by_label(self) -> dict[str, Arm]:
-        """The arms by the labels that their trials carry."""
+        """Return the arms by the labels that their trials carry."""
         return {arm.label: arm for arm in self.arms}
 
     def specs(self) -> dict[str, str]:
-        """Spec hash to the canonical JSON that it covers."""
+        """Return the canonical JSON that each spec hash covers."""
         texts = (self.spec(arm, name) for arm in self.arms for name in self.conditions)
         return {spec_hash(text): text for text in texts}
 

@@ -1,4 +1,4 @@
-"""What a user sees of a sweep while it runs."""
+"""The display of a sweep while it runs."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ CLOSE_IT = "you may close this: the same command goes on"
 
 @dataclass(slots=True)
 class Progress:
-    """Where a sweep stands; ``runner`` plays its trials.
+    """State of a run, as its display shows it; ``runner`` plays its trials.
 
     ``planned`` is the number of all trials, ``stored`` of those that were stored before this run.
     ``todo`` has by arm the others, and ``done`` those of them that have ended.
@@ -66,14 +66,14 @@ class Progress:
     batches: Callable[[], list[str]] = list  # says which batches are waited for
 
     def meter(self) -> Meter:
-        """What the meters of all models have counted."""
-        whole = Meter()
-        for each in self.runner.meters.values():
-            whole.add(each)
-        return whole
+        """Return the counts of all models together."""
+        total = Meter()
+        for meter in self.runner.meters.values():
+            total.add(meter)
+        return total
 
     def snapshot(self, sweep_id: str) -> ProgressSnapshot:
-        """Where the sweep stands now."""
+        """Return the state of the run now."""
         meter = self.meter()
         now = datetime.now(UTC)
         elapsed_s = (now - self.began_at).total_seconds()
@@ -115,7 +115,7 @@ class Progress:
         )
 
     def _left_s(self, elapsed_s: float, ended: int) -> float | None:
-        """The estimated time left in s; None while there is nothing to estimate it from.
+        """Return the estimated time left in s; None while there is nothing to estimate it from.
 
         It is that of the slowest model. Trials that run in step all end late, so early in a run the
         calls are a better basis.
@@ -132,7 +132,7 @@ class Progress:
         return elapsed_s / part - elapsed_s if part else None
 
     def _trials(self, by_arm: Counter[str], model: str) -> int:
-        """How many of these trials a model takes part in."""
+        """Return the number of these trials that a model takes part in."""
         registered = self.plan.registered
         return sum(
             by_arm[arm.label]
@@ -141,9 +141,9 @@ class Progress:
         )
 
     def _shares(self) -> dict[str, float]:
-        """The share of its decisions that each model has made, of those that are left to it.
+        """Return the share of its decisions that each model has made, of those left to this run.
 
-        How many a trial takes is known when it has ended: the share is of the usual number.
+        The number in a trial is known when it has ended: the share is of the usual number.
         """
         expected, made = defaultdict[str, float](float), Counter[str]()
         for arm in self.plan.arms:
@@ -155,7 +155,7 @@ class Progress:
         return {m: min(made[m] / calls, 0.99) for m, calls in expected.items() if calls}
 
     def _decided(self) -> Iterator[str]:
-        """How much of its decisions each model has made, or of all where one drives."""
+        """Yield the share of its decisions that each model has made."""
         shares = self._shares()
         for model, share in shares.items():
             yield f"{f'{model}: ' * (len(shares) > 1)}about {share:.0%} of the decisions"
@@ -170,7 +170,7 @@ class Progress:
             yield from (f"{name}: {underpriced(tier)}" for tier in sorted(meter.underpriced))
 
     def _waits(self) -> list[str]:
-        """How many calls wait, for what, and the latest time until when, if known."""
+        """Return the number of waiting calls by their reason, with the latest end if known."""
         texts = []
         for what, number in Counter(wait.what for wait in self.runner.waits).most_common():
             ends = [w.until for w in self.runner.waits if w.what == what and w.until is not None]
@@ -236,7 +236,7 @@ async def show_progress(
 
 
 def terminal_text(progress: Progress) -> Text:
-    """What is shown on a terminal; text from a server must not be read as markup."""
+    """Return the text on a terminal; text from a server must not be read as markup."""
     from rich.text import Text
 
     mock = " (a mock)" if progress.plan.scripted else ""
@@ -281,7 +281,7 @@ class Log:
 
 
 def _notes(progress: Progress) -> list[str]:
-    """The clients' messages since the last call: each once, and the first SHOWN."""
+    """Return the clients' messages since the last call: each once, and the first few."""
     notes: dict[str, None] = {}
     for meter in progress.runner.meters.values():
         notes |= dict.fromkeys(meter.notes)

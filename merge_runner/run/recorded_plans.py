@@ -1,4 +1,4 @@
-"""The plans that lie within a recording, which replay it without a file of their study."""
+"""The plans in a recording, which replay it without a file of their study."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def _with_parts(plan: Plan, db: Path, *, trust: bool) -> Plan:
 
 
 def _of_a_known_study(file: Path, name: str, config: dict[str, object], db: Path) -> Plan:
-    """The plan of an early recording, which names its study and does not hold it."""
+    """Return the plan of an early recording, which names its study and does not hold it."""
     if name not in study_files():
         raise UsageError(
             f"{file} is of the study {name}, and does not hold it: `merge-runner replay STUDY.toml "

@@ -27,9 +27,9 @@ from merge_runner.run.plan import Plan
 async def with_names(
     plan: Plan, options: Options, cache: ResponseCache, say: Callable[[str], None]
 ) -> Plan:
-    """The plan with its models' names, and in a replay the endpoints where they are recorded.
+    """Return the plan with its models' names, and in a replay with the recorded endpoints.
 
-    A model's name is as told, as recorded, or as its server says. Raises UsageError.
+    A model's name is that of its entry, its recorded replies or its server. Raises UsageError.
     """
     entries, endpoints = dict(plan.entries), dict(plan.endpoints)
     for name, entry in entries.items():
@@ -57,7 +57,7 @@ async def with_names(
 
 
 async def _served_name(name: str, entry: ModelEntry, *, say: Callable[[str], None]) -> str:
-    """The one model that a server lists; raises ProviderDown where nobody listens, UsageError."""
+    """Return the one model that a server lists; raises ProviderDown and UsageError."""
     # Imports httpx, which no replay needs.
     from merge_runner.llm.http import LIST_TIMEOUT_S, listed_models
 

@@ -70,12 +70,12 @@ class Flusher:
 
     @property
     def left(self) -> int:
-        """How many trials are not stored yet."""
+        """The number of trials that are not stored yet."""
         return len(self._pending) + len(self.dropped)
 
     @property
     def problem(self) -> str:
-        """Why trials are not stored, as a line of text; empty where nothing is wrong."""
+        """The reason why trials are not stored, as text; empty where nothing is wrong."""
         if self._problem is None:
             return ""
         what = f"{self.left} trials wait" if self.left else "how the sweep ended waits"
