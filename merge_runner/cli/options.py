@@ -41,7 +41,7 @@ def beside_study(ctx: typer.Context, param: typer.CallbackParam, path: Path) -> 
     if source is None or source.name != "DEFAULT":
         return path
     study = next(filter(None, map(ctx.params.get, ("studies", "name", "study", "study_file"))), "")
-    homes = {home_of(each) for each in ([study] if isinstance(study, str) else study)}
+    homes = {home_of(name) for name in ([study] if isinstance(study, str) else study)}
     if len(homes) > 1:
         raise UsageError(
             f"{', '.join(study)} have their results in different folders: play them one at a time, "

@@ -75,8 +75,8 @@ def recording_import(
 
     take = import_folder if file.is_dir() else import_recording
     with closing(ResponseCache(cache)) as opened:
-        added, there = take(file, opened)
-    say(f"{added} calls added to {cache}, {there} were there already")
+        added, known = take(file, opened)
+    say(f"{added} calls added to {cache}, {known} were there already")
 
 
 @recording_app.command("verify")

@@ -47,7 +47,7 @@ class ClusterRunner:
     """Plays trials on the workers of a cluster, each of which gets one chunk at a time."""
 
     waits: Sequence[Wait] = ()
-    held = 0
+    waiting_for_money = 0
 
     def __init__(self, client: Client, setup: RunSetup, ledger: Ledger) -> None:
         self.meters = {name: Meter() for name in setup.plan.entries}
@@ -111,17 +111,17 @@ class ClusterRunner:
 
     def _take(self, event: tuple[float, tuple[Any, ...]]) -> None:
         """Hand an event of a worker, with its time, to the chunk that it names first."""
-        name, *told = event[1]
+        name, *message = event[1]
         for assignment in self._assigned.values():
             if assignment.chunk.name == name:
-                assignment.events.put_nowait(tuple(told))
+                assignment.events.put_nowait(tuple(message))
 
     async def _give(self, address: str) -> None:
         """Give a chunk to a worker, unless those under way still hold all shares."""
         setup, options = self._setup, self._setup.options
         slots = 1 if self._one_by_one else min(self.workers, options.in_flight)
-        held = sum(assignment.chunk.share for assignment in self._assigned.values())
-        if held + 1 / slots > 1.001:
+        shares = sum(assignment.chunk.share for assignment in self._assigned.values())
+        if shares + 1 / slots > 1.001:
             return
         in_flight, idle = options.in_flight // slots, max(1, slots - len(self._assigned))
         size = min(TRIALS_PER_SLOT * in_flight, math.ceil(sum(map(len, self._groups)) / idle))
@@ -166,8 +166,8 @@ class ClusterRunner:
             name, cap_usd = assignment.chunk.name, self._setup.options.max_cost_usd
             while (answers := await assignment.book(self._ledger, cap_usd)) is not None:
                 if answers:
-                    told = answer, self._setup.run, name, answers
-                    await run(*told, workers=workers, on_error="ignore")
+                    arguments = answer, self._setup.run, name, answers
+                    await run(*arguments, workers=workers, on_error="ignore")
 
         played, _ = await asyncio.gather(play(), book())
         return played

@@ -66,7 +66,7 @@ class Played:
 
 @dataclass(eq=False)
 class Assignment:
-    """A chunk on a worker, the events that it tells, and the money of its attempts.
+    """A chunk on a worker, its events, and the money of its attempts.
 
     An event is a kind, an attempt's number, USD and an Asked; after the last one comes None.
     ``usd`` is by attempt its worst case, or its cost where that is known. The rows ``booked`` are
@@ -92,9 +92,9 @@ class Assignment:
         events = [await self.events.get()]
         while not self.events.empty():
             events.append(self.events.get_nowait())
-        told = [event for event in events if event is not None]
+        messages = [event for event in events if event is not None]
         operations = list[Operation]()
-        for kind, number, usd, asked in told:
+        for kind, number, usd, asked in messages:
             attempt = self.chunk.name, number, usd
             if kind == "reserve":
                 operations.append(partial(ledger.reserve, *attempt, cap_usd, Asked(*asked)))
@@ -102,14 +102,14 @@ class Assignment:
                 operations.append(partial(ledger.pay, *attempt, Asked(*asked).driver))
         results = await asyncio.gather(*map(ledger.store.write, operations))
         answers = dict[int, bool]()
-        for (kind, number, usd, _), result in zip(told, results, strict=True):
+        for (kind, number, usd, _), result in zip(messages, results, strict=True):
             if kind == "reserve":
                 answers[number] = result
             else:
                 self.booked.append(result)
             if result:
                 self.usd[number] = usd
-        return answers if len(told) == len(events) else None
+        return answers if len(messages) == len(events) else None
 
 
 async def recorded_calls(plan: Plan, cache: ResponseCache, specs: Sequence[TrialSpec]) -> Recorded:

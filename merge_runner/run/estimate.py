@@ -37,12 +37,12 @@ def earlier_answers(plan: Plan, cache: ResponseCache) -> dict[str, Usage | None]
     None: the endpoint has answered, but no such request; a model whose endpoint has never answered
     is missing. No mock model's answers count, and none that leaves its tokens out.
     """
-    like = _asked_as(plan)
+    templates = _request_templates(plan)
     sums: dict[str, Answers] = {}
     for kind, answers in chain.from_iterable(kinds.items() for kinds in counted(cache)):
         asked = kind.model, kind.endpoint, kind.path, kind.body
-        for name in (name for name, wanted in like.items() if wanted[:2] == asked[:2]):
-            counts = kind.own and like[name] == asked
+        for name in (name for name, template in templates.items() if template[:2] == asked[:2]):
+            counts = kind.own and templates[name] == asked
             sums[name] = sums.get(name, Answers()).plus(answers if counts else Answers())
     return {name: _mean(answers) for name, answers in sums.items()}
 
@@ -51,22 +51,22 @@ def usual_latencies_s(
     plan: Plan, cache: ResponseCache, facts: Mapping[str, Usage | None]
 ) -> dict[str, float]:
     """Return the median latency of the answers that ``facts`` measured, of the newest of them."""
-    like = _asked_as(plan)
+    templates = _request_templates(plan)
     latencies: dict[str, list[float]] = {name: [] for name, usage in facts.items() if usage}
     for call in cache.newest(MOST_READ) if latencies else ():
         last = call.attempts[-1]
         (kind,) = kinds_of([(call.request, last)])
         asked = kind.model, kind.endpoint, kind.path, kind.body
         if kind.own and last.latency_s is not None:
-            for name in (name for name in latencies if like[name] == asked):
+            for name in (name for name in latencies if templates[name] == asked):
                 latencies[name].append(last.latency_s)
         if all(len(latencies_s) >= ENOUGH for latencies_s in latencies.values()):
             break
     return {name: median(latencies_s) for name, latencies_s in latencies.items() if latencies_s}
 
 
-def _asked_as(plan: Plan) -> dict[str, tuple[str, str, str, str]]:
-    """Return the id, endpoint, path and body without a prompt by which each model is asked."""
+def _request_templates(plan: Plan) -> dict[str, tuple[str, str, str, str]]:
+    """Return by model the id, endpoint, path and body of its requests, all but the prompt."""
     asked = {}
     for name, entry in plan.entries.items():
         sent = plan.parts.formats[entry.format].request(entry, "")

@@ -18,8 +18,8 @@ def _output_caps(expected: Estimate) -> Iterator[str]:
     if caps:
         same = len({*caps.values()}) == 1
         most = [f"{n}{'' if same else f' with {model}'}" for model, n in caps.items()]
-        each = ", ".join(most[:1] if same else most)
-        yield f"        a reply is cut off at {each} output tokens (max_output_tokens)"
+        shown = ", ".join(most[:1] if same else most)
+        yield f"        a reply is cut off at {shown} output tokens (max_output_tokens)"
 
 
 def _by_model(expected: Estimate) -> Iterator[str]:
@@ -53,16 +53,19 @@ def shown_prompts(plan: Plan) -> list[dict[str, Any]]:
     for arm in plan.arms:
         for name, text in prompts_of(plan, arm).items():
             sides = [s for s in SIDES if arm.asked[s] in arm.entries and arm.prompt(s) == name]
-            who = "both drivers" if len(sides) == len(SIDES) else f"the {sides[0]} driver"
-            readers.setdefault((name, text), []).append(f"{who} of {arm.label}")
-    return [{"prompt": name, "read_by": who, "text": text} for (name, text), who in readers.items()]
+            drivers = "both drivers" if len(sides) == len(SIDES) else f"the {sides[0]} driver"
+            readers.setdefault((name, text), []).append(f"{drivers} of {arm.label}")
+    return [
+        {"prompt": name, "read_by": drivers, "text": text}
+        for (name, text), drivers in readers.items()
+    ]
 
 
 def shown_prompt_lines(plan: Plan) -> Iterator[str]:
     """Yield each prompt of a plan as text, with the numbers of one situation."""
-    for each in shown_prompts(plan):
-        who = "; ".join(first_of(each["read_by"], "others"))
-        yield f"\nprompt  {each['prompt']}, read by {who}:\n{each['text']}"
+    for prompt in shown_prompts(plan):
+        readers = "; ".join(first_of(prompt["read_by"], "others"))
+        yield f"\nprompt  {prompt['prompt']}, read by {readers}:\n{prompt['text']}"
 
 
 def estimate_lines(expected: Estimate) -> Iterator[str]:

@@ -55,7 +55,7 @@ class LocalRunner:
         return [wait for client in self.clients.values() for wait in client.waits]
 
     @property
-    def held(self) -> int:
+    def waiting_for_money(self) -> int:
         """The number of running trials that wait for money."""
         return len(set().union(*(client.money.waiting for client in self.clients.values())))
 

@@ -214,10 +214,10 @@ def make_plan(
     with using(catalogue):
         _check_primary(file.primary)
         registry = load_models(study.path.parent)
-        wanted = selected_repetitions(study, variants, repetitions)
+        selected = selected_repetitions(study, variants, repetitions)
         names = selected_conditions(file, conditions)
         arms = cross(
-            file, drivers, wanted, registry, only or {}, conditions=len(names), mirror=mirror
+            file, drivers, selected, registry, only or {}, conditions=len(names), mirror=mirror
         )
         entries = {name: entry for arm in arms for name, entry in arm.entries.items()}
         endpoints = {name: endpoint_identity(entry) for name, entry in entries.items()}
@@ -229,7 +229,7 @@ def make_plan(
         name=f"{study.name}-first" if first else study.name,
         study=study,
         model=",".join(map("+".join, pairs)),
-        levels=listed_levels(file, (arm.model_level for arm in arms), wanted),
+        levels=listed_levels(file, (arm.model_level for arm in arms), selected),
         description=file.description,
         arms=tuple(arms),
         entries=entries,

@@ -84,9 +84,9 @@ class Progress:
         left_s = None if batches else self._left_s(elapsed_s, ended + failed)
         before = f" (+{self.stored} stored before)" if self.stored else ""
         workers = "" if self.runner.workers is None else f" on {self.runner.workers} workers"
-        held = self.runner.held
-        running = f"{max(0, self.runner.running - held)} running{workers}"
-        running += f", {held} wait for money" if held else ""
+        waiting = self.runner.waiting_for_money
+        running = f"{max(0, self.runner.running - waiting)} running{workers}"
+        running += f", {waiting} wait for money" if waiting else ""
         total = self.planned - self.stored
         trials = f"{ended + failed}/{total} ended{before}, {running}"
         cost = f"{meter.cost_usd:.2f} USD"
@@ -172,10 +172,10 @@ class Progress:
     def _waits(self) -> list[str]:
         """Return the number of waiting calls by their reason, with the latest end if known."""
         texts = []
-        for what, number in Counter(wait.what for wait in self.runner.waits).most_common():
-            ends = [w.until for w in self.runner.waits if w.what == what and w.until is not None]
+        for reason, number in Counter(wait.what for wait in self.runner.waits).most_common():
+            ends = [w.until for w in self.runner.waits if w.what == reason and w.until is not None]
             until = f" until {max(ends):%H:%M:%S} UTC" if ends else ""
-            texts.append(f"{number} {what}{until}")
+            texts.append(f"{number} {reason}{until}")
         return first_of(texts, "other reasons", REASONS_SHOWN)
 
 
@@ -248,23 +248,23 @@ def terminal_text(progress: Progress) -> Text:
 
 @dataclass
 class Log:
-    """The progress as short lines, where no terminal shows it: without what is as it should be.
+    """The progress as short lines, where no terminal shows it: only what is out of the ordinary.
 
-    What is a warning, or may be known once, is a line of its own.
+    A warning, or what may be known once, is a line of its own.
     """
 
-    said: str = ""
-    once: set[str] = field(default_factory=set)
+    last_line: str = ""
+    shown_once: set[str] = field(default_factory=set)
 
     def show(self, progress: Progress) -> None:
-        """Say where the sweep stands; once the trials have ended, only what is new."""
+        """Print the state of the run; once the trials have ended, only what is new."""
         snapshot = progress.snapshot("")
         for name, text in snapshot.rows:
             # Numbers of the same warning change.
-            same = re.sub(r"\d+", "", text)
-            if (name == "WARNING" or text == CLOSE_IT) and same not in self.once:
+            kind = re.sub(r"\d+", "", text)
+            if (name == "WARNING" or text == CLOSE_IT) and kind not in self.shown_once:
                 say(f"{name}: {text}")
-                self.once.add(same)
+                self.shown_once.add(kind)
         rows = dict(reversed(snapshot.rows))  # the first of each name
         ended = snapshot.ended + snapshot.failed - progress.stored
         workers = progress.runner.workers
@@ -272,12 +272,12 @@ class Log:
         line += "" if workers is None else f" on {workers} workers"
         line += f"; failed: {snapshot.failed}" if snapshot.failed else ""
         line += f"; cost: {rows['cost']}" if snapshot.cost_usd >= CENT_USD else ""
-        if line != self.said or progress.doing == "playing":
+        if line != self.last_line or progress.doing == "playing":
             waits = f"; waiting: {rows['waiting']}" if "waiting" in rows else ""
             say(
                 textwrap.shorten(f"{line}; {rows['time']}{waits}", LONGEST_LINE, placeholder=" ...")
             )
-        self.said = line
+        self.last_line = line
 
 
 def _notes(progress: Progress) -> list[str]:

@@ -23,7 +23,7 @@ class Replay:
     plan: Plan
     calls: Calls
     running: int = 0
-    held: int = 0
+    waiting_for_money: int = 0
     waits: Sequence[Wait] = ()
     workers: None = None
     unsaved: str = "0 calls in flight"

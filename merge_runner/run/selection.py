@@ -56,8 +56,8 @@ def _axis(text: str) -> tuple[str, list[float]]:
 
 def selected_conditions(file: StudyFile, chosen: Sequence[str] | None) -> tuple[str, ...]:
     """Return the names of the conditions, each once; raises UsageError where none is left."""
-    wanted = next(c for c in (chosen, file.conditions, HUMAN_CONDITIONS) if c is not None)
-    names = (HUMAN_CONDITIONS if each == EVERY_CONDITION else (each,) for each in wanted)
+    selected = next(c for c in (chosen, file.conditions, HUMAN_CONDITIONS) if c is not None)
+    names = (HUMAN_CONDITIONS if name == EVERY_CONDITION else (name,) for name in selected)
     if conditions := tuple(dict.fromkeys(chain.from_iterable(names))):
         return conditions
     raise UsageError(f"no condition is left; valid: {', '.join(CONDITIONS)}")
@@ -69,14 +69,14 @@ def selected_repetitions(
     """Return the selected prompts with their repetitions per condition; raises UsageError."""
     if chosen is not None and not 1 <= chosen <= MOST_REPETITIONS:
         raise UsageError(f"--reps is a whole number from 1 to {MOST_REPETITIONS}")
-    given, wanted = study.file.repetitions, {}
+    given, selected = study.file.repetitions, {}
     for variant in file_prompts(study.file) if variants is None else variants:
         VARIANTS.require(variant)
         blocks_of(variant)  # raises where it names a block that there is not
-        wanted[variant] = chosen or given.get(variant, given.get(EVERY_PROMPT, 0))
-    if wanted and all(wanted.values()):
-        return wanted
-    lacking = "".join(f" {variant}" for variant, repetitions in wanted.items() if not repetitions)
+        selected[variant] = chosen or given.get(variant, given.get(EVERY_PROMPT, 0))
+    if selected and all(selected.values()):
+        return selected
+    lacking = "".join(f" {variant}" for variant, repetitions in selected.items() if not repetitions)
     raise UsageError(
         f"the sweep {study.name} has no variant{lacking}; valid: {', '.join(VARIANTS)}. With "
         "--reps N any variant can be run."

@@ -112,13 +112,12 @@ def _others_under_the_cap(
     """
     if options.max_cost_usd is None:
         return []
-    own, study = plan.ledger, plan.study.name
-    others = [
-        scope
-        for scope in scopes(cache)
-        if scope != own
-        and (scope in options.ledgers or (study in (own, scope) and scope.split("/")[0] == study))
-    ]
+    ledger, study = plan.ledger, plan.study.name
+    others = []
+    for scope in scopes(cache):
+        is_same_study = study in (ledger, scope) and scope.split("/")[0] == study
+        if scope != ledger and (scope in options.ledgers or is_same_study):
+            others.append(scope)
     if spent_usd := sum(Ledger(cache, scope).read().committed_usd for scope in others):
         say(f"{spent_usd:.4f} USD of {', '.join(others)} count against the budget, too")
     return others

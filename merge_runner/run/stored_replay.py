@@ -95,8 +95,8 @@ def audit_database(
             _audit(connection, name, config, recorded, finished=finished)
             for name, config, finished in sweeps.values()
         ]
-        rest = [check_rest(connection, path)] if sweep_ids is None else []
-        return [*reversed(audits), *rest]
+        orphans = [check_rest(connection, path)] if sweep_ids is None else []
+        return [*reversed(audits), *orphans]
 
 
 def refuse_changed_programs(path: Path, plan: Plan, stored: Sequence[TrialSpec]) -> None:
@@ -122,8 +122,8 @@ def refuse_changed_programs(path: Path, plan: Plan, stored: Sequence[TrialSpec])
                 last = max((row[step] for row in driven), default=-1)
                 known = [row for row in states.rows.get(key, ()) if row[step] <= last]
                 states = replace(states, rows={key: known})
-            found = states.differences(key, driven, tolerance=TOLERANCE)
-            if difference := next(iter(found), None):
+            differences = states.differences(key, driven, tolerance=TOLERANCE)
+            if difference := next(iter(differences), None):
                 raise UsageError(
                     f"{' or '.join(programs[record.spec.arm])} drives otherwise than in the trial "
                     f"{key[0]} of {path} ({difference.text}): give its class another `revision`, "
@@ -210,12 +210,12 @@ def _replayable(
     """
     hashes = dict(connection.execute("SELECT trial_id, spec_hash FROM audited").fetchall())
     stored = dict(connection.execute("SELECT spec_hash, spec::VARCHAR FROM specs").fetchall())
-    wanted = plan.specs()
+    planned = plan.specs()
     for spec in specs:
         actual = hashes.get(spec.trial_id, spec.spec_hash)
         if actual == spec.spec_hash:
             continue
-        texts = (stored.get(actual, "{}"), wanted[spec.spec_hash])
+        texts = (stored.get(actual, "{}"), planned[spec.spec_hash])
         old, new = (dict(leaves(json.loads(text))) for text in texts)
         names = sorted(name for name in {**old, **new} if old.get(name) != new.get(name))
         if all(name.startswith(OF_THE_PROGRAM) for name in names):
@@ -340,7 +340,7 @@ def _findings(
     if kind == "replay":
         ignored |= {name.removeprefix("calls.") for name in NOT_REPLAYED}
     for table, rows in rows_of(record).items():
-        found = tables[table].differences(key, rows, ignored=ignored, tolerance=TOLERANCE)
-        for difference in found:
-            where = (difference.place.get(name) for name in ("side", "decision"))
-            yield Finding(kind, difference.text, sweep_id, key[0], *where)
+        stored_rows = tables[table]
+        for difference in stored_rows.differences(key, rows, ignored=ignored, tolerance=TOLERANCE):
+            place = (difference.place.get(name) for name in ("side", "decision"))
+            yield Finding(kind, difference.text, sweep_id, key[0], *place)

@@ -143,11 +143,8 @@ def _outcomes(summary: dict[str, Any]) -> str:
         for outcome, number in whole.items()
         if isinstance(number, int) and number
     ]
-    return (
-        f"trials: {trials}{of}"
-        + (f" ({', '.join(outcome_counts)})" if outcome_counts else "")
-        + before
-    )
+    outcomes = f" ({', '.join(outcome_counts)})" if outcome_counts else ""
+    return f"trials: {trials}{of}{outcomes}{before}"
 
 
 def calls_text(live: int, cached: int, shared: int, recorded: int) -> str:

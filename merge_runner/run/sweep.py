@@ -87,9 +87,9 @@ async def run(
     if misses := [miss for record in ahead for miss in misses_of(record)]:
         progress = _progress(session, replay)
         session.fail_by_misses(misses)
-        held = described(options.recordings, session.cache.entries())
+        contents = described(options.recordings, session.cache.entries())
         session.messages.append(
-            f"nothing of this replay is recorded, and nothing is stored: {held}"
+            f"nothing of this replay is recorded, and nothing is stored: {contents}"
         )
     else:
         async with AsyncExitStack() as stack:
@@ -187,9 +187,10 @@ async def unsent(
 
 def _has_replies(cache: ResponseCache, plan: Plan) -> bool:
     """Return whether a model of a plan is recorded, or it has none; damaged replies may be its."""
-    models, (_, kinds) = {entry.id or UNNAMED for entry in plan.entries.values()}, counted(cache)
-    whole = sum(answers.answers for answers in kinds.values())
-    return any(kind.model in models for kind in kinds) or cache.number > whole or not models
+    models = {entry.id or UNNAMED for entry in plan.entries.values()}
+    _, kinds = counted(cache)
+    are_damaged = cache.number > sum(answers.answers for answers in kinds.values())
+    return any(kind.model in models for kind in kinds) or are_damaged or not models
 
 
 def _recorded_part(plan: Plan, recordings: Sequence[Path]) -> Plan:
@@ -198,14 +199,14 @@ def _recorded_part(plan: Plan, recordings: Sequence[Path]) -> Plan:
     A sweep's recording holds its first situations, too.
     """
     names = {plan.study.name, plan.name}
-    held = recorded_part(recordings, names, plan.model, plan.sample_set)
-    if held is None:
+    recorded = recorded_part(recordings, names, plan.model, plan.sample_set)
+    if recorded is None:
         return plan
-    arms = tuple(
-        replace(arm, repetitions=min(arm.repetitions, held.repetitions[arm.variant]))
-        for arm in plan.arms
-        if held.repetitions.get(arm.variant) and (not held.arms or arm.label in held.arms)
-    )
-    conditions = tuple(name for name in plan.conditions if name in held.conditions)
-    part = plan.model_copy(update={"arms": arms, "conditions": conditions})
+    arms = []
+    for arm in plan.arms:
+        most = recorded.repetitions.get(arm.variant)
+        if most and (not recorded.arms or arm.label in recorded.arms):
+            arms.append(replace(arm, repetitions=min(arm.repetitions, most)))
+    conditions = tuple(name for name in plan.conditions if name in recorded.conditions)
+    part = plan.model_copy(update={"arms": tuple(arms), "conditions": conditions})
     return part if part.trials else plan

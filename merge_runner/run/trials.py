@@ -41,7 +41,7 @@ class Player(Protocol):
         """The number of trials under way."""
 
     @property
-    def held(self) -> int:
+    def waiting_for_money(self) -> int:
         """The number of them that wait for money, as far as this process knows."""
 
     @property

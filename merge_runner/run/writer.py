@@ -78,8 +78,8 @@ class Flusher:
         """The reason why trials are not stored, as text; empty where nothing is wrong."""
         if self._problem is None:
             return ""
-        what = f"{self.left} trials wait" if self.left else "how the sweep ended waits"
-        return f"{what} to be stored: {self._problem}"
+        waiting = f"{self.left} trials wait" if self.left else "how the sweep ended waits"
+        return f"{waiting} to be stored: {self._problem}"
 
     async def close(self) -> None:
         """Store the trials in memory, and leave the database reachable.
@@ -89,15 +89,15 @@ class Flusher:
         """
         self._closing = True
         await self._task
-        said = False
+        is_announced = False
         while not await self._flush() or self._pending:
             if isinstance(self._problem, StoreLocked):
-                if not said:
+                if not is_announced:
                     self._say(
                         f"the playing has ended; {self.problem}. Ctrl-C ends the waiting: all "
                         "replies are in the cache"
                     )
-                said = True
+                is_announced = True
                 await asyncio.sleep(EVERY_S)
             elif self._problem and self.left:
                 raise StoreError(f"{self.left} trials are not stored: {self._problem}. {AGAIN}")

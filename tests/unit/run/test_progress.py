@@ -104,7 +104,7 @@ def test_the_time_left_is_that_of_the_slowest_model_that_has_trials_left():
 
 
 def test_trials_that_wait_for_money_are_not_running():
-    waiting = dict(rows(progress(runner(running=105, held=103))))
+    waiting = dict(rows(progress(runner(running=105, waiting_for_money=103))))
     assert waiting["trials"] == "0/10 ended, 2 running, 103 wait for money"
 
 
