@@ -60,7 +60,7 @@ def ledger(
 
 
 def _release(cache: ResponseCache, name: str, *, yes: bool) -> None:
-    """Release what is set aside under the name of a sweep, once the user agrees."""
+    """Release the reservations of a sweep, once the user agrees."""
     from merge_runner.llm.ledger import Ledger
 
     ledger = Ledger(cache, name)

@@ -36,7 +36,7 @@ ASKED = {"rich_help_panel": "Questions and output"}
 
 
 def beside_study(ctx: typer.Context, param: typer.CallbackParam, path: Path) -> Path:
-    """Put a default beside the study's file, from wherever it is started."""
+    """Return the default path next to the study's file; a path that is given stays."""
     source = ctx.get_parameter_source(str(param.name))
     if source is None or source.name != "DEFAULT":
         return path

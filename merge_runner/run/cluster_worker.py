@@ -130,7 +130,7 @@ async def play_chunk(program: str, pickled: bytes, *, dask_worker: Worker) -> Pl
         return Played(error=differs)
     # Dask's profiler samples all threads; Python 3.11 can deadlock there.
     dask_worker.periodic_callbacks["profile"].stop()
-    chunk: Chunk = pickle.loads(pickled)  # noqa: S301 # whoever reaches a scheduler can run code
+    chunk: Chunk = pickle.loads(pickled)  # noqa: S301 # a scheduler runs any code
     state = _state(chunk.setup.run, dask_worker)
     try:
         if state.plan is None:

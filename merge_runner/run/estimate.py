@@ -87,8 +87,9 @@ def _mean(answers: Answers) -> Usage | None:
 class Estimate:
     """A live run's drivers, trials, calls, tokens, USD (None: a price is unknown) and minutes.
 
-    They are ``measured`` where tokens are those of earlier answers. Calls that are asked singly
-    cost ``singly_usd``; in batches they cost less, and take so many ``rounds`` in place of minutes.
+    They are ``measured`` where tokens are those of earlier answers. Sent as normal
+    requests, calls cost ``singly_usd``; in batches they cost less, and take so many ``rounds`` in
+    place of minutes.
     ``usd_by_model`` has the models of the registry. Of ``planned`` trials some are ``stored``.
     A cap leaves ``left_usd`` of what it covers; without one that is None. ``output_caps`` are the
     most tokens that a reply of each model may have.

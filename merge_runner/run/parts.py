@@ -1,4 +1,4 @@
-"""The objects that the names in a plan stand for."""
+"""The resolved objects of a plan: conditions, prompts, programs and wire formats."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """The objects that the names in a plan stand for.
+    """The objects of a plan, by their names in it.
 
     They are resolved when the plan is made, and not looked up again: another study may give the
     same names to other things. ``prompts`` are by variant; ``programs``, and the wire ``formats``
@@ -75,7 +75,7 @@ class Parts:
 def find_parts(
     arms: Sequence[Arm], conditions: Iterable[str], catalogue: Catalogue, hint: str = ""
 ) -> Parts:
-    """Return the objects that the names in arms and conditions stand for, by a catalogue.
+    """Resolve the names in arms and conditions by a catalogue.
 
     Raises UsageError, with a ``hint``, for an unknown name.
     """

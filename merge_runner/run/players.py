@@ -18,7 +18,7 @@ from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.session import Session
 from merge_runner.run.trials import Player
 
-# Trials under way in a batch run: one that waits for a round takes up nobody's time, but memory.
+# Trials under way in a batch run: one that waits for a round takes no time, but memory.
 MOST_IN_ROUNDS = 10_000
 
 

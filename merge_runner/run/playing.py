@@ -108,7 +108,7 @@ async def _play(endings: Endings, stopping: Stopping) -> bool:
     with stopping(interrupted, drain.cancel):
         try:
             await asyncio.wait([drain])
-        except asyncio.CancelledError:  # by whoever runs this task
+        except asyncio.CancelledError:  # by the caller of this task
             cancelled = True
             interrupted()
             await asyncio.wait([drain])

@@ -80,7 +80,7 @@ class Progress:
         failed = self.outcome_counts["failed"]
         ended = self.outcome_counts.total() - self.outcome_counts["suspended"] - failed
         batches = first_of(self.batches(), "others", REASONS_SHOWN)
-        # How long a batch takes nobody knows.
+        # The time that a batch takes is unknown.
         left_s = None if batches else self._left_s(elapsed_s, ended + failed)
         before = f" (+{self.stored} stored before)" if self.stored else ""
         workers = "" if self.runner.workers is None else f" on {self.runner.workers} workers"

@@ -1,4 +1,4 @@
-"""The progress of a sweep in a small file beside the database, for other processes."""
+"""The progress of a sweep in a small file next to the database, for other processes."""
 
 from __future__ import annotations
 

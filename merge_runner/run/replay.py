@@ -31,7 +31,7 @@ class Replay:
     _ahead: dict[int, TrialRecord] = field(default_factory=dict)  # by order, until it is their turn
 
     def __post_init__(self) -> None:
-        """Find out which models are asked."""
+        """Make the models of the plan."""
         plan, formats = self.plan, self.plan.parts.formats
         self._trials = TrialMaker(plan)
         self._models = {
@@ -48,7 +48,7 @@ class Replay:
         return played or play_trial(self._trials.make(spec), self._decide)
 
     async def look_ahead(self, specs: Sequence[TrialSpec]) -> list[TrialRecord]:
-        """Play trials until a reply is found, and return them where none is.
+        """Play trials until one has a recorded reply, and return them where none has.
 
         They are not played again. Where no model is asked, there is nothing to find out.
         """

@@ -16,7 +16,7 @@ def trial_id(arm: Arm, condition: str, repetition: int, *, sample_set: int, seat
     """Return the id of a trial of an arm."""
     begin = "seat/" if seat else ""
     set_ = f"/set{sample_set}" if sample_set else ""
-    # The prompt and the opponent stand in it already.
+    # The prompt and the opponent are in it already.
     levels = "".join(
         f"/{name}={in_a_name(level)}"
         for name, level in sorted(arm.factors.items())
@@ -32,8 +32,8 @@ def spec_text(
 ) -> str:
     """Return the canonical JSON of what determines a trial of an arm.
 
-    It leaves out its condition's headway and relative velocity. These stand in its row, where a
-    change of them is refused; another mean speed does not.
+    It leaves out its condition's headway and relative velocity. These are in its row, where a
+    change of them is refused; the mean speed is not.
     """
     mean_speed_mps = parts.conditions[condition].mean_speed_mps
     spec: dict[str, object] = {

@@ -300,7 +300,7 @@ def _attempt(number: int, row: Mapping[str, Any], form: WireFormat) -> Attempt:
     """Read the reply of a row anew.
 
     A failed attempt is taken as it is stored: its outcome depends on headers, which are not. The
-    mark of a stand-in may have been a header too, so that a stored ``scripted`` is believed.
+    mark of a mock model may have been a header too, so that a stored ``scripted`` is believed.
     """
     body = row["reply"]
     with suppress(TypeError, ValueError, RecursionError):

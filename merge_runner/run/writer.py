@@ -102,7 +102,7 @@ class Flusher:
             elif self._problem and self.left:
                 raise StoreError(f"{self.left} trials are not stored: {self._problem}. {AGAIN}")
             elif self._problem:
-                return  # whoever opens the database next will say what is wrong with it
+                return  # the next command that opens the database reports it
 
     @property
     def _bytes(self) -> int:
