@@ -34,14 +34,14 @@ class Endings:
 
     def add(self, spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
         """Take a trial that has ended, or is suspended for lack of money."""
-        counts = self.progress.outcome_counts
+        counts = self.progress.trials.outcome_counts
         if isinstance(record, TrialSuspended):
             counts["suspended"] += 1
             self.suspended[_played_as(spec)] += 1
             self.why_suspended = str(record)
             return
         counts[record.status] += 1
-        self.progress.done[spec.arm] += 1
+        self.progress.trials.done[spec.arm] += 1
         self.misses += misses_of(record)
         self.flusher.add(record)
 
@@ -59,7 +59,7 @@ class Endings:
 
     def note_failed(self) -> None:
         """Note the trials that failed, by what they lack where that is known."""
-        failed = self.progress.outcome_counts["failed"]
+        failed = self.progress.trials.outcome_counts["failed"]
         self.session.fail_by_misses(self.misses)
         if failed and not self.misses:
             self.session.fail(1, f"{failed} trials failed")
@@ -74,7 +74,7 @@ async def play_and_store(
     program holds, and whether the task that runs it was cancelled.
     """
     endings = Endings(session, progress, flusher)
-    progress.unstored = lambda: flusher.problem
+    progress.trials.unstored = lambda: flusher.problem
     try:
         cancelled = await _play(endings, stopping)
         endings.note_suspended()

@@ -40,30 +40,39 @@ CLOSE_IT = "you may close this: the same command goes on"
 
 
 @dataclass(slots=True)
+class TrialCounts:
+    """The trials of a run: those ``stored`` before it, and by arm those ``todo`` in it.
+
+    ``done`` has by arm those of them that have ended. ``outcome_counts`` counts how they ended:
+    with a Status, or ``suspended`` until there is more money. ``unstored`` returns the reason why
+    trials are not stored; empty: nothing is wrong.
+    """
+
+    todo: Counter[str]
+    stored: int = 0
+    done: Counter[str] = field(default_factory=Counter)
+    outcome_counts: Counter[str] = field(default_factory=Counter)
+    unstored: Callable[[], str] = str
+
+
+@dataclass(slots=True)
 class Progress:
     """State of a run, as its display shows it; ``runner`` plays its trials.
 
-    ``planned`` is the number of all trials, ``stored`` of those that were stored before this run.
-    ``todo`` has by arm the others, and ``done`` those of them that have ended.
-    ``outcome_counts`` counts how the trials of this run ended: with a Status, or ``suspended``
-    until there is more money. ``worst_stall_s`` is the longest delay of the event loop.
+    ``worst_stall_s`` is the longest delay of the event loop. ``batches`` returns the batches that
+    are waited for.
     """
 
     plan: Plan
-    planned: int
     runner: Player
     ledger: Ledger
-    todo: Counter[str]
-    done: Counter[str] = field(default_factory=Counter)
-    stored: int = 0
+    trials: TrialCounts
     cap_usd: float | None = None
-    outcome_counts: Counter[str] = field(default_factory=Counter)
+    batches: Callable[[], list[str]] = list
     began_at: datetime = field(default_factory=lambda: datetime.now(UTC))
     ended_at: datetime | None = None
     worst_stall_s: float = 0.0
     doing: Literal["playing", "checking"] = "playing"
-    unstored: Callable[[], str] = str  # says why trials are not stored; empty: nothing is wrong
-    batches: Callable[[], list[str]] = list  # says which batches are waited for
 
     def meter(self) -> Meter:
         """Return the counts of all models together."""
@@ -77,17 +86,18 @@ class Progress:
         meter = self.meter()
         now = datetime.now(UTC)
         elapsed_s = (now - self.began_at).total_seconds()
-        failed = self.outcome_counts["failed"]
-        ended = self.outcome_counts.total() - self.outcome_counts["suspended"] - failed
+        counts = self.trials.outcome_counts
+        failed = counts["failed"]
+        ended = counts.total() - counts["suspended"] - failed
         batches = first_of(self.batches(), "others", REASONS_SHOWN)
         # The time that a batch takes is unknown.
         left_s = None if batches else self._left_s(elapsed_s, ended + failed)
-        before = f" (+{self.stored} stored before)" if self.stored else ""
+        before = f" (+{self.trials.stored} stored before)" if self.trials.stored else ""
         workers = "" if self.runner.workers is None else f" on {self.runner.workers} workers"
         waiting = self.runner.waiting_for_money
         running = f"{max(0, self.runner.running - waiting)} running{workers}"
         running += f", {waiting} wait for money" if waiting else ""
-        total = self.planned - self.stored
+        total = self.trials.todo.total()
         trials = f"{ended + failed}/{total} ended{before}, {running}"
         cost = f"{meter.cost_usd:.2f} USD"
         if self.cap_usd is not None:
@@ -107,7 +117,7 @@ class Progress:
             sweep_id=sweep_id,
             updated_at=now,
             doing=self.doing,
-            ended=self.stored + ended,
+            ended=self.trials.stored + ended,
             failed=failed,
             cost_usd=meter.cost_usd,
             left_s=left_s,
@@ -120,18 +130,19 @@ class Progress:
         It is that of the slowest model. Trials that run in step all end late, so early in a run the
         calls are a better basis.
         """
-        total = self.planned - self.stored
+        total = self.trials.todo.total()
         if ended >= total:
             return None
-        parts = [
-            max(self._trials(self.done, model) / trials, share)
-            for model, share in self._shares().items()
-            if self._trials(self.done, model) < (trials := self._trials(self.todo, model))
-        ]
+        parts = []
+        for model, share in self._shares().items():
+            done = self._of(model, self.trials.done)
+            todo = self._of(model, self.trials.todo)
+            if done < todo:
+                parts.append(max(done / todo, share))
         part = min(parts, default=ended / total)
         return elapsed_s / part - elapsed_s if part else None
 
-    def _trials(self, by_arm: Counter[str], model: str) -> int:
+    def _of(self, model: str, by_arm: Counter[str]) -> int:
         """Return the number of these trials that a model takes part in."""
         registered = self.plan.registered
         return sum(
@@ -149,7 +160,7 @@ class Progress:
         for arm in self.plan.arms:
             for name in filter(arm.entries.get, arm.asked.values()):
                 model = self.plan.registered[name]
-                expected[model] += self.todo[arm.label] * usual_prompts(arm)
+                expected[model] += self.trials.todo[arm.label] * usual_prompts(arm)
         for name, meter in self.runner.meters.items():
             made[self.plan.registered.get(name, name)] += meter.calls_live + meter.calls_cached
         return {m: min(made[m] / calls, 0.99) for m, calls in expected.items() if calls}
@@ -161,7 +172,7 @@ class Progress:
             yield f"{f'{model}: ' * (len(shares) > 1)}about {share:.0%} of the decisions"
 
     def _warnings(self) -> Iterator[str]:
-        if problem := self.unstored():
+        if problem := self.trials.unstored():
             yield problem
         for name, meter in self.runner.meters.items():
             yield from (f"another model answers: {pair}" for pair in sorted(meter.mismatches))
@@ -266,9 +277,9 @@ class Log:
                 say(f"{name}: {text}")
                 self.shown_once.add(kind)
         rows = dict(reversed(snapshot.rows))  # the first of each name
-        ended = snapshot.ended + snapshot.failed - progress.stored
+        ended = snapshot.ended + snapshot.failed - progress.trials.stored
         workers = progress.runner.workers
-        line = f"trials: {ended}/{progress.planned - progress.stored} ended"
+        line = f"trials: {ended}/{progress.trials.todo.total()} ended"
         line += "" if workers is None else f" on {workers} workers"
         line += f"; failed: {snapshot.failed}" if snapshot.failed else ""
         line += f"; cost: {rows['cost']}" if snapshot.cost_usd >= CENT_USD else ""

@@ -55,8 +55,8 @@ def as_dict(
         "cache": str(options.cache),
         "trials": {
             "planned": plan.trials,
-            "stored_before": progress.stored,
-            "suspended": progress.outcome_counts["suspended"],
+            "stored_before": progress.trials.stored,
+            "suspended": progress.trials.outcome_counts["suspended"],
         },
         "calls": {"live": meter.calls_live, "cached": meter.calls_cached},
         "calls_shared": meter.calls_shared,

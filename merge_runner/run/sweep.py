@@ -27,7 +27,7 @@ from merge_runner.run.options import Options
 from merge_runner.run.plan import Plan, usual_prompts
 from merge_runner.run.players import open_player
 from merge_runner.run.playing import play_and_store
-from merge_runner.run.progress import Progress, show_progress
+from merge_runner.run.progress import Progress, TrialCounts, show_progress
 from merge_runner.run.progress_file import write_snapshot
 from merge_runner.run.replay import Replay
 from merge_runner.run.run_record import begin, check, end
@@ -121,11 +121,9 @@ async def run(
 def _progress(session: Session, player: Player, rounds: Rounds | None = None) -> Progress:
     return Progress(
         plan=session.plan,
-        planned=len(session.stored) + len(session.todo),
-        todo=Counter(spec.arm for spec in session.todo),
-        stored=len(session.stored),
         runner=player,
         ledger=session.ledger,
+        trials=TrialCounts(Counter(spec.arm for spec in session.todo), len(session.stored)),
         cap_usd=session.options.max_cost_usd,
         batches=rounds.standing if rounds else list,
     )
