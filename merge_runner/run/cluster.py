@@ -1,13 +1,10 @@
 """Plays a sweep on a Dask cluster whose workers share nothing.
 
 A chunk of trials has a share of the rate limits and of the cap. Its worker plays it with the
-ordinary runner and a reply folder of its own, and returns records and replies. The coordinator
-keeps them in one transaction before it counts the chunk as done. The chunk of a worker that dies is
-given out again.
-
-A worker tells the coordinator of each attempt before it is sent, which reserves its worst case
-durably under the name of the chunk, and of each cost. What is lost with a worker or a coordinator
-so counts with what it may have cost, no more.
+ordinary runner and a reply folder of its own. The coordinator keeps its records and replies in one
+transaction before it counts the chunk as done, and gives the chunk of a lost worker out again.
+A worker announces each attempt, whose worst case the coordinator reserves durably before it is
+sent, and each cost: what is lost counts with what it may have cost, no more.
 """
 
 from __future__ import annotations
@@ -15,7 +12,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-import pickle
 import secrets
 from collections import Counter, deque
 from collections.abc import Iterable, Sequence
@@ -27,16 +23,15 @@ from merge_runner.errors import MergeRunnerError, SweepStopped, TrialSuspended
 from merge_runner.llm.call import Meter, Wait
 from merge_runner.llm.ledger import Ledger
 from merge_runner.records import TrialRecord, TrialSpec
-from merge_runner.run.cluster_chunk import Assignment, Chunk, Played, RunSetup, recorded_calls
-from merge_runner.run.cluster_worker import answer, fingerprint, play_chunk, stop
+from merge_runner.run.cluster_assignment import Assignment, recorded_calls
+from merge_runner.run.cluster_worker import Chunk, Played, RunSetup, stop
 from merge_runner.run.guard import FirstDecisions
 from merge_runner.run.trials import Ended, Room
 
 if TYPE_CHECKING:
     from distributed import Client
 
-# Workers may come and go: how often they are counted.
-COUNT_WORKERS_EVERY_S = 1.0
+COUNT_WORKERS_EVERY_S = 1.0  # they may come and go
 # A worker that dies loses so many times its trials in flight, and the longest trial of a chunk
 # holds the others up.
 TRIALS_PER_SLOT = 4
@@ -147,30 +142,9 @@ class ClusterRunner:
             overruns=[*spending.overruns.items()],
         )
         assignment = Assignment(address, chunk)
-        self._assigned[asyncio.create_task(self._work(assignment))] = assignment
-
-    async def _work(self, assignment: Assignment) -> Any:  # noqa: ANN401 # or why it is lost
-        """Let a worker play a chunk, and book its attempts meanwhile; return what it returns."""
-        run, workers = self._client.run, [assignment.address]
-
-        async def play() -> Any:  # noqa: ANN401
-            # Not as a task of Dask, which would play a lost one again before its loss is booked.
-            arguments = play_chunk, fingerprint(), pickle.dumps(assignment.chunk)
-            try:
-                played = await run(*arguments, workers=workers, on_error="return")
-            finally:
-                assignment.events.put_nowait(None)
-            return played[assignment.address]
-
-        async def book() -> None:
-            name, cap_usd = assignment.chunk.name, self._setup.options.max_cost_usd
-            while (answers := await assignment.book(self._ledger, cap_usd)) is not None:
-                if answers:
-                    arguments = answer, self._setup.run, name, answers
-                    await run(*arguments, workers=workers, on_error="ignore")
-
-        played, _ = await asyncio.gather(play(), book())
-        return played
+        self._assigned[
+            asyncio.create_task(assignment.play(self._client, self._ledger, options.max_cost_usd))
+        ] = assignment
 
     async def _collect(self) -> None:
         """Wait a while for chunks, and keep what those that have ended return."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import pickle
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AsyncExitStack, closing
 from dataclasses import astuple, dataclass, field, replace
 from functools import cache, partial
@@ -16,14 +16,17 @@ from typing import TYPE_CHECKING
 
 import merge_runner
 from merge_runner.errors import MergeRunnerError, SweepStopped, TrialSuspended, UsageError
-from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.llm.call import Meter
+from merge_runner.llm.durable import Rows
 from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.llm.limiter import Limiter
-from merge_runner.records import TrialRecord, TrialSpec
+from merge_runner.records import Attempt, TrialRecord, TrialSpec, Usage
 from merge_runner.registry import plugin_sources, using
 from merge_runner.run.clients import live_clients
-from merge_runner.run.cluster_chunk import Chunk, Played
+from merge_runner.run.guard import FirstDecisions
 from merge_runner.run.local_runner import LocalRunner
+from merge_runner.run.options import Options
 from merge_runner.run.plan import Plan
 from merge_runner.study.parts import catalogue_of
 
@@ -32,6 +35,48 @@ if TYPE_CHECKING:
 
 # The coordinator may be slow, or its machine suspended; one that is gone never answers.
 SILENT_S = 300
+# The calls with an answer, and by key the attempts at those without one.
+Recorded = tuple[Sequence[CachedCall], Sequence[tuple[str, tuple[Attempt, ...]]]]
+
+
+@dataclass(frozen=True, slots=True)
+class RunSetup:
+    """A run and how it is played; ``urls`` are the coordinator's base URLs."""
+
+    run: str
+    plan: Plan
+    options: Options
+    earlier: Mapping[str, Usage | None]
+    first: FirstDecisions
+    urls: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Chunk:
+    """Trials for one worker, what is recorded of their calls, and its ``share`` of the limits.
+
+    Its attempts are reserved under its ``name`` until it ends. The options of ``setup`` have its
+    share of the trials in flight and of the cap.
+    """
+
+    name: str
+    setup: RunSetup
+    specs: Sequence[TrialSpec]
+    share: float
+    recorded: Recorded
+    overruns: Sequence[tuple[str, float]]
+
+
+@dataclass(slots=True)
+class Played:
+    """Result of a chunk; ``spent`` and ``opened`` are rows of the worker's ledger."""
+
+    ended: list[tuple[TrialSpec, TrialRecord | TrialSuspended]] = field(default_factory=list)
+    recorded: Recorded = ((), ())
+    spent: Rows = field(default_factory=list)
+    opened: Rows = field(default_factory=list)
+    meters: Mapping[str, Meter] = field(default_factory=dict)
+    error: MergeRunnerError | None = None
 
 
 class RemoteLedger(Ledger):

@@ -10,8 +10,8 @@ from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.results.store import Store
 from merge_runner.run.clients import live_clients
 from merge_runner.run.cluster import ClusterRunner
-from merge_runner.run.cluster_chunk import RunSetup
 from merge_runner.run.cluster_connection import connected
+from merge_runner.run.cluster_worker import RunSetup
 from merge_runner.run.estimate import earlier_answers
 from merge_runner.run.guard import MOST_INVALID, FirstDecisions
 from merge_runner.run.local_runner import LocalRunner

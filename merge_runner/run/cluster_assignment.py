@@ -1,67 +1,26 @@
-"""Chunks of trials, as they go to the workers of a Dask cluster and as they come back."""
+"""A chunk of trials on a worker of a Dask cluster, as the coordinator sees it."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Mapping, Sequence
+import pickle
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from merge_runner.errors import MergeRunnerError, RecordingError, TrialSuspended
+from merge_runner.errors import RecordingError
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.call import Meter
 from merge_runner.llm.durable import Operation, Rows
 from merge_runner.llm.ledger import Asked, Ledger
-from merge_runner.records import Attempt, TrialRecord, TrialSpec, Usage
-from merge_runner.run.guard import FirstDecisions
-from merge_runner.run.options import Options
+from merge_runner.records import Attempt, TrialSpec
+from merge_runner.run.cluster_worker import Chunk, Recorded, answer, fingerprint, play_chunk
 from merge_runner.run.plan import Plan
 from merge_runner.run.replay import Replay
 
-# The calls with an answer, and by key the attempts at those without one.
-Recorded = tuple[Sequence[CachedCall], Sequence[tuple[str, tuple[Attempt, ...]]]]
-
-
-@dataclass(frozen=True, slots=True)
-class RunSetup:
-    """A run and how it is played; ``urls`` are the coordinator's base URLs."""
-
-    run: str
-    plan: Plan
-    options: Options
-    earlier: Mapping[str, Usage | None]
-    first: FirstDecisions
-    urls: Mapping[str, str]
-
-
-@dataclass(frozen=True, slots=True)
-class Chunk:
-    """Trials for one worker, what is recorded of their calls, and its ``share`` of the limits.
-
-    Its attempts are reserved under its ``name`` until it ends. The options of ``setup`` have its
-    share of the trials in flight and of the cap.
-    """
-
-    name: str
-    setup: RunSetup
-    specs: Sequence[TrialSpec]
-    share: float
-    recorded: Recorded
-    overruns: Sequence[tuple[str, float]]
-
-
-@dataclass(slots=True)
-class Played:
-    """Result of a chunk; ``spent`` and ``opened`` are rows of the worker's ledger."""
-
-    ended: list[tuple[TrialSpec, TrialRecord | TrialSuspended]] = field(default_factory=list)
-    recorded: Recorded = ((), ())
-    spent: Rows = field(default_factory=list)
-    opened: Rows = field(default_factory=list)
-    meters: Mapping[str, Meter] = field(default_factory=dict)
-    error: MergeRunnerError | None = None
+if TYPE_CHECKING:
+    from distributed import Client
 
 
 @dataclass(eq=False)
@@ -84,7 +43,29 @@ class Assignment:
         """The rest of its share of the cap."""
         return max(0.0, (self.chunk.setup.options.max_cost_usd or 0.0) - sum(self.usd.values()))
 
-    async def book(self, ledger: Ledger, cap_usd: float | None) -> dict[int, bool] | None:
+    async def play(self, client: Client, ledger: Ledger, cap_usd: float | None) -> Any:  # noqa: ANN401 # or why it is lost
+        """Let the worker play the chunk, and book its attempts meanwhile; return its result."""
+        run = partial(client.run, workers=[self.address])
+
+        async def play() -> Any:  # noqa: ANN401
+            # Not as a task of Dask, which would play a lost one again before its loss is booked.
+            chunk = pickle.dumps(self.chunk)
+            try:
+                results = await run(play_chunk, fingerprint(), chunk, on_error="return")
+            finally:
+                self.events.put_nowait(None)
+            return results[self.address]
+
+        async def book() -> None:
+            name, setup = self.chunk.name, self.chunk.setup
+            while (answers := await self._book(ledger, cap_usd)) is not None:
+                if answers:
+                    await run(answer, setup.run, name, answers, on_error="ignore")
+
+        result, _ = await asyncio.gather(play(), book())
+        return result
+
+    async def _book(self, ledger: Ledger, cap_usd: float | None) -> dict[int, bool] | None:
         """Reserve the attempts and book the costs of the next events, in their order.
 
         Returns by attempt to reserve whether there is money for it; None after the last event.
