@@ -100,8 +100,7 @@ class ClusterRunner:
         with contextlib.suppress(OSError):
             await self._client.run(stop, self._setup.run, workers=addresses, on_error="ignore")
         while self._assigned:
-            # The first error has ended the run already.
-            with contextlib.suppress(MergeRunnerError, OSError):
+            with contextlib.suppress(MergeRunnerError, OSError):  # the first one has ended the run
                 await self._collect()
 
     def _take(self, event: tuple[float, tuple[Any, ...]]) -> None:
