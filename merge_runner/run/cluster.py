@@ -26,7 +26,7 @@ from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.run.cluster_assignment import Assignment, recorded_calls
 from merge_runner.run.cluster_worker import Chunk, Played, RunSetup, stop
 from merge_runner.run.guard import FirstDecisions
-from merge_runner.run.trials import Ended, Room
+from merge_runner.run.trials import Capacity, Ended
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -70,7 +70,7 @@ class ClusterRunner:
         """Text of what an interrupted run saves before it ends."""
         return f"the replies of {len(self._assigned)} tasks"
 
-    async def play(self, specs: Iterable[TrialSpec], ended: Ended, room: Room) -> None:
+    async def play(self, specs: Iterable[TrialSpec], ended: Ended, capacity: Capacity) -> None:
         """Play trials in order; an error raised by ``ended`` or at a worker ends the run."""
         self._ended = ended
         groups: dict[tuple[str, int], list[TrialSpec]] = {}
@@ -85,7 +85,7 @@ class ClusterRunner:
                 busy = {assignment.address for assignment in self._assigned.values()}
                 for address in addresses:
                     if self._groups and address not in busy:
-                        await room()
+                        await capacity()
                         await self._give(address)
                 await self._collect()
         except OSError as exc:

@@ -16,7 +16,7 @@ from merge_runner.llm.client import LlmClient
 from merge_runner.records import CallFailed, Decision, Side, TrialRecord, TrialSpec
 from merge_runner.run.guard import FirstDecisions
 from merge_runner.run.plan import Plan
-from merge_runner.run.trials import Ended, Room, TrialMaker
+from merge_runner.run.trials import Capacity, Ended, TrialMaker
 from merge_runner.trial import Trial
 
 # More than bad luck explains, since nothing is answered between them; few enough to stop early.
@@ -72,15 +72,15 @@ class LocalRunner:
         return f"{calls} calls in flight"
 
     async def play(
-        self, specs: Sequence[TrialSpec], ended: Ended, room: Room | None = None
+        self, specs: Sequence[TrialSpec], ended: Ended, capacity: Capacity | None = None
     ) -> None:
         """Play trials in order; an error raised by ``ended`` or outside a trial ends the run."""
         waiting = iter(specs)
 
         async def work() -> None:
             for spec in waiting:
-                if room is not None:  # before any call: what is answered must also be stored
-                    await room()
+                if capacity is not None:  # before any call: what is answered must also be stored
+                    await capacity()
                 try:
                     record = await self.play_one(spec)
                 except TrialSuspended as exc:

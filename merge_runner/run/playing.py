@@ -91,7 +91,9 @@ async def _play(endings: Endings, stopping: Stopping) -> bool:
     Two tasks, since Ctrl-C stops the trials but lets the calls that are paid for end.
     """
     session, flusher, player = endings.session, endings.flusher, endings.progress.runner
-    work = asyncio.create_task(player.play(session.todo, endings.add, room=flusher.room))
+    work = asyncio.create_task(
+        player.play(session.todo, endings.add, capacity=flusher.wait_for_capacity)
+    )
     flusher.on_break = work.cancel  # no money is spent on what cannot be stored
 
     async def drained() -> None:

@@ -12,7 +12,7 @@ from merge_runner.llm.recorded import Calls, RecordedReplies
 from merge_runner.records import Decision, TrialRecord, TrialSpec
 from merge_runner.run.guard import FirstDecisions
 from merge_runner.run.plan import Plan
-from merge_runner.run.trials import Room, TrialMaker
+from merge_runner.run.trials import Capacity, TrialMaker
 from merge_runner.trial import play_trial
 
 
@@ -63,12 +63,12 @@ class Replay:
         self,
         specs: Sequence[TrialSpec],
         ended: Callable[[TrialSpec, TrialRecord], None],
-        room: Room | None = None,
+        capacity: Capacity | None = None,
     ) -> None:
         """Play trials in order, and let what is stored and shown meanwhile go on between two."""
         for spec in specs:
-            if room is not None:
-                await room()
+            if capacity is not None:
+                await capacity()
             await asyncio.sleep(0)
             self.running = 1
             ended(spec, self.play_one(spec))

@@ -17,7 +17,7 @@ from merge_runner.trial import Trial
 # Called with each trial that ends, or is suspended for lack of money.
 Ended = Callable[[TrialSpec, TrialRecord | TrialSuspended], None]
 # Awaited before a trial begins: returns once there is memory to hold the trial until it is stored.
-Room = Callable[[], Awaitable[None]]
+Capacity = Callable[[], Awaitable[None]]
 
 
 class Player(Protocol):
@@ -52,7 +52,7 @@ class Player(Protocol):
     def unsaved(self) -> str:
         """Text of what an interrupted run saves before it ends."""
 
-    async def play(self, specs: Sequence[TrialSpec], ended: Ended, room: Room) -> None:
+    async def play(self, specs: Sequence[TrialSpec], ended: Ended, capacity: Capacity) -> None:
         """Play trials in order; an error raised by ``ended`` or outside a trial ends the run."""
 
     async def drain(self) -> None:

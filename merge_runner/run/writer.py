@@ -61,7 +61,7 @@ class Flusher:
         if self._problem is not None:
             self._drop_excess()
 
-    async def room(self) -> None:
+    async def wait_for_capacity(self) -> None:
         """Wait while too much is still to be stored, unless storing fails or has ended."""
         while self._problem is None and not self._task.done():
             if len(self._pending) <= MOST_PENDING and self._bytes <= MOST_PENDING_BYTES:
