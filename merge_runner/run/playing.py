@@ -70,8 +70,8 @@ async def play_and_store(
 ) -> tuple[bool, bool]:
     """Play what is missing, and store it; what goes wrong is noted in the session.
 
-    Returns whether all is stored, unless Ctrl-C ended the waiting for a database that another
-    program holds, and whether the task that runs it was cancelled.
+    Returns two truth values: all is stored (not where Ctrl-C ended the waiting for a database that
+    another program holds), and the task that runs it was cancelled.
     """
     endings = Endings(session, progress, flusher)
     progress.trials.unstored = lambda: flusher.problem
