@@ -21,9 +21,11 @@ from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, home_of
 from merge_runner.registry import Catalogue, Registry, collecting, remember
 from merge_runner.run.estimate import Estimate
 from merge_runner.run.estimate_lines import estimate_lines
-from merge_runner.run.plan import Options, Plan, make_plan
+from merge_runner.run.interrupt import on_event
+from merge_runner.run.options import Options
+from merge_runner.run.plan import Plan, make_plan
 from merge_runner.run.summary import as_lines
-from merge_runner.run.sweep import on_event, play, unsent
+from merge_runner.run.sweep import play, unsent
 from merge_runner.study.arms import level_text
 from merge_runner.text_safety import say
 

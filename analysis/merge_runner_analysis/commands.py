@@ -212,7 +212,8 @@ def power(
     import asyncio
 
     from merge_runner.registry import use
-    from merge_runner.run.plan import Options, make_plan
+    from merge_runner.run.options import Options
+    from merge_runner.run.plan import make_plan
     from merge_runner.run.sweep import unsent
     from merge_runner_analysis.power import chances, power_table
     from merge_runner_analysis.study import Study

@@ -1,4 +1,4 @@
-"""The program: its commands in the order of ``--help``, and what becomes of an error."""
+"""The program: its commands in the order of ``--help``, and its exit codes."""
 
 from __future__ import annotations
 
@@ -13,10 +13,14 @@ from typing import Annotated
 import typer
 
 from merge_runner import __version__
-from merge_runner.cli import commands
 from merge_runner.cli.help import Program
+from merge_runner.cli.inspect import audit, digest, forget, sql
+from merge_runner.cli.models import emulate, models
+from merge_runner.cli.money import ledger
 from merge_runner.cli.options import flag, print_out
 from merge_runner.cli.packages import load_commands
+from merge_runner.cli.recording import recording_app
+from merge_runner.cli.run import init, replay, sweep
 from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner.text_safety import say
 
@@ -24,6 +28,8 @@ from merge_runner.text_safety import say
 OUTPUT_ERRORS = (errno.ENOSPC, errno.EFBIG, errno.EIO)
 # An error of Click, whose name Typer keeps to itself.
 USAGE: type[typer.BadParameter] = typer.BadParameter.__mro__[2]
+# A user can act on some of them: see _code_and_line.
+EXPECTED = (MergeRunnerError, ModuleNotFoundError, OSError, RuntimeError)
 COMPLETION = "_MERGE_RUNNER_COMPLETE"  # set by the shell's script that typer installs
 
 
@@ -47,14 +53,14 @@ app.callback(invoke_without_command=True)(common)
 # The groups of the menu, in which the commands of the analysis take their places, too.
 PLAY, LOOK, KEEP, CHECK = "Play", "Look", "Keep", "Check"
 for _panel, _commands in {
-    PLAY: (commands.sweep, commands.replay, commands.init, commands.models, commands.emulate),
-    LOOK: (commands.sql,),
-    KEEP: (commands.forget,),
-    CHECK: (commands.audit, commands.digest, commands.ledger),
+    PLAY: (sweep, replay, init, models, emulate),
+    LOOK: (sql,),
+    KEEP: (forget,),
+    CHECK: (audit, digest, ledger),
 }.items():
     for _command in _commands:
         app.command(rich_help_panel=_panel)(_command)
-app.add_typer(commands.recording_app, name="recording", rich_help_panel=KEEP)
+app.add_typer(recording_app, name="recording", rich_help_panel=KEEP)
 # To run one of these, the commands of other packages are not looked up.
 OWN = {info.callback.__name__ for info in app.registered_commands if info.callback}
 OWN |= {str(info.name) for info in app.registered_groups}
@@ -66,10 +72,10 @@ def complete_app() -> typer.Typer:
     return app
 
 
-def alone(command: str | None) -> typer.Typer:
-    """The program with the options of one command, since making those of all takes as long again.
+def app_with_one_command(command: str | None) -> typer.Typer:
+    """Return the program with the options of one command: making those of all takes as long again.
 
-    The others are there by their names and by what they say of themselves.
+    The others are there by their names and their help.
     """
     light = copy(app)
     light.registered_commands = [copy(info) for info in app.registered_commands]
@@ -95,24 +101,24 @@ def main() -> None:
         command = next(words, None)
         if completing or sys.argv[1:2] != [command] or command not in OWN:
             load_commands()
-        run = app if completing else alone(command)
+        run = app if completing else app_with_one_command(command)
         sys.exit(run(prog_name="merge-runner", standalone_mode=False))
     except typer.Abort:
         say("Aborted!")
         sys.exit(1)
-    except Exception as exc:
-        if isinstance(exc, USAGE):
-            exc.show()  # in plain lines: in Typer's boxes a script could not find them
-            sys.exit(exc.exit_code)
-        code, text = _told(exc)
-        if debug or not text:
+    except USAGE as exc:
+        exc.show()  # in plain lines: in Typer's boxes a script could not find them
+        sys.exit(exc.exit_code)
+    except EXPECTED as exc:
+        code, line = _code_and_line(exc)
+        if debug or not line:
             raise
-        say(text)
+        say(line)
         sys.exit(code)
 
 
-def _told(exc: Exception) -> tuple[int, str]:
-    """The exit code and the line of an error that a user can act on; no line for any other."""
+def _code_and_line(exc: Exception) -> tuple[int, str]:
+    """Return the exit code and the line of an error that a user can act on; no line for others."""
     match exc:
         case MergeRunnerError():
             return exc.exit_code, f"error: {exc}"

@@ -21,9 +21,9 @@ def _write_groups(command: TyperCommand | TyperGroup, ctx: Any, formatter: Any) 
         usual = "Arguments" if param.param_type_name == "argument" else "Options"
         if record := param.get_help_record(ctx):
             groups.setdefault(getattr(param, "rich_help_panel", None) or usual, []).append(record)
-    for name, each in getattr(command, "commands", {}).items():
-        says = (each.help or "").partition("\n\n")[0]
-        groups.setdefault(each.rich_help_panel or "Commands", []).append((name, says))
+    for name, listed in getattr(command, "commands", {}).items():
+        summary = (listed.help or "").partition("\n\n")[0]
+        groups.setdefault(listed.rich_help_panel or "Commands", []).append((name, summary))
     for title, rows in groups.items():
         if rows:
             with formatter.section(title):

@@ -1,4 +1,4 @@
-"""The options that several commands share, what the command line prints, and what it asks."""
+"""Options of several commands, the output of the command line, and its questions."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from merge_runner.text_safety import printable, say
 
 
 def option(metavar: str, text: str, *names: str, **more: Any) -> Any:  # noqa: ANN401 # as typer's
-    """An option with a value, named as its parameter unless ``names`` are given."""
+    """Return an option with a value, named as its parameter unless ``names`` are given."""
     return typer.Option(*names, metavar=metavar, help=text, **more)
 
 
 def flag(name: str, text: str, **more: Any) -> Any:  # noqa: ANN401 # as typer's
-    """An option without a value."""
+    """Return an option without a value."""
     return typer.Option(name, help=text, metavar="", **more)
 
 
@@ -36,12 +36,12 @@ ASKED = {"rich_help_panel": "Questions and output"}
 
 
 def beside_study(ctx: typer.Context, param: typer.CallbackParam, path: Path) -> Path:
-    """Put a default beside the study's file, from wherever it is started."""
+    """Return the default path next to the study's file; a path that is given stays."""
     source = ctx.get_parameter_source(str(param.name))
     if source is None or source.name != "DEFAULT":
         return path
     study = next(filter(None, map(ctx.params.get, ("studies", "name", "study", "study_file"))), "")
-    homes = {home_of(each) for each in ([study] if isinstance(study, str) else study)}
+    homes = {home_of(name) for name in ([study] if isinstance(study, str) else study)}
     if len(homes) > 1:
         raise UsageError(
             f"{', '.join(study)} have their results in different folders: play them one at a time, "
@@ -106,6 +106,9 @@ StudyOption = Annotated[
 ]
 
 
+NOT_BOTH = "--sweep names a run, --study all runs of a study: leave one of them out"
+
+
 def use_study(file: str | None, *, trust: bool) -> None:
     """Use what the study of ``--study`` adds, once the user agrees to its code."""
     if file is not None:
@@ -117,7 +120,7 @@ def use_study(file: str | None, *, trust: bool) -> None:
 
 
 def runs_of_study(file: str | None, db: Path) -> list[str] | None:
-    """The ids of the runs of the study of ``--study``, whose code does not run; None without it."""
+    """Return the ids of the runs of ``--study``, whose code does not run; None without it."""
     if file is None:
         return None
     from merge_runner.study.file import read_study
@@ -127,18 +130,18 @@ def runs_of_study(file: str | None, db: Path) -> list[str] | None:
 
 
 def levels(given: Sequence[str], option: str) -> dict[str, list[str]]:
-    """The levels of each factor that an option names; raises UsageError."""
+    """Return the levels of each factor that an option names; raises UsageError."""
     levels: dict[str, list[str]] = {}
-    for each in given:
-        factor, equals, level = each.partition("=")
+    for text in given:
+        factor, equals, level = text.partition("=")
         if not equals:
-            raise UsageError(f"{option} {each}: write FACTOR=LEVEL, as in {option} temperature=0.2")
+            raise UsageError(f"{option} {text}: write FACTOR=LEVEL, as in {option} temperature=0.2")
         levels.setdefault(factor.strip(), []).append(level.strip())
     return levels
 
 
 def listed(text: str | None) -> list[str] | None:
-    """The parts of an option that takes several names, None where it is not given."""
+    """Return the parts of an option that takes several names; None where it is not given."""
     return None if text is None else [part.strip() for part in text.split(",") if part.strip()]
 
 
@@ -148,7 +151,7 @@ def print_out(text: str) -> None:
 
 
 def terminal_width() -> int | None:
-    """How many columns the result may take; None where it goes into a file or a pipe."""
+    """Return the width of the terminal in columns; None where the output is a file or a pipe."""
     return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
 
 

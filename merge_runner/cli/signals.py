@@ -1,4 +1,4 @@
-"""What Ctrl-C, SIGTERM and a terminal that closes do to a run of the command line."""
+"""Handlers of Ctrl-C, SIGTERM and a closing terminal during a run of the command line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Makes the clients of a sweep's language models, with their connections."""
+"""The clients of a sweep's language models, with their connections."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ from merge_runner.llm.sender import DirectSender
 from merge_runner.providers import resolve_endpoint
 from merge_runner.records import Usage
 from merge_runner.run.estimate import trial_costs
-from merge_runner.run.plan import Options, Plan
+from merge_runner.run.options import Options
+from merge_runner.run.plan import Plan
 
 if TYPE_CHECKING:
     from merge_runner.llm.http import HttpTransport
@@ -48,7 +49,7 @@ def live_clients(
     share: float = 1.0,
     limiters: dict[str, Limiter] | None = None,
 ) -> dict[str, LlmClient]:
-    """Clients with connections, closed with ``stack``, and a share of the rate limits.
+    """Return clients with connections, closed with ``stack``, and a share of the rate limits.
 
     ``earlier`` is as ``earlier_answers`` says. ``rounds`` are those of this run, which get the
     batch modes of its models. Variables in ``urls`` go before the environment. ``limiters`` by
@@ -94,7 +95,7 @@ def live_clients(
 def _connections(
     plan: Plan, options: Options, env: Mapping[str, str], rounds: Rounds | None
 ) -> Callable[[str], HttpTransport]:
-    """Return what connects to a model's endpoint, and tells the rounds of its batch mode.
+    """Return a function that connects to a model's endpoint, and gives the rounds its batch mode.
 
     The emulator answers in this process unless it has a URL.
     """
@@ -152,7 +153,7 @@ def _allow_files(number: int) -> None:
 def open_rounds(
     plan: Plan, options: Options, cache: ResponseCache, say: Callable[[str], None]
 ) -> Rounds | None:
-    """The rounds of a run; None where it submits none, and no earlier run has left a batch open."""
+    """Return the rounds of a run; None where it submits none and no batch is open."""
     rounds = Rounds(cache, {*plan.registered.values()}, submits=options.batch, say=say)
     if options.dask is not None and rounds.batches:
         raise UsageError(
@@ -165,7 +166,7 @@ def open_rounds(
 
 
 def check_batches(plan: Plan, options: Options) -> None:
-    """Raise UsageError where a run cannot use batches as it is told to."""
+    """Raise UsageError where a run cannot use batches as its options ask."""
     if not options.batch:
         return
     is_served = bool(os.environ.get("EMULATOR_BASE_URL"))
@@ -179,9 +180,9 @@ def check_batches(plan: Plan, options: Options) -> None:
     for name, entry in plan.entries.items():
         if batch_terms(entry) is None:
             valid = ", ".join(
-                each
-                for each, its in registry.items()
-                if batch_terms(its) and (is_served or its.provider != "emulator")
+                model
+                for model, listed in registry.items()
+                if batch_terms(listed) and (is_served or listed.provider != "emulator")
             )
             raise UsageError(
                 f"{plan.registered[name]} has no batch mode that is known; valid with --batch: "

@@ -1,4 +1,4 @@
-"""What a sweep will take, before anything is sent."""
+"""The estimate of a sweep: calls, tokens, cost and time, before anything is sent."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from merge_runner.llm.templates import AnswerCounts, answer_counts, count_by_tem
 from merge_runner.prompts.blocks import render_prompt
 from merge_runner.providers import ModelEntry
 from merge_runner.records import SIDES, Usage, canonical_json
-from merge_runner.run.plan import Options, Plan, usual_prompts
+from merge_runner.run.options import Options
+from merge_runner.run.plan import Plan, usual_prompts
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 from merge_runner.study.arms import Arm
@@ -36,12 +37,12 @@ def earlier_answers(plan: Plan, cache: ResponseCache) -> dict[str, Usage | None]
     None: the endpoint has answered, but no such request; a model whose endpoint has never answered
     is missing. No mock model's answers count, and none that leaves its tokens out.
     """
-    like = _asked_as(plan)
+    requests = _request_templates(plan)
     sums: dict[str, AnswerCounts] = {}
     for template, answers in chain.from_iterable(c.items() for c in answer_counts(cache)):
         asked = template.model, template.endpoint, template.path, template.body
-        for name in (name for name, wanted in like.items() if wanted[:2] == asked[:2]):
-            counts = template.own and like[name] == asked
+        for name in (name for name, request in requests.items() if request[:2] == asked[:2]):
+            counts = template.own and requests[name] == asked
             sums[name] = sums.get(name, AnswerCounts()).plus(answers if counts else AnswerCounts())
     return {name: _mean(answers) for name, answers in sums.items()}
 
@@ -50,22 +51,22 @@ def usual_latencies_s(
     plan: Plan, cache: ResponseCache, facts: Mapping[str, Usage | None]
 ) -> dict[str, float]:
     """Return the median latency of the answers that ``facts`` measured, of the newest of them."""
-    like = _asked_as(plan)
-    found: dict[str, list[float]] = {name: [] for name, usage in facts.items() if usage is not None}
-    for call in cache.newest(MOST_READ) if found else ():
+    requests = _request_templates(plan)
+    latencies: dict[str, list[float]] = {name: [] for name, usage in facts.items() if usage}
+    for call in cache.newest(MOST_READ) if latencies else ():
         last = call.attempts[-1]
         (template,) = count_by_template([(call.request, last)])
         asked = template.model, template.endpoint, template.path, template.body
         if template.own and last.latency_s is not None:
-            for name in (name for name in found if like[name] == asked):
-                found[name].append(last.latency_s)
-        if all(len(latencies_s) >= ENOUGH for latencies_s in found.values()):
+            for name in (name for name in latencies if requests[name] == asked):
+                latencies[name].append(last.latency_s)
+        if all(len(latencies_s) >= ENOUGH for latencies_s in latencies.values()):
             break
-    return {name: median(latencies_s) for name, latencies_s in found.items() if latencies_s}
+    return {name: median(latencies_s) for name, latencies_s in latencies.items() if latencies_s}
 
 
-def _asked_as(plan: Plan) -> dict[str, tuple[str, str, str, str]]:
-    """Return the id, endpoint, path and body without a prompt by which each model is asked."""
+def _request_templates(plan: Plan) -> dict[str, tuple[str, str, str, str]]:
+    """Return by model the id, endpoint, path and body of its requests, all but the prompt."""
     asked = {}
     for name, entry in plan.entries.items():
         sent = plan.parts.formats[entry.format].request(entry, "")
@@ -86,8 +87,9 @@ def _mean(answers: AnswerCounts) -> Usage | None:
 class Estimate:
     """A live run's drivers, trials, calls, tokens, USD (None: a price is unknown) and minutes.
 
-    They are ``measured`` where tokens are those of earlier answers. Calls that are asked singly
-    cost ``singly_usd``; in batches they cost less, and take so many ``rounds`` in place of minutes.
+    They are ``measured`` where tokens are those of earlier answers. Sent as normal
+    requests, calls cost ``singly_usd``; in batches they cost less, and take so many ``rounds`` in
+    place of minutes.
     ``usd_by_model`` has the models of the registry. Of ``planned`` trials some are ``stored``.
     A cap leaves ``left_usd`` of what it covers; without one that is None. ``output_caps`` are the
     most tokens that a reply of each model may have.
@@ -123,9 +125,9 @@ def estimate(
 ) -> Estimate:
     """Return the estimate for the ``trials`` that a live run of a plan has yet to ask for.
 
-    ``calls`` is roughly how many each model has yet to answer, by arm. ``facts`` is what the cache
-    knows about each model's earlier answers to similar requests at its endpoint, ``latencies_s``
-    their median, in place of what the registry says.
+    ``calls`` are roughly those that each model has yet to answer, by arm. ``facts`` are the mean
+    tokens of each model's earlier answers to similar requests at its endpoint, and ``latencies_s``
+    their median latencies, in place of those of the registry.
     """
     number = read = written = 0
     usd = singly_usd = 0.0
@@ -166,20 +168,20 @@ def estimate(
         measured=any(map(facts.get, plan.entries)),
         planned=plan.trials,
         stored=stored,
-        usd_by_model={model: _cents(each) for model, each in by_model.items()},
+        usd_by_model={model: _cents(model_usd) for model, model_usd in by_model.items()},
         output_caps=dict(caps),
     )
 
 
 def _cents(usd: float) -> float | None:
-    """An amount in USD to the cent; None where a price is unknown, which is NaN."""
+    """Round an amount in USD to the cent; None where it is NaN, as of an unknown price."""
     return None if math.isnan(usd) else round(usd, 2)
 
 
 def trial_costs(
     plan: Plan, facts: Mapping[str, Usage | None], *, batch: bool = False
 ) -> Callable[[int], float]:
-    """Return what tells by a trial's order the USD that it is expected to cost, perhaps in batches.
+    """Return a function from a trial's order to its expected cost in USD, perhaps in batches.
 
     They are its usual calls, with a margin, and one worst case, which the last call must be able to
     reserve. ``facts`` is as for ``estimate``.

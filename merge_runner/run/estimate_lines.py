@@ -1,4 +1,4 @@
-"""What a run will take, and the prompts that it will ask, for a reader."""
+"""The estimate of a run, and the prompts that it will ask, as text."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from merge_runner.text_safety import first_of
 
 
 def _output_caps(expected: Estimate) -> Iterator[str]:
-    """The most tokens that a reply may have, by which a longer one is cut off."""
+    """Yield the output cap, by which a longer reply is cut off."""
     caps = expected.output_caps
     if caps:
         same = len({*caps.values()}) == 1
         most = [f"{n}{'' if same else f' with {model}'}" for model, n in caps.items()]
-        each = ", ".join(most[:1] if same else most)
-        yield f"        a reply is cut off at {each} output tokens (max_output_tokens)"
+        shown = ", ".join(most[:1] if same else most)
+        yield f"        a reply is cut off at {shown} output tokens (max_output_tokens)"
 
 
 def _by_model(expected: Estimate) -> Iterator[str]:
-    """What each of several models costs."""
+    """Yield the cost of each of several models."""
     if len(expected.usd_by_model) > 1:
         yield from (
             f"        {name}: {usd_text(usd)}" for name, usd in expected.usd_by_model.items()
@@ -31,7 +31,7 @@ def _by_model(expected: Estimate) -> Iterator[str]:
 
 
 def _by_cap(expected: Estimate) -> Iterator[str]:
-    """How far the money goes, where it will not do for all."""
+    """Yield the part of the run that the cap pays for, where it does not pay for all."""
     left_usd, cost_usd = expected.left_usd, expected.cost_usd
     if left_usd is not None and cost_usd and left_usd < cost_usd:
         yield (
@@ -41,32 +41,35 @@ def _by_cap(expected: Estimate) -> Iterator[str]:
 
 
 def prompt_lines(plan: Plan) -> Iterator[str]:
-    """The blocks, in order, of each prompt that has words of the study's factors."""
+    """Yield the blocks, in order, of each prompt that has words of the study's factors."""
     for name, prompt in plan.parts.prompts.items():
         if decomposed(name)[1]:
             yield f"prompt  {name}: {', '.join(prompt.blocks)}"
 
 
 def shown_prompts(plan: Plan) -> list[dict[str, Any]]:
-    """The text of each prompt that a language model reads in a plan, and by whom it is read."""
+    """Return the text of each prompt of a plan, and the drivers that read it."""
     readers: dict[tuple[str, str], list[str]] = {}
     for arm in plan.arms:
         for name, text in prompts_of(plan, arm).items():
             sides = [s for s in SIDES if arm.asked[s] in arm.entries and arm.prompt(s) == name]
-            who = "both drivers" if len(sides) == len(SIDES) else f"the {sides[0]} driver"
-            readers.setdefault((name, text), []).append(f"{who} of {arm.label}")
-    return [{"prompt": name, "read_by": who, "text": text} for (name, text), who in readers.items()]
+            drivers = "both drivers" if len(sides) == len(SIDES) else f"the {sides[0]} driver"
+            readers.setdefault((name, text), []).append(f"{drivers} of {arm.label}")
+    return [
+        {"prompt": name, "read_by": drivers, "text": text}
+        for (name, text), drivers in readers.items()
+    ]
 
 
 def shown_prompt_lines(plan: Plan) -> Iterator[str]:
-    """The same for a reader, with the numbers of one situation."""
-    for each in shown_prompts(plan):
-        who = "; ".join(first_of(each["read_by"], "others"))
-        yield f"\nprompt  {each['prompt']}, read by {who}:\n{each['text']}"
+    """Yield each prompt of a plan as text, with the numbers of one situation."""
+    for prompt in shown_prompts(plan):
+        readers = "; ".join(first_of(prompt["read_by"], "others"))
+        yield f"\nprompt  {prompt['prompt']}, read by {readers}:\n{prompt['text']}"
 
 
 def estimate_lines(expected: Estimate) -> Iterator[str]:
-    """What a run will take, for a reader."""
+    """Yield the lines of an estimate."""
     measured = ", as measured before" if expected.measured else ""
     tokens = f"about {expected.input_tokens} in, {expected.output_tokens} out{measured}"
     if not expected.trials:

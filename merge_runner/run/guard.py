@@ -1,4 +1,4 @@
-"""Stops a run before much is paid for what is no result."""
+"""The guard that stops a run whose model gives no valid decision."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class FirstDecisions:
             self._described.setdefault(model, f"The first reply is {reply}. To mend that {ADVICE}")
 
     def without_a_valid_one(self, least: float = 1) -> list[str]:
-        """A line for each model with at least so many decisions none of which is valid."""
+        """Return a line for each model with at least so many decisions, none of them valid."""
         return [
             f"none of the first {number} decisions of {model} is valid. {self._described[model]}"
             for model, number in sorted(self._invalid.items())

@@ -16,7 +16,7 @@ from merge_runner.llm.client import LlmClient
 from merge_runner.records import CallFailed, Decision, Side
 from merge_runner.run.guard import FirstDecisions
 from merge_runner.run.plan import Plan
-from merge_runner.run.trials import Ended, Room, TrialMaker
+from merge_runner.run.trials import Capacity, Ended, TrialMaker
 from merge_runner.trial import Trial
 from merge_runner.trial_records import TrialRecord, TrialSpec
 
@@ -53,34 +53,34 @@ class LocalRunner:
 
     @property
     def waits(self) -> Sequence[Wait]:
-        """What the calls wait for that are not in flight."""
+        """The reasons why calls wait that are not in flight."""
         return self.calls.waits
 
     @property
-    def held(self) -> int:
-        """How many of the running trials wait for money."""
+    def waiting_for_money(self) -> int:
+        """The number of running trials that wait for money."""
         return len(set().union(*(client.budget.waiting for client in self.clients.values())))
 
     def _is_idle(self) -> bool:
-        """Whether no trial goes on by itself: all ask, and wait for the answers to others."""
+        """Return whether all trials wait for answers to others, so that none goes on by itself."""
         asking = +self._asking  # without the trials that ask nothing now
         return self.running == len(asking) and asking.total() == self.calls.blocked_askers
 
     @property
     def unsaved(self) -> str:
-        """What Ctrl-C waits for, in words."""
+        """Text of what an interrupted run saves before it ends."""
         return f"{self.calls.in_flight} calls in flight"
 
     async def play(
-        self, specs: Sequence[TrialSpec], ended: Ended, room: Room | None = None
+        self, specs: Sequence[TrialSpec], ended: Ended, capacity: Capacity | None = None
     ) -> None:
         """Play trials in order; an error raised by ``ended`` or outside a trial ends the run."""
         waiting = iter(specs)
 
         async def work() -> None:
             for spec in waiting:
-                if room is not None:  # before any call: what is answered must also be stored
-                    await room()
+                if capacity is not None:  # before any call: what is answered must also be stored
+                    await capacity()
                 try:
                     record = await self.play_one(spec)
                 except TrialSuspended as exc:

@@ -1,4 +1,4 @@
-"""What a user sees of a sweep while it runs."""
+"""The display of a sweep while it runs."""
 
 from __future__ import annotations
 
@@ -40,53 +40,63 @@ CLOSE_IT = "you may close this: the same command goes on"
 
 
 @dataclass(slots=True)
-class Progress:
-    """Where a sweep stands; ``runner`` plays its trials.
+class TrialCounts:
+    """The trials of a run: those ``stored`` before it, and by arm those ``todo`` in it.
 
-    ``planned`` is the number of all trials, ``stored`` of those that were stored before this run.
-    ``todo`` has by arm the others, and ``done`` those of them that have ended.
-    ``outcome_counts`` counts how the trials of this run ended: with a Status, or ``suspended``
-    until there is more money. ``worst_stall_s`` is the longest delay of the event loop.
+    ``done`` has by arm those of them that have ended. ``outcome_counts`` counts how they ended:
+    with a Status, or ``suspended`` until there is more money. ``unstored`` returns the reason why
+    trials are not stored; empty: nothing is wrong.
+    """
+
+    todo: Counter[str]
+    stored: int = 0
+    done: Counter[str] = field(default_factory=Counter)
+    outcome_counts: Counter[str] = field(default_factory=Counter)
+    unstored: Callable[[], str] = str
+
+
+@dataclass(slots=True)
+class Progress:
+    """State of a run, as its display shows it; ``runner`` plays its trials.
+
+    ``worst_stall_s`` is the longest delay of the event loop. ``batches`` returns the batches that
+    are waited for.
     """
 
     plan: Plan
-    planned: int
     runner: Player
     ledger: Ledger
-    todo: Counter[str]
-    done: Counter[str] = field(default_factory=Counter)
-    stored: int = 0
-    outcome_counts: Counter[str] = field(default_factory=Counter)
+    trials: TrialCounts
+    batches: Callable[[], list[str]] = list
     began_at: datetime = field(default_factory=lambda: datetime.now(UTC))
     ended_at: datetime | None = None
     worst_stall_s: float = 0.0
     doing: Literal["playing", "checking"] = "playing"
-    unstored: Callable[[], str] = str  # says why trials are not stored; empty: nothing is wrong
-    batches: Callable[[], list[str]] = list  # says which batches are waited for
 
     def meter(self) -> Meter:
-        """What the meters of all models have counted."""
-        whole = Meter()
-        for each in self.runner.meters.values():
-            whole.add(each)
-        return whole
+        """Return the counts of all models together."""
+        total = Meter()
+        for meter in self.runner.meters.values():
+            total.add(meter)
+        return total
 
     def snapshot(self, sweep_id: str) -> ProgressSnapshot:
-        """Where the sweep stands now."""
+        """Return the state of the run now."""
         meter = self.meter()
         now = datetime.now(UTC)
         elapsed_s = (now - self.began_at).total_seconds()
-        failed = self.outcome_counts["failed"]
-        ended = self.outcome_counts.total() - self.outcome_counts["suspended"] - failed
+        counts = self.trials.outcome_counts
+        failed = counts["failed"]
+        ended = counts.total() - counts["suspended"] - failed
         batches = first_of(self.batches(), "others", REASONS_SHOWN)
-        # How long a batch takes nobody knows.
+        # The time that a batch takes is unknown.
         left_s = None if batches else self._left_s(elapsed_s, ended + failed)
-        before = f" (+{self.stored} stored before)" if self.stored else ""
+        before = f" (+{self.trials.stored} stored before)" if self.trials.stored else ""
         workers = "" if self.runner.workers is None else f" on {self.runner.workers} workers"
-        held = self.runner.held
-        running = f"{max(0, self.runner.running - held)} running{workers}"
-        running += f", {held} wait for money" if held else ""
-        total = self.planned - self.stored
+        waiting = self.runner.waiting_for_money
+        running = f"{max(0, self.runner.running - waiting)} running{workers}"
+        running += f", {waiting} wait for money" if waiting else ""
+        total = self.trials.todo.total()
         trials = f"{ended + failed}/{total} ended{before}, {running}"
         cost = f"{meter.cost_usd:.2f} USD"
         if (cap := self.ledger.cap) is not None:
@@ -106,7 +116,7 @@ class Progress:
             sweep_id=sweep_id,
             updated_at=now,
             doing=self.doing,
-            ended=self.stored + ended,
+            ended=self.trials.stored + ended,
             failed=failed,
             cost_usd=meter.cost_usd,
             left_s=left_s,
@@ -114,24 +124,25 @@ class Progress:
         )
 
     def _left_s(self, elapsed_s: float, ended: int) -> float | None:
-        """The estimated time left in s; None while there is nothing to estimate it from.
+        """Return the estimated time left in s; None while there is nothing to estimate it from.
 
         It is that of the slowest model. Trials that run in step all end late, so early in a run the
         calls are a better basis.
         """
-        total = self.planned - self.stored
+        total = self.trials.todo.total()
         if ended >= total:
             return None
-        parts = [
-            max(self._trials(self.done, model) / trials, share)
-            for model, share in self._shares().items()
-            if self._trials(self.done, model) < (trials := self._trials(self.todo, model))
-        ]
+        parts = []
+        for model, share in self._shares().items():
+            done = self._of(model, self.trials.done)
+            todo = self._of(model, self.trials.todo)
+            if done < todo:
+                parts.append(max(done / todo, share))
         part = min(parts, default=ended / total)
         return elapsed_s / part - elapsed_s if part else None
 
-    def _trials(self, by_arm: Counter[str], model: str) -> int:
-        """How many of these trials a model takes part in."""
+    def _of(self, model: str, by_arm: Counter[str]) -> int:
+        """Return the number of these trials that a model takes part in."""
         registered = self.plan.registered
         return sum(
             by_arm[arm.label]
@@ -140,27 +151,27 @@ class Progress:
         )
 
     def _shares(self) -> dict[str, float]:
-        """The share of its decisions that each model has made, of those that are left to it.
+        """Return the share of its decisions that each model has made, of those left to this run.
 
-        How many a trial takes is known when it has ended: the share is of the usual number.
+        The number in a trial is known when it has ended: the share is of the usual number.
         """
         expected, made = defaultdict[str, float](float), Counter[str]()
         for arm in self.plan.arms:
             for name in filter(arm.entries.get, arm.asked.values()):
                 model = self.plan.registered[name]
-                expected[model] += self.todo[arm.label] * usual_prompts(arm)
+                expected[model] += self.trials.todo[arm.label] * usual_prompts(arm)
         for name, meter in self.runner.meters.items():
             made[self.plan.registered.get(name, name)] += meter.calls_live + meter.calls_cached
         return {m: min(made[m] / calls, 0.99) for m, calls in expected.items() if calls}
 
     def _decided(self) -> Iterator[str]:
-        """How much of its decisions each model has made, or of all where one drives."""
+        """Yield the share of its decisions that each model has made."""
         shares = self._shares()
         for model, share in shares.items():
             yield f"{f'{model}: ' * (len(shares) > 1)}about {share:.0%} of the decisions"
 
     def _warnings(self) -> Iterator[str]:
-        if problem := self.unstored():
+        if problem := self.trials.unstored():
             yield problem
         for name, meter in self.runner.meters.items():
             yield from (f"another model answers: {pair}" for pair in sorted(meter.mismatches))
@@ -169,12 +180,12 @@ class Progress:
             yield from (f"{name}: {underpriced(tier)}" for tier in sorted(meter.underpriced))
 
     def _waits(self) -> list[str]:
-        """How many calls wait, for what, and the latest time until when, if known."""
+        """Return the number of waiting calls by their reason, with the latest end if known."""
         texts = []
-        for what, number in Counter(wait.what for wait in self.runner.waits).most_common():
-            ends = [w.until for w in self.runner.waits if w.what == what and w.until is not None]
+        for reason, number in Counter(wait.what for wait in self.runner.waits).most_common():
+            ends = [w.until for w in self.runner.waits if w.what == reason and w.until is not None]
             until = f" until {max(ends):%H:%M:%S} UTC" if ends else ""
-            texts.append(f"{number} {what}{until}")
+            texts.append(f"{number} {reason}{until}")
         return first_of(texts, "other reasons", REASONS_SHOWN)
 
 
@@ -235,7 +246,7 @@ async def show_progress(
 
 
 def terminal_text(progress: Progress) -> Text:
-    """What is shown on a terminal; text from a server must not be read as markup."""
+    """Return the text on a terminal; text from a server must not be read as markup."""
     from rich.text import Text
 
     mock = " (a mock)" if progress.plan.scripted else ""
@@ -247,40 +258,40 @@ def terminal_text(progress: Progress) -> Text:
 
 @dataclass
 class Log:
-    """The progress as short lines, where no terminal shows it: without what is as it should be.
+    """The progress as short lines, where no terminal shows it: only what is out of the ordinary.
 
-    What is a warning, or may be known once, is a line of its own.
+    A warning, or what may be known once, is a line of its own.
     """
 
-    said: str = ""
-    once: set[str] = field(default_factory=set)
+    last_line: str = ""
+    shown_once: set[str] = field(default_factory=set)
 
     def show(self, progress: Progress) -> None:
-        """Say where the sweep stands; once the trials have ended, only what is new."""
+        """Print the state of the run; once the trials have ended, only what is new."""
         snapshot = progress.snapshot("")
         for name, text in snapshot.rows:
             # Numbers of the same warning change.
-            same = re.sub(r"\d+", "", text)
-            if (name == "WARNING" or text == CLOSE_IT) and same not in self.once:
+            kind = re.sub(r"\d+", "", text)
+            if (name == "WARNING" or text == CLOSE_IT) and kind not in self.shown_once:
                 say(f"{name}: {text}")
-                self.once.add(same)
+                self.shown_once.add(kind)
         rows = dict(reversed(snapshot.rows))  # the first of each name
-        ended = snapshot.ended + snapshot.failed - progress.stored
+        ended = snapshot.ended + snapshot.failed - progress.trials.stored
         workers = progress.runner.workers
-        line = f"trials: {ended}/{progress.planned - progress.stored} ended"
+        line = f"trials: {ended}/{progress.trials.todo.total()} ended"
         line += "" if workers is None else f" on {workers} workers"
         line += f"; failed: {snapshot.failed}" if snapshot.failed else ""
         line += f"; cost: {rows['cost']}" if snapshot.cost_usd >= CENT_USD else ""
-        if line != self.said or progress.doing == "playing":
+        if line != self.last_line or progress.doing == "playing":
             waits = f"; waiting: {rows['waiting']}" if "waiting" in rows else ""
             say(
                 textwrap.shorten(f"{line}; {rows['time']}{waits}", LONGEST_LINE, placeholder=" ...")
             )
-        self.said = line
+        self.last_line = line
 
 
 def _notes(progress: Progress) -> list[str]:
-    """The clients' messages since the last call: each once, and the first SHOWN."""
+    """Return the clients' messages since the last call: each once, and the first few."""
     notes: dict[str, None] = {}
     for meter in progress.runner.meters.values():
         notes |= dict.fromkeys(meter.notes)

@@ -1,4 +1,4 @@
-"""The progress of a sweep in a small file beside the database, for other processes."""
+"""The progress of a sweep in a small file next to the database, for other processes."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class ProgressSnapshot(BaseModel):
 
     @property
     def alive(self) -> bool:
-        """Whether the sweep is still running, by its file and its process."""
+        """True where the sweep is still running, by its file and its process."""
         try:
             if self.machine == MACHINE:
                 os.kill(self.pid, 0)
@@ -77,12 +77,12 @@ def remove_snapshot(db: Path, sweep_id: str) -> None:
 
 
 def read_snapshot(db: Path, sweep_id: str) -> ProgressSnapshot | None:
-    """The snapshot of a sweep that runs, or was killed; None without a file."""
+    """Return the snapshot of a sweep that runs, or was killed; None without a file."""
     return _read(_path(db, sweep_id))
 
 
 def running(db: Path) -> list[ProgressSnapshot]:
-    """The snapshots of the sweeps into this database that are running now."""
+    """Return the snapshots of the sweeps into this database that are running now."""
     return [snapshot for _, snapshot in _snapshots(db) if snapshot.alive]
 
 

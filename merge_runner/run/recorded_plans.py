@@ -1,18 +1,17 @@
-"""The plans that lie within a recording, which replay it without a file of their study."""
+"""The plans in a recording, which replay it without a file of their study."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from contextlib import nullcontext
 from pathlib import Path
 
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.records import DAMAGED
-from merge_runner.results.database import read_database
 from merge_runner.results.recorded_sweeps import sweep_rows
 from merge_runner.results.recording import read_provenance
-from merge_runner.run.plan import Plan, find_parts, make_plan
+from merge_runner.run.parts import find_parts
+from merge_runner.run.plan import Plan, make_plan
 from merge_runner.study.crossing import MOST_TRIALS
 from merge_runner.study.file import study_files
 from merge_runner.study.parts import load_study
@@ -49,15 +48,12 @@ def recorded_plans(file: Path, *, db: Path, trust: bool) -> Iterator[Plan]:
 
 def _with_parts(plan: Plan, db: Path, *, trust: bool) -> Plan:
     _, catalogue = load_study(plan.study, trust=trust)
-    parts = find_parts(plan.arms, plan.conditions, catalogue)
-    if parts.replays_humans:
-        with read_database(db) if db.is_file() else nullcontext() as connection:
-            parts = parts.with_humans(connection)
+    parts = find_parts(plan.arms, plan.conditions, catalogue).with_humans_of(db)
     return plan.model_copy(update={"parts": parts})
 
 
 def _of_a_known_study(file: Path, name: str, config: dict[str, object], db: Path) -> Plan:
-    """The plan of an early recording, which names its study and does not hold it."""
+    """Return the plan of an early recording, which names its study and does not hold it."""
     if name not in study_files():
         raise UsageError(
             f"{file} is of the study {name}, and does not hold it: `merge-runner replay STUDY.toml "

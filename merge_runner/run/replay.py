@@ -12,7 +12,7 @@ from merge_runner.llm.recorded import RecordedCalls, RecordedReplies
 from merge_runner.records import Decision
 from merge_runner.run.guard import FirstDecisions
 from merge_runner.run.plan import Plan
-from merge_runner.run.trials import Room, TrialMaker
+from merge_runner.run.trials import Capacity, TrialMaker
 from merge_runner.trial import play_trial
 from merge_runner.trial_records import TrialRecord, TrialSpec
 
@@ -24,7 +24,7 @@ class Replay:
     plan: Plan
     calls: RecordedCalls
     running: int = 0
-    held: int = 0
+    waiting_for_money: int = 0
     waits: Sequence[Wait] = ()
     workers: None = None
     unsaved: str = "0 calls in flight"
@@ -32,7 +32,7 @@ class Replay:
     _ahead: dict[int, TrialRecord] = field(default_factory=dict)  # by order, until it is their turn
 
     def __post_init__(self) -> None:
-        """Find out which models are asked."""
+        """Make the models of the plan."""
         plan, formats = self.plan, self.plan.parts.formats
         self._trials = TrialMaker(plan)
         self._models = {
@@ -49,7 +49,7 @@ class Replay:
         return played or play_trial(self._trials.make(spec), self._decide)
 
     async def look_ahead(self, specs: Sequence[TrialSpec]) -> list[TrialRecord]:
-        """Play trials until a reply is found, and return them where none is.
+        """Play trials until one has a recorded reply, and return them where none has.
 
         They are not played again. Where no model is asked, there is nothing to find out.
         """
@@ -64,12 +64,12 @@ class Replay:
         self,
         specs: Sequence[TrialSpec],
         ended: Callable[[TrialSpec, TrialRecord], None],
-        room: Room | None = None,
+        capacity: Capacity | None = None,
     ) -> None:
         """Play trials in order, and let what is stored and shown meanwhile go on between two."""
         for spec in specs:
-            if room is not None:
-                await room()
+            if capacity is not None:
+                await capacity()
             await asyncio.sleep(0)
             self.running = 1
             ended(spec, self.play_one(spec))

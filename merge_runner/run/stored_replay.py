@@ -37,8 +37,10 @@ from merge_runner.registry import Catalogue, in_use, require, using
 from merge_runner.results.database import read_database
 from merge_runner.results.replay_misses import leaves
 from merge_runner.results.rows import Stored, in_order, rows_of
-from merge_runner.run.plan import Plan, find_parts
+from merge_runner.run.parts import find_parts
+from merge_runner.run.plan import Plan
 from merge_runner.run.replay import Replay
+from merge_runner.run.spec import trial_id
 from merge_runner.study.arms import Arm
 from merge_runner.study.parts import declared_catalogue
 from merge_runner.text_safety import one_line
@@ -93,8 +95,8 @@ def audit_database(
             _audit(connection, name, config, recorded, finished=finished)
             for name, config, finished in sweeps.values()
         ]
-        rest = [check_rest(connection, path)] if sweep_ids is None else []
-        return [*reversed(audits), *rest]
+        orphans = [check_rest(connection, path)] if sweep_ids is None else []
+        return [*reversed(audits), *orphans]
 
 
 def refuse_changed_programs(path: Path, plan: Plan, stored: Sequence[TrialSpec]) -> None:
@@ -120,8 +122,8 @@ def refuse_changed_programs(path: Path, plan: Plan, stored: Sequence[TrialSpec])
                 last = max((row[step] for row in driven), default=-1)
                 known = [row for row in states.rows.get(key, ()) if row[step] <= last]
                 states = replace(states, rows={key: known})
-            found = states.differences(key, driven, tolerance=TOLERANCE)
-            if difference := next(iter(found), None):
+            differences = states.differences(key, driven, tolerance=TOLERANCE)
+            if difference := next(iter(differences), None):
                 raise UsageError(
                     f"{' or '.join(programs[record.spec.arm])} drives otherwise than in the trial "
                     f"{key[0]} of {path} ({difference.text}): give its class another `revision`, "
@@ -149,7 +151,7 @@ def _audit(
             text = f"it disagrees with itself in {', '.join(wrong)}"
             problems.append(Finding("config", text, sweep_id))
         planned = {
-            plan.trial_id_of(arm, condition, repetition): ""
+            trial_id(arm, condition, repetition, sample_set=plan.sample_set, seat=plan.seat): ""
             for arm in plan.arms
             for condition in plan.conditions
             for repetition in range(1, arm.repetitions + 1)
@@ -208,12 +210,12 @@ def _replayable(
     """
     hashes = dict(connection.execute("SELECT trial_id, spec_hash FROM audited").fetchall())
     stored = dict(connection.execute("SELECT spec_hash, spec::VARCHAR FROM specs").fetchall())
-    wanted = plan.specs()
+    planned = plan.specs()
     for spec in specs:
         actual = hashes.get(spec.trial_id, spec.spec_hash)
         if actual == spec.spec_hash:
             continue
-        texts = (stored.get(actual, "{}"), wanted[spec.spec_hash])
+        texts = (stored.get(actual, "{}"), planned[spec.spec_hash])
         old, new = (dict(leaves(json.loads(text))) for text in texts)
         names = sorted(name for name in {**old, **new} if old.get(name) != new.get(name))
         if all(name.startswith(OF_THE_PROGRAM) for name in names):
@@ -298,7 +300,7 @@ def _attempt(number: int, row: Mapping[str, Any], form: WireFormat) -> Attempt:
     """Read the reply of a row anew.
 
     A failed attempt is taken as it is stored: its outcome depends on headers, which are not. The
-    mark of a stand-in may have been a header too, so that a stored ``scripted`` is believed.
+    mark of a mock model may have been a header too, so that a stored ``scripted`` is believed.
     """
     body = row["reply"]
     with suppress(TypeError, ValueError, RecursionError):
@@ -338,7 +340,7 @@ def _findings(
     if kind == "replay":
         ignored |= {name.removeprefix("calls.") for name in NOT_REPLAYED}
     for table, rows in rows_of(record).items():
-        found = tables[table].differences(key, rows, ignored=ignored, tolerance=TOLERANCE)
-        for difference in found:
-            where = (difference.place.get(name) for name in ("side", "decision"))
-            yield Finding(kind, difference.text, sweep_id, key[0], *where)
+        stored_rows = tables[table]
+        for difference in stored_rows.differences(key, rows, ignored=ignored, tolerance=TOLERANCE):
+            place = (difference.place.get(name) for name in ("side", "decision"))
+            yield Finding(kind, difference.text, sweep_id, key[0], *place)

@@ -14,7 +14,7 @@ from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, command_at
 from merge_runner.records import ReplayMiss
 from merge_runner.results.export import write_table
 from merge_runner.run.estimate import Estimate, usd_text
-from merge_runner.run.plan import Options
+from merge_runner.run.options import Options
 from merge_runner.text_safety import first_of
 from merge_runner.trial_records import Status
 
@@ -36,17 +36,17 @@ def as_dict(
     progress: Progress,
     expected: Estimate | None,
     checked: tuple[dict[str, Any], Audit] | None,
-    **told: object,
+    **ended_with: object,
 ) -> dict[str, Any]:
-    """The summary as JSON values; ``expected`` is the estimate made before the run, if any.
+    """Return the summary as JSON values; ``expected`` is the estimate before the run, if any.
 
-    ``checked`` is what the database holds of the sweep. From ``decisions`` on, values are there
-    where anything is stored. ``told`` goes into it.
+    ``checked`` are the facts of the database and their audit. From ``decisions`` on, values are
+    there where anything is stored. ``ended_with`` goes into it as it is.
     """
     plan, spending, meter = progress.plan, progress.ledger.spending, progress.meter()
     playing_s = ((progress.ended_at or progress.began_at) - progress.began_at).total_seconds()
     summary: dict[str, Any] = {
-        **told,
+        **ended_with,
         "name": plan.name,
         "run_name": options.name,
         "model": plan.model,
@@ -56,8 +56,8 @@ def as_dict(
         "cache": str(options.cache),
         "trials": {
             "planned": plan.trials,
-            "stored_before": progress.stored,
-            "suspended": progress.outcome_counts["suspended"],
+            "stored_before": progress.trials.stored,
+            "suspended": progress.trials.outcome_counts["suspended"],
         },
         "calls": {"live": meter.calls_live, "cached": meter.calls_cached},
         "calls_shared": meter.calls_shared,
@@ -102,7 +102,7 @@ def as_dict(
 
 
 def as_lines(summary: dict[str, Any]) -> Iterator[str]:
-    """The summary by ``as_dict`` for a reader."""
+    """Yield the lines of a summary by ``as_dict``."""
     is_stored = summary["audit"] is not None
     if summary["run_name"]:
         yield f"run: {summary['run_name']}"
@@ -117,7 +117,7 @@ def as_lines(summary: dict[str, Any]) -> Iterator[str]:
 
 
 def _results(summary: dict[str, Any]) -> Iterator[str]:
-    """How the trials ended, or what drivers do first."""
+    """Yield how the trials ended, or the first decisions."""
     if looks := summary["first_looks"]:
         yield as_table(looks)
     else:
@@ -132,21 +132,24 @@ def _results(summary: dict[str, Any]) -> Iterator[str]:
 
 
 def _outcomes(summary: dict[str, Any]) -> str:
-    """How the trials ended that are stored, in one line."""
+    """Return how the stored trials ended, in one line."""
     rows = {(row["factor"], row["level"]): row for row in summary["outcomes_by_level"]}
     whole = dict(rows.get(("condition", "all"), {"trials": 0}))
     trials, planned = whole.pop("trials"), summary["trials"]["planned"]
     of = f" of {planned}" if trials < planned else ""
     stored = summary["trials"]["stored_before"]
     before = f", {stored} of them stored before this run" if stored else ""
-    ways = [
-        f"{number} {way}" for way, number in whole.items() if isinstance(number, int) and number
+    outcome_counts = [
+        f"{number} {outcome}"
+        for outcome, number in whole.items()
+        if isinstance(number, int) and number
     ]
-    return f"trials: {trials}{of}" + (f" ({', '.join(ways)})" if ways else "") + before
+    outcomes = f" ({', '.join(outcome_counts)})" if outcome_counts else ""
+    return f"trials: {trials}{of}{outcomes}{before}"
 
 
 def calls_text(live: int, cached: int, shared: int, recorded: int) -> str:
-    """How many calls were asked, and how many had an answer.
+    """Return how many calls were asked, and how many had an answer.
 
     Of these ``shared`` ones got it in this run, and ``recorded`` ones from a recording that was
     named.
@@ -187,7 +190,7 @@ def _costs(summary: dict[str, Any]) -> Iterator[str]:
 
 
 def _faults(summary: dict[str, Any]) -> Iterator[str]:
-    """Who answered in whose place, what the audit says, and which trials failed."""
+    """Yield the models that answered for others, the audit, and the failed trials."""
     for pair, answers in summary["model_mismatches"].items():
         yield f"WARNING: another model answered than was asked for: {pair} ({answers} answers)"
     for driver, model, provider in summary["stand_ins"]:
@@ -203,10 +206,10 @@ def _faults(summary: dict[str, Any]) -> Iterator[str]:
         )
     audit = summary["audit"]
     audit_it = command_at("merge-runner audit", "--db", summary["db"], DEFAULT_DB)
-    found = f"{len(audit['findings'])} findings, which `{audit_it}` lists"
-    checked = found if audit["findings"] else "no problems"
+    findings = f"{len(audit['findings'])} findings, which `{audit_it}` lists"
+    checked = findings if audit["findings"] else "no problems"
     yield f"checked: {checked}; database: {summary['db']}"
-    notes = [f"note: {each}" for each in audit["notes"]]
+    notes = [f"note: {note}" for note in audit["notes"]]
     yield from first_of(notes, f"more notes: `{audit_it}`")
     failed = [f"failed: {trial_id}: {error}" for trial_id, error in summary["failed"].items()]
     yield from first_of(failed, "more, in the table trials")
@@ -215,7 +218,7 @@ def _faults(summary: dict[str, Any]) -> Iterator[str]:
 
 
 def as_table(rows: Sequence[dict[str, Any]]) -> str:
-    """The table of a few rows, numbers shortened; empty without a row."""
+    """Return a table of a few rows, numbers shortened; empty without a row."""
     text = StringIO()
     if rows:
         cells = ([f"{v:g}" if isinstance(v, float) else v for v in r.values()] for r in rows)

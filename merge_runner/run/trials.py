@@ -1,4 +1,4 @@
-"""What makes the trials of a plan, and what any player of them offers."""
+"""The trials of a plan, and the interface of whatever plays them."""
 
 from __future__ import annotations
 
@@ -19,39 +19,42 @@ from merge_runner.trial_records import TrialRecord, TrialSpec
 # Called with each trial that ends, or is suspended for lack of money.
 Ended = Callable[[TrialSpec, TrialRecord | TrialSuspended], None]
 # Awaited before a trial begins: returns once there is memory to hold the trial until it is stored.
-Room = Callable[[], Awaitable[None]]
+Capacity = Callable[[], Awaitable[None]]
 
 
 class Player(Protocol):
-    """What plays trials: from recorded replies, in this process, or on a cluster.
+    """Plays trials: from recorded replies, in this process, or on a cluster.
 
-    ``meters`` are by model, and ``first`` counts the first decisions of each.
+    ``meters`` are by model.
     """
 
-    first: FirstDecisions
     meters: dict[str, Meter]
 
     @property
+    def first(self) -> FirstDecisions:
+        """The first decisions of each model."""
+
+    @property
     def waits(self) -> Sequence[Wait]:
-        """What the calls wait for that are not in flight."""
+        """The reasons why calls wait that are not in flight."""
 
     @property
     def running(self) -> int:
-        """How many trials are under way."""
+        """The number of trials under way."""
 
     @property
-    def held(self) -> int:
-        """How many of them wait for money, as far as this process knows."""
+    def waiting_for_money(self) -> int:
+        """The number of them that wait for money, as far as this process knows."""
 
     @property
     def workers(self) -> int | None:
-        """On how many workers they are; None: in this process."""
+        """The number of workers that they are on; None: they are in this process."""
 
     @property
     def unsaved(self) -> str:
-        """What Ctrl-C waits for, in words."""
+        """Text of what an interrupted run saves before it ends."""
 
-    async def play(self, specs: Sequence[TrialSpec], ended: Ended, room: Room) -> None:
+    async def play(self, specs: Sequence[TrialSpec], ended: Ended, capacity: Capacity) -> None:
         """Play trials in order; an error raised by ``ended`` or outside a trial ends the run."""
 
     async def drain(self) -> None:

@@ -61,7 +61,7 @@ class Flusher:
         if self._problem is not None:
             self._drop_excess()
 
-    async def room(self) -> None:
+    async def wait_for_capacity(self) -> None:
         """Wait while too much is still to be stored, unless storing fails or has ended."""
         while self._problem is None and not self._task.done():
             if len(self._pending) <= MOST_PENDING and self._bytes <= MOST_PENDING_BYTES:
@@ -70,16 +70,16 @@ class Flusher:
 
     @property
     def left(self) -> int:
-        """How many trials are not stored yet."""
+        """The number of trials that are not stored yet."""
         return len(self._pending) + len(self.dropped)
 
     @property
     def problem(self) -> str:
-        """Why trials are not stored, as a line of text; empty where nothing is wrong."""
+        """The reason why trials are not stored, as text; empty where nothing is wrong."""
         if self._problem is None:
             return ""
-        what = f"{self.left} trials wait" if self.left else "how the sweep ended waits"
-        return f"{what} to be stored: {self._problem}"
+        waiting = f"{self.left} trials wait" if self.left else "how the sweep ended waits"
+        return f"{waiting} to be stored: {self._problem}"
 
     async def close(self) -> None:
         """Store the trials in memory, and leave the database reachable.
@@ -89,20 +89,20 @@ class Flusher:
         """
         self._closing = True
         await self._task
-        said = False
+        is_announced = False
         while not await self._flush() or self._pending:
             if isinstance(self._problem, StoreLocked):
-                if not said:
+                if not is_announced:
                     self._say(
                         f"the playing has ended; {self.problem}. Ctrl-C ends the waiting: all "
                         "replies are in the cache"
                     )
-                said = True
+                is_announced = True
                 await asyncio.sleep(EVERY_S)
             elif self._problem and self.left:
                 raise StoreError(f"{self.left} trials are not stored: {self._problem}. {AGAIN}")
             elif self._problem:
-                return  # whoever opens the database next will say what is wrong with it
+                return  # the next command that opens the database reports it
 
     @property
     def _bytes(self) -> int:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from merge_runner.audit.checks import audit_sweep, audited_database
 from merge_runner.cli import main
-from merge_runner.run import sweep
+from merge_runner.run import run_record
 
 
 def audited(path, sweep_id, planned, *, finished):
@@ -23,5 +23,5 @@ def audited(path, sweep_id, planned, *, finished):
 
 
 if __name__ == "__main__":
-    sweep.audit_sweep = audited
+    run_record.audit_sweep = audited
     main()

@@ -16,8 +16,10 @@ from aiohttp import web
 from merge_runner.emulator.server import HOST
 from merge_runner.records import SCRIPTED_FIELD, SLOT_HEADER
 from merge_runner.registry import GROUP
-from merge_runner.run.plan import Options, Plan
-from merge_runner.run.sweep import open_sweep
+from merge_runner.run.options import Options
+from merge_runner.run.plan import Plan
+from merge_runner.run.session import open_session
+from merge_runner.run.sweep import run
 from tests.support.mock_server import application
 
 PROJECT = Path(__file__).parents[2]
@@ -92,8 +94,8 @@ def environment(**changes: str) -> dict[str, str]:
 
 async def run_sweep(plan: Plan, options: Options, *, say: Callable[[str], None]) -> dict:
     """Play a plan in this process."""
-    async with open_sweep(plan, options, say=say) as sweep:
-        return await sweep.run()
+    async with open_session(plan, options, say=say) as session:
+        return await run(session)
 
 
 def each(usd: float) -> Callable[[int], float]:

@@ -5,20 +5,26 @@ from types import SimpleNamespace
 
 from merge_runner.llm.ledger import Cap, Spending
 from merge_runner.run.plan import make_plan
-from merge_runner.run.progress import Progress
+from merge_runner.run.progress import Progress, TrialCounts
 
 SPENDING = Spending(spent_usd=4.0, reserved_usd=0.25)
 LEDGER = SimpleNamespace(spending=SPENDING, committed_usd=SPENDING.committed_usd, cap=Cap(20))
 
 
-def runner(*meters, running=0, waits=(), held=0):
+def runner(*meters, running=0, waits=(), waiting_for_money=0):
     """Plays nothing, and has counted this."""
     named = dict(zip(("emulator", "another"), meters, strict=False))
-    return SimpleNamespace(meters=named, waits=waits, running=running, held=held, workers=None)
+    return SimpleNamespace(
+        meters=named,
+        waits=waits,
+        running=running,
+        waiting_for_money=waiting_for_money,
+        workers=None,
+    )
 
 
-def progress(runner, planned=10, **changes):
+def progress(runner, todo=None, **changes):
     """Of ten trials where nothing else is said, so that about 210 calls are expected."""
     plan = make_plan("baseline", "emulator")
-    changes.setdefault("todo", Counter(baseline=planned))
-    return Progress(plan, planned, runner, LEDGER, **changes)
+    trials = TrialCounts(Counter(baseline=10) if todo is None else todo)
+    return Progress(plan, runner, LEDGER, trials, **changes)

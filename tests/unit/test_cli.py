@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 
 import merge_runner as package
 from merge_runner.cli import complete_app
-from merge_runner.cli.app import alone
+from merge_runner.cli.app import app_with_one_command
 from merge_runner.cli.packages import GROUP, command_modules, load_commands
-from merge_runner.run.plan import Options
+from merge_runner.run.options import Options
 
 COMMANDS = {
     *("sweep", "replay", "sql", "digest", "models", "emulate", "recording", "audit"),
@@ -56,7 +56,8 @@ def test_a_command_has_its_options_where_those_of_the_others_are_left_out():
     whole = complete_app()
     for name in typer.main.get_command(whole).commands:
         for words in ([name, "-h"], ["-h"]):
-            shown, same = (CliRunner().invoke(each, words).output for each in (alone(name), whole))
+            apps = app_with_one_command(name), whole
+            shown, same = (CliRunner().invoke(app, words).output for app in apps)
             assert shown == same
             assert "Usage:" in shown
 

@@ -9,7 +9,8 @@ import pytest
 from aiohttp import web
 
 from merge_runner.results.store import results_digest
-from merge_runner.run.plan import Options, make_plan
+from merge_runner.run.options import Options
+from merge_runner.run.plan import make_plan
 from tests.integration.reliability.test_batches import PRICE, account, answered
 from tests.support.harness import a_model, run_sweep, watched
 from tests.support.mock_server import BatchPlan, FaultPlan
@@ -200,6 +201,6 @@ async def test_no_fault_of_a_batch_server_changes_a_result(play, case):
 
 
 async def test_a_trial_begins_where_one_ends_if_no_more_may_be_under_way(play, monkeypatch):
-    monkeypatch.setattr("merge_runner.run.sweep.MOST_IN_ROUNDS", 1)
+    monkeypatch.setattr("merge_runner.run.players.MOST_IN_ROUNDS", 1)
     digest, count = await play("openai", batch=True)
     assert (digest, count) == await play("openai")

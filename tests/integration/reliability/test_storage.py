@@ -17,7 +17,8 @@ from merge_runner.errors import StoreLocked
 from merge_runner.records import SLOT_HEADER
 from merge_runner.results.database import SCHEMA_VERSION
 from merge_runner.results.store import Store, results_digest
-from merge_runner.run.plan import Options, make_plan
+from merge_runner.run.options import Options
+from merge_runner.run.plan import make_plan
 from tests.support.gate import HANGS_S, Gate
 from tests.support.harness import run_sweep, watched
 
@@ -148,7 +149,7 @@ async def test_what_was_dropped_is_played_again_and_failed_trials_are_kept_as_th
     said, is_free, written = [], [], Store.write
     monkeypatch.setattr(Store, "write", write)
     monkeypatch.setattr("merge_runner.run.writer.BATCH", 2)
-    monkeypatch.setattr("merge_runner.run.sweep.BATCH", 2)
+    monkeypatch.setattr("merge_runner.run.playing.BATCH", 2)
     async with watched(fails) as server:
         monkeypatch.setenv("EMULATOR_BASE_URL", f"{server.url}/v1")
         conditions = ["L_4_0", "N_0_0", "R_-4_8", "L_4_8", "R_-4_0"]

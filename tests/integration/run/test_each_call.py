@@ -11,7 +11,8 @@ import pytest
 
 import merge_runner
 from merge_runner.run.local_runner import LocalRunner
-from merge_runner.run.plan import Options, make_plan
+from merge_runner.run.options import Options
+from merge_runner.run.plan import make_plan
 from merge_runner.run.replay import Replay
 from tests.support.harness import PROJECT, a_model, run_sweep
 

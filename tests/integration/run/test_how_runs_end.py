@@ -16,9 +16,10 @@ from merge_runner.errors import StoreError, StoreLocked
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.ledger import CallLabel, Ledger
 from merge_runner.results.store import Store
-from merge_runner.run import sweep, writer
+from merge_runner.run import run_record, writer
 from merge_runner.run.local_runner import LocalRunner
-from merge_runner.run.plan import Options, make_plan
+from merge_runner.run.options import Options
+from merge_runner.run.plan import make_plan
 from merge_runner.run.progress import Progress
 from merge_runner.run.progress_file import read_snapshot
 from tests.support.crossed_study import MODEL
@@ -89,7 +90,7 @@ async def test_a_writer_that_breaks_ends_the_run_before_more_is_asked(options, m
     ],
 )
 async def test_a_run_that_could_not_be_audited_has_ended(options, monkeypatch, fault, what):
-    monkeypatch.setattr(sweep, what, Mock(side_effect=fault))
+    monkeypatch.setattr(run_record, what, Mock(side_effect=fault))
     ours = isinstance(fault, KeyError)
     with pytest.raises(KeyError) if ours else contextlib.nullcontext():
         summary = await run(options, "constant")

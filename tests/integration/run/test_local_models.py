@@ -48,7 +48,7 @@ def serving(*names, status=200):
 async def test_a_server_s_one_model_is_asked_of_several_one_must_be_chosen_and_a_replay_finds_both(
     merge_runner, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("merge_runner.run.sweep.LONG_WAIT_S", 0)
+    monkeypatch.setattr("merge_runner.run.served_names.LONG_WAIT_S", 0)
     async with watched(serving("qwen3-8b")) as server:
         told = await merge_runner(*LOCAL, "--dry-run", LOCAL_BASE_URL=f"{server.url}/v1")
         assert (told.summary["trials"], server.requests) == (1, 0)

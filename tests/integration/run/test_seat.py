@@ -7,7 +7,7 @@ from aiohttp import web
 
 from merge_runner.records import SLOT_HEADER
 from merge_runner.results.store import query, results_digest
-from merge_runner.run.plan import USUAL_GRID
+from merge_runner.run.selection import USUAL_GRID
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from tests.support.crossed_study import MODEL
 from tests.support.harness import FAST, RECORDING, watched

@@ -7,7 +7,8 @@ from dataclasses import fields, is_dataclass
 import pytest
 
 from merge_runner.config import Perception, ScenarioConfig, model_in
-from merge_runner.run.plan import Options, make_plan
+from merge_runner.run.options import Options
+from merge_runner.run.plan import make_plan
 from merge_runner.run.sweep import unsent
 from merge_runner.study.file import StudyFile
 from tests.support.harness import PROJECT

@@ -17,7 +17,7 @@ from merge_runner.llm.ledger import CallLabel
 from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.llm.store import CachedCall
 from merge_runner.records import Attempt, CallFailed, ReplayMiss, Usage
-from merge_runner.run.cluster import Desk, ToldLedger
+from merge_runner.run.cluster_worker import RemoteLedger
 from tests.support.clients import PRICE, answer, begun, error, raw, slot, ticks
 from tests.support.virtual_time import now_s
 
@@ -289,15 +289,12 @@ async def test_drain_gives_up_calls_that_wait_for_their_turn(make):
         await client.ask("prompt", slot(3))
 
 
-@pytest.mark.parametrize("told", [False, True])
 @pytest.mark.parametrize("drains", [False, True])
-async def test_a_call_that_waits_for_its_coordinator_can_be_given_up(make, cache, drains, told):
-    client, desk = make(answer(), price=PRICE), Desk()
-    client.budget.ledger = ToldLedger(cache, "test", desk)
+async def test_a_call_that_waits_for_its_coordinator_can_be_given_up(make, cache, drains):
+    client, events = make(answer(), price=PRICE), []
+    client.money.ledger = RemoteLedger(cache, "test", lambda *event: events.append(event[:2]))
     asked = await begun(client.ask("prompt", slot()))
-    if told:
-        assert (await desk.exchange({})).asking.keys() == {1}
-    (waits,) = client.calls.waits
+    (waits,) = client.waits
     assert "coordinator" in waits.what
     if drains:
         await client.calls.drain()
@@ -305,13 +302,9 @@ async def test_a_call_that_waits_for_its_coordinator_can_be_given_up(make, cache
         asked.cancel()
     await asyncio.wait([asked])
     await ticks()
-    assert (client.direct.transport.sent, client.calls.waits, client.budget.queued_usd) == (
-        [],
-        [],
-        0,
-    )
-    assert (desk.told.asking, desk.told.costs) == ({}, {1: 0.0} if told else {})
-    assert client.budget.ledger.read().open_attempts == 0
+    assert (client.transport.sent, client.waits, client.money.queued_usd) == ([], [], 0)
+    assert events == [("reserve", 1), ("cost", 1)]
+    assert client.money.ledger.read().open_attempts == 0
 
 
 @pytest.mark.parametrize("in_flight", [False, True])

@@ -5,10 +5,13 @@ from pathlib import Path
 
 import pytest
 
+from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
 from merge_runner.records import Usage
 from merge_runner.run.estimate import estimate
-from merge_runner.run.plan import PROGRAMS, USUAL_GRID, Options, grid_conditions, make_plan
+from merge_runner.run.options import Options
+from merge_runner.run.plan import make_plan
+from merge_runner.run.selection import USUAL_GRID, grid_conditions
 from tests.support.cases import cases
 
 PLACES = (Path("m.duckdb"), Path("responses"))

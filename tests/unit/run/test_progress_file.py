@@ -10,7 +10,7 @@ import pytest
 from merge_runner.llm.ledger import Spending
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import make_plan
-from merge_runner.run.progress import Progress
+from merge_runner.run.progress import Progress, TrialCounts
 from merge_runner.run.progress_file import (
     clear_dead,
     read_snapshot,
@@ -25,7 +25,9 @@ LEDGER = SimpleNamespace(spending=Spending(), cap=None)
 
 def snapshot(sweep_id="s", **changes):
     plan = make_plan("baseline", "constant", repetitions=2, conditions=["N_0_0"])
-    plain = Progress(plan, 2, LocalRunner(plan, {}, 0), LEDGER, Counter()).snapshot(sweep_id)
+    plain = Progress(
+        plan, LocalRunner(plan, {}, 0), LEDGER, TrialCounts(Counter(baseline=2))
+    ).snapshot(sweep_id)
     return plain.model_copy(update=changes)
 
 

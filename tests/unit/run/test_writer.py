@@ -1,4 +1,4 @@
-"""Room for trials that are not stored yet."""
+"""Capacity for trials that are not stored yet."""
 
 import asyncio
 import threading
@@ -50,7 +50,7 @@ async def test_trials_wait_for_no_reader_and_no_flusher_that_is_gone_and_what_is
     flusher = flusher_of(store)
     for order in range(2 * MOST_PENDING):
         flusher.add(ended(order))
-    await asyncio.wait_for(flusher.room(), HANGS_S)
+    await asyncio.wait_for(flusher.wait_for_capacity(), HANGS_S)
     store.error = StoreError("the disk is full")
     said = r"the disk is full\. When|the writer of results has failed \(Key"
     with pytest.raises(StoreError, match=f"^{2 * MOST_PENDING} trials are not stored: ({said})"):
@@ -62,9 +62,9 @@ async def test_long_replies_wait_and_are_written_in_parts_of_bounded_size():
     flusher = flusher_of(store)
     most = MOST_PENDING_BYTES // (5 * MB) + 1
     for _ in range(most):
-        await asyncio.wait_for(flusher.room(), HANGS_S)
+        await asyncio.wait_for(flusher.wait_for_capacity(), HANGS_S)
         flusher.add(ended(size=5 * MB))
-    waiting = asyncio.create_task(flusher.room())
+    waiting = asyncio.create_task(flusher.wait_for_capacity())
     await asyncio.sleep(0.01)
     assert not waiting.done()
     store.go_on.set()
@@ -107,7 +107,7 @@ async def test_while_the_database_is_held_256_trials_stay_in_memory_and_the_fail
         await is_refused(flusher)
     for order in range(1, 500):
         flusher.add(ended(order, "failed" if order in (300, 400) else "collided"))
-        await asyncio.wait_for(flusher.room(), HANGS_S)
+        await asyncio.wait_for(flusher.wait_for_capacity(), HANGS_S)
     await is_refused(flusher)
     kept = [*range(256), 300, 400]
     dropped = [order for order in range(500) if order not in kept]

@@ -1,0 +1,277 @@
+"""The commands that play a study."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from dataclasses import asdict, replace
+from datetime import UTC, datetime
+from functools import partial, wraps
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from merge_runner.cli import options as cli
+from merge_runner.cli.options import agree, print_out
+from merge_runner.cli.signals import on_signal
+from merge_runner.errors import UsageError
+from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
+from merge_runner.text_safety import say
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from merge_runner.run.estimate import Estimate
+    from merge_runner.run.options import Options
+    from merge_runner.run.plan import Plan
+
+GRID = (
+    "With --first, in the place of the study's conditions: h=FROM:TO:STEP,dv=FROM:TO:STEP, "
+    "projected headways in m and relative velocities in m/s; usual: -6:6:2 and -1.6:1.6:0.4."
+)
+RUN_NAME = "What you call this run, as lists of runs and its summary show it."
+SAMPLES = "Another number draws a fresh set of samples."
+ORDER = "Another number draws another order of the trials."
+FIRST = "Only the first decision of both sides."
+DRY_RUN = "Only estimate: trials, calls, tokens, cost, time. Nothing is sent."
+SHOW_PROMPTS = "With --dry-run: print each prompt as its drivers read it."
+IN_FLIGHT = "Trials at once, over all workers."
+KEEP_GOING = "Go on with a model that gives no valid decision."
+REPLAY = "From recorded replies alone: no key, no network."
+MAX_COST = "Never spend more on this, over all its runs."
+STRICT = "Stop when another model answers."
+DASK = "Play on a Dask cluster: local:N, a scheduler's address, or its file."
+BATCH = "Send requests in the provider's batches: cheaper, but it takes hours."
+RECORDING = "Also replay from this file, without importing it; may be repeated."
+
+
+def init(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A new folder, or an empty one.")],
+) -> None:
+    """Write a folder with a study that runs, to change into your own.
+
+    Example: merge-runner init my-study
+    """
+    from merge_runner.study.file import write_folder
+
+    for path in write_folder(folder):
+        say(f"wrote {path}")
+    print_out(f"go on: cd {shlex.quote(str(folder))} && merge-runner sweep study.toml")
+
+
+def sweep(
+    studies: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="NAME...",
+            help="experiments/NAME.toml, or a path; baseline if none is named; to replay also a "
+            "recording, FILE.parquet. Several are played one after the other.",
+        ),
+    ] = None,
+    models: cli.ModelOption = None,
+    only: cli.OnlyOption = None,
+    mirror: Annotated[
+        bool, cli.flag("--mirror", "Also play two drivers both ways.", **cli.PLAYED)
+    ] = False,
+    repetitions: cli.RepsOption = None,
+    conditions: cli.ConditionsOption = None,
+    variants: cli.VariantsOption = None,
+    run_name: Annotated[str, cli.option("TEXT", RUN_NAME, "--name", **cli.PLAYED)] = "",
+    sample_set: Annotated[int, cli.option("N", SAMPLES, **cli.PLAYED)] = 0,
+    order_seed: Annotated[int, cli.option("N", ORDER, **cli.PLAYED)] = 0,
+    first: Annotated[bool, cli.flag("--first", FIRST, **cli.PLAYED)] = False,
+    grid: Annotated[str | None, cli.option("GRID", GRID, **cli.PLAYED)] = None,
+    dry_run: Annotated[bool, cli.flag("--dry-run", DRY_RUN, **cli.PACE)] = False,
+    show_prompts: Annotated[bool, cli.flag("--show-prompts", SHOW_PROMPTS, **cli.PACE)] = False,
+    max_cost_usd: Annotated[
+        float | None, cli.option("USD", MAX_COST, "--max-cost", min=0, **cli.PACE)
+    ] = None,
+    batch: Annotated[bool, cli.flag("--batch", BATCH, **cli.PACE)] = False,
+    in_flight: Annotated[int, cli.option("N", IN_FLIGHT, min=1, **cli.PACE)] = 200,
+    rpm: Annotated[int | None, cli.option("N", "Requests a minute.", min=1, **cli.PACE)] = None,
+    tpm: Annotated[int | None, cli.option("N", "Tokens a minute.", min=1, **cli.PACE)] = None,
+    dask: Annotated[str | None, cli.option("CLUSTER", DASK, **cli.PACE)] = None,
+    strict_model: Annotated[bool, cli.flag("--strict-model", STRICT, **cli.FAULTS)] = False,
+    keep_going: Annotated[bool, cli.flag("--keep-going", KEEP_GOING, **cli.FAULTS)] = False,
+    replay: Annotated[bool, cli.flag("--replay", REPLAY, **cli.REPLAY)] = False,
+    recordings: Annotated[
+        list[Path] | None, cli.option("FILE", RECORDING, "--recording", **cli.REPLAY)
+    ] = None,
+    db: cli.DbOption = DEFAULT_DB,
+    cache: cli.CacheOption = DEFAULT_CACHE,
+    yes: cli.YesOption = False,
+    trust: cli.TrustOption = False,
+    quiet: Annotated[bool, cli.flag("--quiet", "Show no progress.", **cli.ASKED)] = False,
+    as_json: cli.JsonOption = False,
+) -> None:
+    """Run a study. What is already stored is not run again.
+
+    Example: merge-runner sweep baseline --model o3 --dry-run
+    """
+    from merge_runner.run.options import Options
+    from merge_runner.run.plan import make_plan
+
+    if not isfinite(max_cost_usd or 0):
+        raise UsageError("--max-cost is a number of USD")
+    if show_prompts and not dry_run:
+        raise UsageError("--show-prompts goes with --dry-run")
+    if recordings and not replay:
+        raise UsageError("--recording goes with a replay; to keep its replies: recording import")
+    options = Options(
+        db=db,
+        cache=cache,
+        in_flight=in_flight,
+        rpm=rpm,
+        tpm=tpm,
+        max_cost_usd=max_cost_usd,
+        replay=replay,
+        recordings=recordings or (),
+        strict_model=strict_model,
+        keep_going=keep_going,
+        quiet=quiet,
+        dask=dask,
+        batch=batch,
+        typed=sys.argv[1:],
+        name=run_name,
+    )
+    make = partial(
+        make_plan,
+        models=models or (),
+        repetitions=repetitions,
+        conditions=cli.listed(conditions),
+        variants=cli.listed(variants),
+        sample_set=sample_set,
+        order_seed=order_seed,
+        only=cli.levels(only or (), "--only"),
+        db=db,
+        mirror=mirror,
+        first=first,
+        grid=grid,
+        trust=trust,
+    )
+    sizes = (repetitions, grid, conditions, variants)
+    chosen = any((*sizes, models, only, mirror, first, sample_set, order_seed))
+    whole = any(size is not None for size in sizes)
+    if dry_run:
+        play = partial(_estimate, show_prompts=show_prompts, as_json=as_json)
+    else:
+        play = partial(_play, whole=whole, yes=yes, as_json=as_json)
+    plans = partial(_plans, make=make, options=options, chosen=chosen, trust=trust)
+    sys.exit(_play_all(studies or ["baseline"], plans, play, options))
+
+
+def _play_all(
+    studies: Sequence[str],
+    plans: Callable[[str], list[Plan]],
+    play: Callable[[Plan, Options], int],
+    options: Options,
+) -> int:
+    """Play studies one after the other; return the first exit code that is not 0."""
+    if len(studies) > 1:  # all are looked at before the first one is played
+        ledgers = [plan.ledger for name in studies for plan in plans(name)]
+        options = replace(options, ledgers=() if options.max_cost_usd is None else ledgers)
+    codes = []
+    for name in studies:
+        if len(studies) > 1:
+            say(f"{name}:")
+        files = [Path(name)] if name.endswith(".parquet") else []
+        played = replace(options, recordings=(*files, *options.recordings))
+        codes += [play(plan, played) for plan in plans(name)]
+        # Trials that failed, or are not recorded, are no reason to leave the next sweep out.
+        if codes[-1] not in (0, 1, 4):
+            break
+    return next(filter(None, codes), 0)
+
+
+def _plans(
+    name: str, *, make: Callable[[str], Plan], options: Options, chosen: bool, trust: bool
+) -> list[Plan]:
+    """Return the plan of a study, or those in a recording; ``chosen``: only a part is wanted."""
+    from merge_runner.run.recorded_plans import recorded_plans
+
+    if name.endswith(".parquet"):
+        _refuse_a_part(name, chosen=chosen, replay=options.replay)
+        return [*recorded_plans(Path(name), db=options.db, trust=trust)]
+    plan = make(name)
+    if options.dask is not None and (options.replay or plan.replays_humans):
+        raise UsageError("a replay needs no cluster: leave --dask out")
+    return [plan]
+
+
+def _refuse_a_part(recording: str, *, chosen: bool, replay: bool) -> None:
+    """Raise UsageError unless a recording is replayed whole."""
+    if not replay:
+        raise UsageError(f"{recording} is a recording: merge-runner replay {recording}")
+    if chosen:
+        raise UsageError(
+            f"{recording} is replayed as it was played: for a part of it, or other models, name "
+            f"its study: merge-runner replay STUDY --recording {recording}"
+        )
+
+
+@wraps(sweep, assigned=["__annotations__"])
+def replay(**options: Any) -> None:  # noqa: ANN401 # those of sweep
+    """Run a study again from recorded replies alone: no key, no network.
+
+    Example: merge-runner replay theirs.parquet
+    """
+    sweep(**{**options, "replay": True})
+
+
+def _say_shutdowns(plan: Plan, options: Options) -> None:
+    from merge_runner.llm.models import shutdown_notes
+
+    if not options.replay:
+        asked = {plan.registered[name]: entry for name, entry in plan.entries.items()}
+        for note in shutdown_notes(asked, datetime.now(UTC).date()):
+            say(note)
+
+
+def _estimate(plan: Plan, options: Options, *, show_prompts: bool, as_json: bool) -> int:
+    """Print the estimate of a plan; return the exit code."""
+    import asyncio
+
+    from merge_runner.run import estimate_lines as lines
+    from merge_runner.run.sweep import unsent
+
+    _say_shutdowns(plan, options)
+    expected = asyncio.run(unsent(plan, options, say=say))
+    if as_json:
+        prompts = {"prompts": lines.shown_prompts(plan)} if show_prompts else {}
+        print_out(json.dumps(asdict(expected) | prompts, ensure_ascii=False))
+        return 0
+    blocks = lines.shown_prompt_lines if show_prompts else lines.prompt_lines
+    sent = ["Nothing was sent."] if expected.trials else []
+    print_out("\n".join([*lines.estimate_lines(expected), *blocks(plan), *sent]))
+    return 0
+
+
+def _play(plan: Plan, options: Options, *, whole: bool, yes: bool, as_json: bool) -> int:
+    """Play a plan; return the exit code."""
+    import asyncio
+
+    from merge_runner.run import sweep as running
+    from merge_runner.run.estimate_lines import estimate_lines
+    from merge_runner.run.interrupt import INTERRUPTED
+    from merge_runner.run.summary import as_lines
+
+    _say_shutdowns(plan, options)
+
+    def ask(expected: Estimate) -> None:
+        lines = "\n".join(estimate_lines(expected))
+        agree(lines, "Go ahead?", otherwise="nothing was sent", yes=yes)
+
+    try:
+        playing = running.play(plan, options, whole=whole, say=say, agree=ask, stopping=on_signal)
+        facts = asyncio.run(playing)
+    except KeyboardInterrupt:  # before the trials began or after they ended
+        say("interrupted: run the same command again to go on")
+        return INTERRUPTED
+    as_text = json.dumps(facts, ensure_ascii=False) if as_json else "\n".join(as_lines(facts))
+    print_out(as_text)
+    for message in facts["messages"]:
+        say(f"error: {message}")
+    return int(facts["exit_code"])

@@ -1,0 +1,107 @@
+"""Connects to a Dask cluster, or starts a local one."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import signal
+from collections.abc import AsyncIterator, Iterable, Iterator
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
+from multiprocessing import resource_tracker
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from merge_runner.errors import UsageError
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+CONNECT_TIMEOUT_S = 10
+_WHERE = re.compile(
+    r"local:(?P<workers>[1-9]\d*)|(?P<file>.+\.json)|((tcp|tls)://)?(?!local:)[^\s/]+:[1-9]\d*",
+    re.ASCII,
+)
+VALID = (
+    "valid: local:N (N workers on this machine), a scheduler's tcp://HOST:PORT or tls://HOST:PORT, "
+    "or its file PATH.json"
+)
+# Those with a level of their own: Dask logs tracebacks for what we report in a line, such as lost
+# workers, and so do the libraries below it.
+LOGGERS = ("distributed", "distributed.client", "tornado", "tornado.application")
+
+
+@contextmanager
+def _silenced(loggers: Iterable[logging.Logger]) -> Iterator[None]:
+    """Let loggers say nothing for a while."""
+    levels = [(logger, logger.level) for logger in loggers]
+    try:
+        for logger, _ in levels:
+            logger.setLevel(logging.CRITICAL + 1)
+        yield
+    finally:
+        for logger, level in levels:
+            logger.setLevel(level)
+
+
+@contextmanager
+def _environment_restored() -> Iterator[None]:
+    """Undo what is set meanwhile: Dask sets variables of this process for those it starts."""
+    before = {**os.environ}
+    try:
+        yield
+    finally:
+        for name in {*os.environ} - {*before}:
+            del os.environ[name]
+        os.environ.update(before)
+
+
+@asynccontextmanager
+async def connected(where: str) -> AsyncIterator[Client]:
+    """Connect to the cluster that ``--dask`` names, or start a local one; raises UsageError."""
+    named = _WHERE.fullmatch(where)
+    is_file = Path(where).is_file()  # noqa: ASYNC240 # nothing else runs yet
+    if named is None or (named["file"] and not is_file):
+        raise UsageError(f"--dask {where!r} names no cluster; {VALID}")
+    try:
+        import distributed
+    except ModuleNotFoundError as exc:
+        raise UsageError(
+            "--dask needs the package distributed: pip install 'merge-runner[dask]'"
+        ) from exc
+
+    async with AsyncExitStack() as stack:
+        stack.enter_context(_silenced(map(logging.getLogger, LOGGERS)))
+        scheduler = {"scheduler_file" if named["file"] else "address": where}
+        if named["workers"]:
+            stack.enter_context(_environment_restored())
+            os.environ["PYTHONSAFEPATH"] = "1"  # workers import nothing of this folder
+            # A terminal's Ctrl-C reaches this process alone, which stops them in order: children
+            # inherit what is blocked. The tracker, if it were started meanwhile, would unblock it.
+            resource_tracker.ensure_running()
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGHUP))
+            try:
+                local = distributed.LocalCluster(
+                    n_workers=int(named["workers"]),
+                    threads_per_worker=1,
+                    dashboard_address=None,
+                    # Its server of HTTP is started all the same: at any port that is free.
+                    scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
+                    silence_logs=logging.CRITICAL,
+                    asynchronous=True,
+                )
+                cluster = await stack.enter_async_context(local)
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            scheduler = {"address": str(cluster.scheduler_address)}
+        client = distributed.Client(**scheduler, asynchronous=True, timeout=CONNECT_TIMEOUT_S)
+        try:
+            await client
+        except (OSError, ValueError) as exc:
+            raise UsageError(
+                f"no Dask scheduler answers at {where} within {CONNECT_TIMEOUT_S} s; {VALID}"
+            ) from exc
+        stack.push_async_callback(client.close, timeout=CONNECT_TIMEOUT_S)
+        if named["workers"]:  # the first of them would get the share of all
+            await client.wait_for_workers(int(named["workers"]))
+        yield client

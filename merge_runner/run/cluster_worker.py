@@ -1,0 +1,250 @@
+"""A chunk of trials on a worker of a Dask cluster, played on the worker's event loop."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import pickle
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AsyncExitStack, closing
+from dataclasses import astuple, dataclass, field, replace
+from functools import cache, partial
+from itertools import count
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import merge_runner
+from merge_runner.errors import MergeRunnerError, SweepStopped, TrialSuspended, UsageError
+from merge_runner.llm.attempts import Meter
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.call import Calls
+from merge_runner.llm.durable import Rows
+from merge_runner.llm.ledger import CallLabel, Cap, Ledger
+from merge_runner.llm.limiter import Limiter
+from merge_runner.llm.store import CachedCall
+from merge_runner.records import Attempt, Usage
+from merge_runner.registry import plugin_sources, using
+from merge_runner.run.clients import live_clients
+from merge_runner.run.guard import FirstDecisions
+from merge_runner.run.local_runner import LocalRunner
+from merge_runner.run.options import Options
+from merge_runner.run.plan import Plan
+from merge_runner.study.parts import catalogue_of
+from merge_runner.trial_records import TrialRecord, TrialSpec
+
+if TYPE_CHECKING:
+    from distributed import Worker
+
+# The coordinator may be slow, or its machine suspended; one that is gone never answers.
+SILENT_S = 300
+# The calls with an answer, and by key the attempts at those without one.
+Recorded = tuple[Sequence[CachedCall], Sequence[tuple[str, tuple[Attempt, ...]]]]
+
+
+@dataclass(frozen=True, slots=True)
+class RunSetup:
+    """A run and how it is played; ``urls`` are the coordinator's base URLs."""
+
+    run: str
+    plan: Plan
+    options: Options
+    earlier: Mapping[str, Usage | None]
+    first: FirstDecisions
+    urls: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Chunk:
+    """Trials for one worker, what is recorded of their calls, and its ``share`` of the limits.
+
+    Its attempts are reserved under its ``name`` until it ends. The options of ``setup`` have its
+    share of the trials in flight, and ``cap`` that of the money.
+    """
+
+    name: str
+    setup: RunSetup
+    cap: Cap | None
+    specs: Sequence[TrialSpec]
+    share: float
+    recorded: Recorded
+    overruns: Sequence[tuple[str, float]]
+
+
+@dataclass(slots=True)
+class Played:
+    """Result of a chunk; ``spent`` and ``opened`` are rows of the worker's ledger."""
+
+    ended: list[tuple[TrialSpec, TrialRecord | TrialSuspended]] = field(default_factory=list)
+    recorded: Recorded = ((), ())
+    spent: Rows = field(default_factory=list)
+    opened: Rows = field(default_factory=list)
+    meters: Mapping[str, Meter] = field(default_factory=dict)
+    error: MergeRunnerError | None = None
+
+
+class RemoteLedger(Ledger):
+    """Ledger of a chunk, whose attempts the coordinator reserves before they are sent.
+
+    ``tell`` sends it ``"reserve"`` with an attempt's worst case, and then ``"cost"`` with its cost,
+    each with the attempt's number.
+    """
+
+    is_shared_out = True
+
+    def __init__(
+        self, store: ResponseCache, scope: str, cap: Cap | None, tell: Callable[..., object]
+    ) -> None:
+        super().__init__(store, scope, cap)
+        self._tell = tell
+        self._numbers = count(1)
+        self._waiting: dict[int, asyncio.Future[bool]] = {}
+        self._reserved: dict[str, tuple[int, CallLabel]] = {}  # a call has one attempt at a time
+
+    async def ask_coordinator(self, key: str, usd: float, label: CallLabel) -> bool:
+        """Let the coordinator reserve an attempt; False if that exceeds the cap."""
+        number = next(self._numbers)
+        answer = self._waiting[number] = asyncio.get_running_loop().create_future()
+        self._tell("reserve", number, usd, label)
+        try:
+            async with asyncio.timeout(SILENT_S):
+                is_paid: bool = await answer
+        except TimeoutError as exc:
+            raise SweepStopped(f"the coordinator has said nothing for {SILENT_S} s") from exc
+        except asyncio.CancelledError:
+            self._tell("cost", number, 0.0, label)  # it may be reserved
+            raise
+        finally:
+            del self._waiting[number]
+        if is_paid:
+            self._reserved[key] = number, label
+        return is_paid
+
+    def answer(self, answers: Mapping[int, bool]) -> None:
+        """Take the coordinator's answers, by the attempts' numbers."""
+        for number, is_paid in answers.items():
+            if number in self._waiting and not self._waiting[number].done():
+                self._waiting[number].set_result(is_paid)
+
+    def report_cost(self, key: str, usd: float | None) -> None:
+        """Tell what an attempt that may be reserved has cost, where that is known."""
+        number, label = self._reserved.pop(key, (0, CallLabel()))
+        if number and usd is not None:
+            self._tell("cost", number, usd, label)
+
+
+@dataclass
+class WorkerRun:
+    """State of a run on a worker, from one chunk to the next; limiters are by share and model."""
+
+    stopping: asyncio.Event = field(default_factory=asyncio.Event)
+    limiters: dict[float, dict[str, Limiter]] = field(default_factory=dict)
+    plan: Plan | None = None
+    # By the name of the chunk under way.
+    ledgers: dict[str, RemoteLedger] = field(default_factory=dict)
+
+
+def _state(run: str, worker: Worker) -> WorkerRun:
+    state: WorkerRun = worker.extensions.setdefault(run, WorkerRun())
+    return state
+
+
+def answer(run: str, name: str, answers: Mapping[int, bool], *, dask_worker: Worker) -> None:
+    """Give a chunk the coordinator's answers."""
+    ledger = _state(run, dask_worker).ledgers.get(name)
+    if ledger is not None:
+        ledger.answer(answers)
+
+
+def stop(run: str, *, dask_worker: Worker) -> None:
+    """Let the calls of a run's chunk end, which then returns what there is."""
+    _state(run, dask_worker).stopping.set()
+
+
+@cache
+def fingerprint() -> str:
+    """Return the version and a hash of all source and plug-ins."""
+    code = hashlib.sha256()
+    for source in (Path(merge_runner.__file__).parent, *plugin_sources()):
+        for path in sorted(source.rglob("*.py")) if source.is_dir() else [source]:
+            code.update(f"{source.name}/{path.relative_to(source)}\0".encode() + path.read_bytes())
+    return f"{merge_runner.__version__} ({code.hexdigest()[:12]})"
+
+
+async def play_chunk(program: str, pickled: bytes, *, dask_worker: Worker) -> Played:
+    """Play a Chunk, which only a worker with the same ``program`` can read."""
+    if fingerprint() != program:
+        differs = UsageError(
+            f"it has merge-runner {fingerprint()}, and the coordinator {program}: install the same "
+            "one for all, with the same plug-ins"
+        )
+        return Played(error=differs)
+    # Dask's profiler samples all threads; Python 3.11 can deadlock there.
+    dask_worker.periodic_callbacks["profile"].stop()
+    chunk: Chunk = pickle.loads(pickled)  # noqa: S301 # a scheduler runs any code
+    state = _state(chunk.setup.run, dask_worker)
+    try:
+        if state.plan is None:
+            state.plan = _with_code(chunk.setup.plan)
+    except MergeRunnerError as exc:
+        return Played(error=type(exc)(str(exc)))
+    chunk = replace(chunk, setup=replace(chunk.setup, plan=state.plan))
+
+    def tell(kind: str, number: int, usd: float, label: CallLabel) -> None:
+        dask_worker.log_event(chunk.setup.run, (chunk.name, kind, number, usd, astuple(label)))
+
+    with using(state.plan.parts.catalogue):
+        try:
+            return await _play(chunk, state, tell)
+        finally:
+            state.ledgers.pop(chunk.name, None)
+
+
+def _with_code(plan: Plan) -> Plan:
+    """Return the plan with its programs, and all that its study adds, made from their sources."""
+    study = plan.study
+    catalogue = catalogue_of(study.file, study.text, study.plugins)
+    return plan.model_copy(update={"parts": plan.parts.with_code(plan.arms, catalogue)})
+
+
+async def _play(chunk: Chunk, state: WorkerRun, tell: Callable[..., object]) -> Played:
+    setup, played = chunk.setup, Played()
+
+    def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
+        if isinstance(record, TrialSuspended):
+            record = TrialSuspended(str(record))  # without its frames, which no pickle can hold
+        played.ended.append((spec, record))
+
+    async with AsyncExitStack() as stack:
+        folder = Path(stack.enter_context(TemporaryDirectory(prefix="merge-runner-")))
+        replies = stack.enter_context(closing(ResponseCache(folder)))
+        ledger = RemoteLedger(replies, setup.plan.ledger, chunk.cap, tell)
+        state.ledgers[chunk.name] = ledger
+        overruns = [(driver, 0, 0, ratio) for driver, ratio in chunk.overruns]
+        replies.put_now(*chunk.recorded, [partial(ledger.share, "", overruns, [])])
+        try:
+            calls = Calls()
+            clients = live_clients(
+                setup.plan, setup.options, setup.earlier, replies, ledger, calls=calls, stack=stack,
+                urls=setup.urls, share=chunk.share,
+                limiters=state.limiters.setdefault(chunk.share, {}),
+            )  # fmt: skip
+            in_flight = setup.options.in_flight
+            runner = LocalRunner(setup.plan, clients, in_flight, setup.first, calls=calls)
+            played.meters = runner.meters
+            work = asyncio.create_task(runner.play(chunk.specs, ended))
+            stopped = asyncio.create_task(state.stopping.wait())
+            await asyncio.wait([work, stopped], return_when=asyncio.FIRST_COMPLETED)
+            work.cancel()
+            stopped.cancel()
+            await asyncio.wait([work])
+            await runner.drain()
+            if not work.cancelled():
+                work.result()
+        except MergeRunnerError as exc:
+            played.error = type(exc)(str(exc))
+        known = {call.request.key for call in chunk.recorded[0]}
+        new = [call for call in replies.entries() if call.request.key not in known]
+        played.recorded = new, [*replies.all_unanswered().items()]
+        played.spent, played.opened = ledger.rows()
+    return played

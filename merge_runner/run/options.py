@@ -1,0 +1,54 @@
+"""The options of a run, as its user gives them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from merge_runner.providers import ModelEntry
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """The options of a run; none of them changes a result.
+
+    ``rpm`` and ``tpm`` override the registry's. ``max_cost_usd`` is a cap over ``ledgers``, too,
+    those of other sweeps. ``dask`` names the cluster that plays the trials; None: this process. A
+    ``dry_run`` sends nothing, a ``quiet`` run shows no progress, and one that is to ``keep_going``
+    asks a model on that gives no valid decision. In a ``batch`` run all trials ask together, at a
+    lower price. ``typed`` are the command's words after the program's name, with which it goes on.
+    ``name`` is what its user calls the run.
+    """
+
+    db: Path
+    cache: Path
+    in_flight: int = 200
+    rpm: int | None = None
+    tpm: int | None = None
+    max_cost_usd: float | None = None
+    ledgers: Sequence[str] = ()
+    replay: bool = False
+    recordings: Sequence[Path] = ()
+    strict_model: bool = False
+    keep_going: bool = False
+    quiet: bool = False
+    dask: str | None = None
+    dry_run: bool = False
+    batch: bool = False
+    typed: Sequence[str] = ()
+    name: str = ""
+
+    @property
+    def connections(self) -> int:
+        """The number of connections that a model may need: both drivers may ask at once."""
+        return 2 * self.in_flight
+
+    @property
+    def sends_nothing(self) -> bool:
+        """True where no model may be asked."""
+        return self.replay or self.dry_run
+
+    def rates(self, entry: ModelEntry) -> tuple[int | None, int | None]:
+        """Return the requests and tokens a minute that a model may get; None: no limit."""
+        return self.rpm or entry.rpm, self.tpm or entry.tpm

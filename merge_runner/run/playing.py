@@ -1,0 +1,179 @@
+"""Plays the trials of a run and stores them, until all have ended or the run is stopped."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+
+from merge_runner.errors import StoreError, TrialSuspended
+from merge_runner.results.replay_misses import Miss
+from merge_runner.run.interrupt import GO_ON, INTERRUPTED, Stopping
+from merge_runner.run.progress import REASONS_SHOWN, Progress
+from merge_runner.run.replay import Replay
+from merge_runner.run.session import Session, misses_of
+from merge_runner.run.writer import AGAIN, BATCH, Flusher
+from merge_runner.text_safety import first_of
+from merge_runner.trial_records import TrialRecord, TrialSpec
+
+SHOWN = 5  # trials that are stored otherwise
+
+
+@dataclass
+class Endings:
+    """Counts how trials end, as they end, and hands them to the writer."""
+
+    session: Session
+    progress: Progress
+    flusher: Flusher
+    misses: list[Miss] = field(default_factory=list)
+    suspended: Counter[str] = field(default_factory=Counter)  # by drivers and prompt
+    why_suspended: str = ""
+
+    def add(self, spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
+        """Take a trial that has ended, or is suspended for lack of money."""
+        counts = self.progress.trials.outcome_counts
+        if isinstance(record, TrialSuspended):
+            counts["suspended"] += 1
+            self.suspended[_played_as(spec)] += 1
+            self.why_suspended = str(record)
+            return
+        counts[record.status] += 1
+        self.progress.trials.done[spec.arm] += 1
+        self.misses += misses_of(record)
+        self.flusher.add(record)
+
+    def note_suspended(self) -> None:
+        """Note that trials wait for money, where any do."""
+        if not self.suspended:
+            return
+        waiting = dict.fromkeys(map(_played_as, self.session.todo), 0) | self.suspended
+        self.session.fail(
+            TrialSuspended.exit_code,
+            f"{self.suspended.total()} trials wait for money{_unbalanced(waiting)}: "
+            f"{self.why_suspended}. Their replies are kept: raise --max-cost, or the study's "
+            "budget, and run the same command again",
+        )
+
+    def note_failed(self) -> None:
+        """Note the trials that failed, by what they lack where that is known."""
+        failed = self.progress.trials.outcome_counts["failed"]
+        self.session.fail_by_misses(self.misses)
+        if failed and not self.misses:
+            self.session.fail(1, f"{failed} trials failed")
+
+
+async def play_and_store(
+    session: Session, progress: Progress, flusher: Flusher, stopping: Stopping
+) -> tuple[bool, bool]:
+    """Play what is missing, and store it; what goes wrong is noted in the session.
+
+    Returns two truth values: all is stored (not where Ctrl-C ended the waiting for a database that
+    another program holds), and the task that runs it was cancelled.
+    """
+    endings = Endings(session, progress, flusher)
+    progress.trials.unstored = lambda: flusher.problem
+    try:
+        cancelled = await _play(endings, stopping)
+        endings.note_suspended()
+    finally:
+        progress.ended_at = datetime.now(UTC)
+        is_stored = await _store_rest(session, flusher, stopping)
+    endings.note_failed()
+    return is_stored, cancelled
+
+
+async def _play(endings: Endings, stopping: Stopping) -> bool:
+    """Play trials until all have ended, or the run is stopped; return whether it is cancelled.
+
+    Two tasks, since Ctrl-C stops the trials but lets the calls that are paid for end.
+    """
+    session, flusher, player = endings.session, endings.flusher, endings.progress.runner
+    work = asyncio.create_task(
+        player.play(session.todo, endings.add, capacity=flusher.wait_for_capacity)
+    )
+    flusher.on_break = work.cancel  # no money is spent on what cannot be stored
+
+    async def drained() -> None:
+        await asyncio.wait([work])
+        await player.drain()
+
+    drain = asyncio.create_task(drained())
+
+    def interrupted() -> None:
+        work.cancel()  # before anything is written: the terminal may be closed
+        session.say(f"Stopping: {player.unsaved} are saved first; Ctrl-C again drops them.")
+
+    cancelled = False
+    with stopping(interrupted, drain.cancel):
+        try:
+            await asyncio.wait([drain])
+        except asyncio.CancelledError:  # by the caller of this task
+            cancelled = True
+            interrupted()
+            await asyncio.wait([drain])
+        finally:
+            drain.cancel()
+        await asyncio.wait([work])
+    if not work.cancelled():
+        session.fail_by(work.exception())
+    elif not flusher.broken:  # whose error is noted when the rest is stored
+        session.fail(INTERRUPTED, f"Interrupted. {GO_ON}")
+    return cancelled
+
+
+async def _store_rest(session: Session, flusher: Flusher, stopping: Stopping) -> bool:
+    """Store what is not stored yet; False where Ctrl-C ended the waiting for that."""
+    closing = asyncio.create_task(_store_all(session, flusher))
+    with stopping(None, closing.cancel):
+        try:
+            await asyncio.wait([closing])
+        finally:
+            closing.cancel()
+    if closing.cancelled():
+        why = f": {flusher.problem}. {AGAIN}" if flusher.problem else ". " + GO_ON
+        session.fail(INTERRUPTED, f"Interrupted{why}")
+        return False
+    session.fail_by(closing.exception())
+    if flusher.differing:
+        differing = [*flusher.differing.items()][:SHOWN]
+        shown = [f"{trial_id} ({', '.join(columns)})" for trial_id, columns in differing]
+        session.fail(
+            StoreError.exit_code,
+            f"{len(flusher.differing)} trials are stored otherwise in {session.options.db}, "
+            f"which is left as it is: {'; '.join(shown)}. Replay into another --db.",
+        )
+    return True
+
+
+async def _store_all(session: Session, flusher: Flusher) -> None:
+    """Store the trials in memory, and play those again that were dropped: without a call."""
+    await flusher.close()
+    if flusher.dropped:
+        session.say(
+            f"{len(flusher.dropped)} trials that are not stored yet are played again from the "
+            "recorded replies, without a call; Ctrl-C leaves them to the next run"
+        )
+    while flusher.dropped:
+        again, flusher.dropped = flusher.dropped[:BATCH], flusher.dropped[BATCH:]
+        replay = Replay(session.plan, session.cache)
+        await replay.play(again, lambda _, record: flusher.add(record))
+        await flusher.close()
+
+
+def _played_as(spec: TrialSpec) -> str:
+    """Return the drivers and the prompt of a trial, the beginning of its name."""
+    name = spec.trial_id.rsplit("/", 2)[0]
+    return name.removeprefix("seat/") if spec.source == "first_decision" else name
+
+
+def _unbalanced(waiting: Mapping[str, int]) -> str:
+    """Return how many trials of each arm wait, where the numbers differ."""
+    if len({*waiting.values()}) <= 1:
+        return ""
+    parts = first_of(
+        [f"{number} of {name}" for name, number in waiting.items()], "others", REASONS_SHOWN
+    )
+    return f" ({', '.join(parts)}: what has ended is not balanced)"

@@ -1,0 +1,89 @@
+"""The row of a run in the database: its begin, its end, and the check of what it stored."""
+
+from __future__ import annotations
+
+import asyncio
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from merge_runner.audit.checks import Audit, audit_sweep
+from merge_runner.errors import MergeRunnerError, NoValidDecision, StoreError
+from merge_runner.paths import DEFAULT_DB, command_at
+from merge_runner.records import canonical_json
+from merge_runner.results.database import in_thread
+from merge_runner.results.provenance import git_state, versions
+from merge_runner.results.store import Store
+from merge_runner.results.sweeps import sweep_facts
+from merge_runner.run.guard import FirstDecisions
+from merge_runner.run.session import Session
+
+SHOWN = 5  # findings
+
+
+async def begin(session: Session, store: Store) -> str:
+    """Store the row of a run that begins, and return its id."""
+    plan, options, cap = session.plan, session.options, session.ledger.cap
+    started_at = datetime.now(UTC).replace(tzinfo=None)
+    commit, dirty = await asyncio.to_thread(git_state)
+    sweep_id = f"{plan.name}-{plan.model}-{started_at:%Y%m%dT%H%M%S%f}"
+    config = {
+        **plan.model_dump(mode="json"),
+        "max_cost_usd": cap.usd if cap else None,
+        "typed": options.typed,
+    }
+    if options.name:
+        config["run_name"] = options.name
+    row = {
+        "sweep_id": sweep_id,
+        "name": plan.name,
+        "started_at": started_at,
+        "config": canonical_json(config),
+        "git_commit": commit,
+        "git_dirty": dirty,
+        "versions": canonical_json(versions()),
+    }
+    store.begin_sweep(row, plan.specs(), session.stored)
+    return sweep_id
+
+
+def end(session: Session, store: Store, sweep_id: str) -> None:
+    """Note in its row that the run has ended, and how."""
+    try:
+        store.end_sweep(sweep_id, datetime.now(UTC).replace(tzinfo=None), session.exit_code)
+    except StoreError as exc:
+        session.fail_by(exc)
+
+
+async def check(
+    session: Session, store: Store, sweep_id: str, first: FirstDecisions
+) -> tuple[dict[str, Any], Audit] | None:
+    """Read back what the database holds of the run, which has ended, and audit it."""
+    ended_with, checked = session.exit_code, None
+    try:
+        checked = await _read_back(session, store.path, sweep_id)
+        options = session.options
+        if not (session.exit_code or options.sends_nothing or options.keep_going):
+            for line in first.without_a_valid_one():
+                session.fail(NoValidDecision.exit_code, line)
+        # Answers from another model are reported elsewhere; only --strict-model stops for them.
+        findings = [finding for finding in checked[1].findings if finding.kind != "served"]
+        if findings:
+            audit_it = command_at("merge-runner audit", "--db", store.path, DEFAULT_DB)
+            session.fail(1, f"the audit found {len(findings)} faults: `{audit_it}`")
+        session.messages += map(str, findings[:SHOWN])
+    except MergeRunnerError as exc:
+        session.fail_by(exc)
+    if session.exit_code != ended_with:
+        end(session, store, sweep_id)
+    return checked
+
+
+async def _read_back(session: Session, db: Path, sweep_id: str) -> tuple[dict[str, Any], Audit]:
+    keys = [(spec.trial_id, spec.spec_hash) for spec in (*session.stored, *session.todo)]
+    audited = partial(audit_sweep, db, sweep_id, keys, finished=session.exit_code == 0)
+    if not session.options.replay:
+        session.ledger.read()
+    facts = await in_thread(partial(sweep_facts, db, sweep_id))
+    return facts, await in_thread(audited)

@@ -1,0 +1,81 @@
+"""The names of a plan's models, and the endpoints of its recorded replies."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+
+from merge_runner.driver_names import driver_name
+from merge_runner.errors import ProviderDown, UsageError
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.http_outcome import TransportFailure
+from merge_runner.llm.probe import LONG_WAIT_S
+from merge_runner.llm.refusals import if_nobody, set_base_url
+from merge_runner.llm.templates import recorded_values
+from merge_runner.providers import PROVIDERS, UNNAMED, ModelEntry, model_id, resolve_endpoint
+from merge_runner.run.options import Options
+from merge_runner.run.plan import Plan
+
+
+async def with_names(
+    plan: Plan, options: Options, cache: ResponseCache, say: Callable[[str], None]
+) -> Plan:
+    """Return the plan with its models' names, and in a replay with the recorded endpoints.
+
+    A model's name is that of its entry, its recorded replies or its server. Raises UsageError.
+    """
+    entries, endpoints = dict(plan.entries), dict(plan.endpoints)
+    for name, entry in entries.items():
+        named = model_id(entry)
+        if not named and options.sends_nothing:
+            # A server of one's own serves one model, or the recorded replies do not tell which.
+            models = recorded_values(cache, "model", provider=entry.provider)
+            named = models.pop() if len(models) == 1 else UNNAMED
+        entries[name] = entry.model_copy(
+            update={"id": named or await _served_name(name, entry, say=say)}
+        )
+        recorded: set[str] = set()
+        if options.replay:
+            recorded = recorded_values(cache, "endpoint", model=entries[name].id)
+        if recorded and endpoints[name] not in recorded:
+            endpoints[name], *others = sorted(recorded)
+            if others:
+                raise UsageError(
+                    f"replies of {name} are recorded from several endpoints: "
+                    f"{', '.join(sorted(recorded))}. Set the base URL variable of its provider to "
+                    "the one to replay."
+                )
+    arms = tuple(replace(arm, entries={n: entries[n] for n in arm.entries}) for arm in plan.arms)
+    return plan.model_copy(update={"arms": arms, "entries": entries, "endpoints": endpoints})
+
+
+async def _served_name(name: str, entry: ModelEntry, *, say: Callable[[str], None]) -> str:
+    """Return the one model that a server lists; raises ProviderDown and UsageError."""
+    # Imports httpx, which no replay needs.
+    from merge_runner.llm.http import LIST_TIMEOUT_S, listed_models
+
+    endpoint = resolve_endpoint(name, entry)
+    driver = driver_name(name, endpoint.identity)
+    until = datetime.now(UTC) + timedelta(seconds=LIST_TIMEOUT_S)
+    waits = f"{driver} has not listed its models yet: waits until {until:%H:%M:%S} UTC for that"
+    telling = asyncio.get_running_loop().call_later(LONG_WAIT_S, say, waits)
+    try:
+        listed = await listed_models(endpoint)
+        models = ", ".join(listed) or "no model"
+    except TransportFailure as exc:
+        if exc.outcome == "no_connection":
+            raise ProviderDown(f"{driver}: {exc}: {if_nobody(entry)}") from exc
+        wrong = f"; if that is another server, {set_base_url(entry)}"
+        listed, models = [], f"models that it does not list ({exc}{wrong})"
+    finally:
+        telling.cancel()
+    if len(listed) != 1:
+        variable = PROVIDERS.require(entry.provider).model_env
+        raise UsageError(
+            f"{driver} serves {models}: name one with "
+            f"{variable}, or with `id` of {entry.place}, which takes precedence"
+        )
+    say(f"{driver} serves {listed[0]}, which is asked")
+    return listed[0]

@@ -1,0 +1,80 @@
+"""The id of a trial, and the spec that its hash covers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from merge_runner.prompts.blocks import decomposed
+from merge_runner.records import SIDES, Side, canonical_json
+from merge_runner.run.parts import Parts
+from merge_runner.scenarios.merge.conditions import MEAN_SPEED_MPS
+from merge_runner.study.arms import FOCAL, OPPONENT, PROMPT, Arm
+from merge_runner.text_safety import in_a_name
+from merge_runner.trial_records import SPEC_VERSION
+
+
+def trial_id(arm: Arm, condition: str, repetition: int, *, sample_set: int, seat: str) -> str:
+    """Return the id of a trial of an arm."""
+    begin = "seat/" if seat else ""
+    set_ = f"/set{sample_set}" if sample_set else ""
+    # The prompt and the opponent are in it already.
+    levels = "".join(
+        f"/{name}={in_a_name(level)}"
+        for name, level in sorted(arm.factors.items())
+        if name not in (PROMPT, OPPONENT)
+    )
+    prompt, _ = decomposed(arm.variant)
+    focal = f"/{FOCAL}={arm.focal}" if arm.focal else ""
+    return f"{begin}{arm.model}/{prompt}/{condition}/rep{repetition:02d}{set_}{levels}{focal}"
+
+
+def spec_text(
+    arm: Arm, parts: Parts, condition: str, *, endpoints: Mapping[str, str], sample_set: int
+) -> str:
+    """Return the canonical JSON of what determines a trial of an arm.
+
+    It leaves out its condition's headway and relative velocity. These are in its row, where a
+    change of them is refused; the mean speed is not.
+    """
+    mean_speed_mps = parts.conditions[condition].mean_speed_mps
+    spec: dict[str, object] = {
+        "spec_version": SPEC_VERSION,
+        "scenario": arm.scenario.model_dump(),
+        "prompt_blocks": _prompt_blocks(arm, parts),
+        "left": _driver(arm, "left", parts, endpoints),
+        "right": _driver(arm, "right", parts, endpoints),
+        "sample_set": sample_set,
+    }
+    if mean_speed_mps != MEAN_SPEED_MPS:
+        spec["mean_speed_mps"] = mean_speed_mps
+    return canonical_json(spec)
+
+
+def _prompt_blocks(arm: Arm, parts: Parts) -> dict[str, str]:
+    """Return the digests of the prompt's blocks; one of a single driver names its side."""
+    left, right = (
+        parts.prompts[arm.prompt(side)].digests if arm.asked[side] in arm.entries else None
+        for side in SIDES
+    )
+    if left is None or right is None:
+        return left or right or {}
+    both = left.items() & right.items()
+    return dict(both) | {
+        f"{name}@{side}": digest
+        for side, digests in (("left", left), ("right", right))
+        for name, digest in digests.items() - both
+    }
+
+
+def _driver(arm: Arm, side: Side, parts: Parts, endpoints: Mapping[str, str]) -> dict[str, object]:
+    name = arm.asked[side]
+    entry = arm.entries.get(name)
+    if entry is None:
+        return parts.programs[name].in_spec(name)
+    sent = parts.formats[entry.format].request(entry, "")
+    return {
+        "endpoint": endpoints[name],
+        "path": sent.path,
+        "headers": sent.headers,
+        "body": sent.body,
+    }
