@@ -3,7 +3,8 @@
 A trial is admitted only if its expected cost, and what the running trials are still expected to
 cost, fit under the cap. So money finishes trials instead of beginning more. Expectations err, so
 an attempt leaves room for older trials alone: the oldest trial is suspended only where the money
-left does not pay for a single attempt.
+left does not pay for a single attempt. A call that several trials share is paid by the oldest
+running one, so that a running trial never waits for the admission of another.
 
 The worst case of an attempt is reserved in this process while it waits for its turn, and in the
 ledger right before it is sent. A server may ignore the output cap. So several attempts are in
@@ -16,10 +17,9 @@ import asyncio
 import bisect
 import math
 from asyncio import Future
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from functools import partial
-from operator import itemgetter
 
 from merge_runner.errors import TrialSuspended
 from merge_runner.llm.durable import Execute, ResultT
@@ -27,9 +27,8 @@ from merge_runner.llm.ledger import TOLERANCE_USD, CallLabel, Ledger
 from merge_runner.llm.store import both
 from merge_runner.records import Attempt
 
-# Deadlock breaker: an older trial may wait for a call of a younger one, which waits for money.
-# After this long with nothing in flight, the expected cost of older trials is ignored.
-PATIENCE_S = 90.0
+# A run of another model, in another process under the same cap, may free money.
+READ_EVERY_S = 90.0
 USED_UP = "others under the same cap have used it up"
 
 
@@ -104,35 +103,49 @@ class Reservation:
             self.budget.charged_usd[self.trial] += usd
 
 
+@dataclass(slots=True, eq=False)
+class Waiter:
+    """Call that waits for money, with the trials that share it: they may change meanwhile."""
+
+    trials: Sequence[int]
+    is_admission: bool
+    changed: asyncio.Event = field(default_factory=asyncio.Event)
+
+    def place(self) -> tuple[bool, float]:
+        """Return the place in the queue; the lowest is first."""
+        return self.is_admission, min(self.trials, default=math.inf)
+
+
 class MoneyQueue:
-    """Priority queue: attempts before trials that wait for admission, then by trial."""
+    """Priority queue: attempts before trials that wait for admission, then by oldest trial."""
 
     def __init__(self, ledger: Ledger) -> None:
-        self.places: list[tuple[tuple[bool, int], asyncio.Event]] = []
+        self.waiters: list[Waiter] = []
         self._ledger = ledger
 
     def wake(self) -> None:
         """Let the first in the queue check whether it may go on."""
-        if self.places:
-            self.places[0][1].set()
+        if self.waiters:
+            self.waiters[0].changed.set()
 
-    async def wait(self, place: tuple[bool, int], may_go: Callable[[float], bool]) -> None:
-        """Wait in the queue until ``may_go``, which gets the s waited so far, is True."""
-        changed, loop = asyncio.Event(), asyncio.get_running_loop()
-        own, began_s = (place, changed), loop.time()
-        bisect.insort(self.places, own, key=itemgetter(0))
+    def reorder(self) -> None:
+        """Sort anew, since the trials that share a call have changed."""
+        self.waiters.sort(key=Waiter.place)
+        self.wake()
+
+    async def wait(self, waiter: Waiter, may_go: Callable[[], bool]) -> None:
+        """Wait in the queue until ``may_go`` is True."""
+        bisect.insort(self.waiters, waiter, key=Waiter.place)
         try:
-            while self.places[0] is not own or not may_go(loop.time() - began_s):
-                changed.clear()
-                # No event reports that an older trial waits for this call, or that a run of another
-                # model under the same cap frees money.
+            while self.waiters[0] is not waiter or not may_go():
+                waiter.changed.clear()
                 try:
-                    async with asyncio.timeout(PATIENCE_S):
-                        await changed.wait()
+                    async with asyncio.timeout(READ_EVERY_S):
+                        await waiter.changed.wait()
                 except TimeoutError:
                     await asyncio.to_thread(self._ledger.read)
         finally:
-            self.places.remove(own)
+            self.waiters.remove(waiter)
             self.wake()
 
 
@@ -158,12 +171,22 @@ class Budget:
     @property
     def waiting(self) -> set[int]:
         """Trials that wait for money, for admission or for an attempt."""
-        return {trial for (_, trial), _ in self.queue.places}
+        return {trial for waiter in self.queue.waiters for trial in waiter.trials}
 
-    async def admit(self, trial: int) -> None:
-        """Wait until a trial may begin; raise TrialSuspended when no trial's end can let it."""
-        if self.ledger.cap is not None and trial not in self.charged_usd:
-            await self.queue.wait((True, trial), lambda _: self._may_begin(trial))
+    def is_running(self, trials: Sequence[int]) -> bool:
+        """Return whether one of the trials is admitted."""
+        return any(trial in self.charged_usd for trial in trials)
+
+    async def admit(self, trials: Sequence[int]) -> None:
+        """Wait until one of the trials that share a call runs, or the oldest of them may begin.
+
+        ``trials`` may change meanwhile. Raise TrialSuspended when no trial's end can let it begin.
+        """
+        if self.ledger.cap is not None and not self.is_running(trials):
+            await self.queue.wait(
+                Waiter(trials, is_admission=True),
+                lambda: self.is_running(trials) or self._may_begin(min(trials)),
+            )
 
     def readmit(self, trial: int) -> None:
         """Admit a trial at once: an earlier run has asked for it."""
@@ -176,29 +199,24 @@ class Budget:
         if self.charged_usd.pop(trial, None) is not None:
             self.queue.wake()
 
-    async def reserve(self, trial: int, key: str, label: CallLabel) -> Reservation:
-        """Reserve an attempt's worst case, scaled where its server ignores the output cap.
+    async def reserve(self, trials: Sequence[int], key: str, label: CallLabel) -> Reservation:
+        """Reserve an attempt's worst case for the oldest running trial of those that share a call.
 
-        Waits while other attempts or older trials may free money, then raises TrialSuspended. The
-        caller closes the reservation.
+        It is scaled where the server ignores the output cap. Waits while other attempts or older
+        trials may free money, then raises TrialSuspended. The caller closes the reservation.
         """
+        has_cap = self.ledger.cap is not None
+        if has_cap and (self.queue.waiters or not self._may_reserve(trials, label)):
+            waiter = Waiter(trials, is_admission=False)
+            await self.queue.wait(waiter, lambda: self._may_reserve(trials, label))
         usd = self._worst_usd(label)
-        if self.ledger.cap is not None and (
-            self.queue.places or not self._may_reserve(trial, usd, 0.0)
-        ):
-            may_reserve = partial(self._may_reserve, trial)
-            place = (False, trial)
-            await self.queue.wait(place, lambda s: may_reserve(self._worst_usd(label), s))
-            usd = self._worst_usd(label)
         self._largest_usd = max(self._largest_usd, usd)
-        return Reservation(self, trial, key, label, usd)
+        return Reservation(self, self._payer(trials), key, label, usd)
 
     def _may_begin(self, trial: int) -> bool:
         """Admit a trial if its expected cost fits beside the running ones; raise TrialSuspended."""
         if trial in self._left:
             raise TrialSuspended("its trial is suspended")
-        if trial in self.charged_usd:  # its other driver was in the queue, too
-            return True
         needed_usd, left_usd = self.trial_usd(trial), self._left_usd()
         if left_usd < needed_usd and not self.charged_usd and not self.in_flight:
             # The first trial begins all the same: it may cost less, and each attempt must still
@@ -210,17 +228,20 @@ class Budget:
         self.charged_usd[trial] = 0.0
         return True
 
-    def _may_reserve(self, trial: int, worst_usd: float, waited_s: float) -> bool:
+    def _may_reserve(self, trials: Sequence[int], label: CallLabel) -> bool:
         """Return whether an attempt's worst case fits; raise TrialSuspended where it never will."""
-        left_usd = self._left_usd()
+        left_usd, worst_usd = self._left_usd(), self._worst_usd(label)
         if left_usd < worst_usd and not self.in_flight:
             raise self._suspended(f"the next call may cost {worst_usd:.4f} USD")
-        counted_on = self.in_flight or waited_s < PATIENCE_S
-        older_usd = self._needed_usd(before=trial) if counted_on else 0.0
+        older_usd = self._needed_usd(before=self._payer(trials))
         # Only the first expensive reply shows that a server ignores the output cap, when the others
         # are sent already: all in flight may cost twice as much.
         twice_usd = (self.in_flight + 1) * max(worst_usd, self._largest_usd)
         return left_usd - worst_usd >= max(older_usd, twice_usd if self.in_flight else 0.0)
+
+    def _payer(self, trials: Sequence[int]) -> int:
+        """Return the oldest running trial of those that share a call, else the oldest."""
+        return min((trial for trial in trials if trial in self.charged_usd), default=min(trials))
 
     def _worst_usd(self, label: CallLabel) -> float:
         """Return the worst case, scaled by this driver's largest observed cost overrun."""

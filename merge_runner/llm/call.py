@@ -35,9 +35,10 @@ class Call:
     ``label`` names it and bounds the cost of an attempt, ``worst`` bounds its tokens. ``left_s``
     remains for its attempts and the waits between them; waits for the rate limiter do not count.
     ``attempts`` has all attempts, the first ``earlier`` of them by earlier runs. ``wait`` is None
-    while it is in flight or being saved. ``task`` makes the call, ``askers`` counts who waits for
-    it. ``bypass_batch`` is set after a batch without a result for it; ``pending_batch`` is the
-    batch of an earlier run in which it waits. Its recorded reply may be ``damaged``.
+    while it is in flight or being saved. ``task`` makes the call, ``trials`` wait for it,
+    by their order; ``order`` is the lowest. ``bypass_batch`` is set after a batch without a result
+    for it; ``pending_batch`` is the batch of an earlier run in which it waits. Its recorded reply
+    may be ``damaged``.
     """
 
     request: ChatRequest
@@ -49,10 +50,15 @@ class Call:
     attempts: list[Attempt] = field(default_factory=list)
     earlier: int = 0
     wait: Wait | None = None
-    askers: int = 0
+    trials: list[int] = field(default_factory=list)
     bypass_batch: bool = False
     pending_batch: Batch | None = None
     task: asyncio.Task[ChatReply] = field(init=False)
+
+    def add(self, trial: int) -> None:
+        """Let another trial wait for the call."""
+        self.trials.append(trial)
+        self.order = min(self.order, trial)
 
     @property
     def own_attempts(self) -> list[Attempt]:
@@ -96,14 +102,14 @@ class Calls:
     def blocked_askers(self) -> int:
         """Number of questions that wait for calls that are blocked on another call."""
         calls = self.under_way.values()
-        return sum(call.askers for call in calls if call.wait and call.wait.blocked)
+        return sum(len(call.trials) for call in calls if call.wait and call.wait.blocked)
 
     def wait(self, call: Call, wait: Wait) -> None:
         """Let a call wait, so that it can be cancelled; raise CallFailed if it is given up.
 
         It is in flight again when its ``wait`` is None.
         """
-        if self.stopping or not call.askers:
+        if self.stopping or not call.trials:
             raise self.given_up(call)
         call.wait = wait
 

@@ -41,7 +41,7 @@ class LlmClient:
     """Answers prompts of one model.
 
     ``direct`` sends normal requests, ``batch`` what goes into batches. ``calls`` are those of the
-    run. A call whose askers are all cancelled goes on while it may be billed, so that its reply is
+    run. A call whose trials are all cancelled goes on while it may be billed, so that its reply is
     kept; one that waits is cancelled. ``strict``: a reply of another model stops the sweep.
     """
 
@@ -99,13 +99,17 @@ class LlmClient:
         is_shared = call is not None and not call.task.cancelling()
         if call is None or not is_shared:
             call = self._start(request, order, attempts)
-        call.askers += 1
+        call.add(order)
+        if is_shared:
+            self.budget.queue.reorder()
         try:
             # Shielded: the call may be paid for already when its trial is cancelled.
             reply = await asyncio.shield(call.task)
         finally:
-            call.askers -= 1
-            if not call.askers and call.wait is not None and not call.wait.charged:
+            call.trials.remove(order)
+            if call.trials:
+                self.budget.queue.reorder()
+            elif call.wait is not None and not call.wait.charged:
                 call.task.cancel()  # or it would take money for a trial that is left
         # The attempts are counted once, for whoever asked first.
         return replace(reply, earlier=len(reply.attempts)) if is_shared else reply
@@ -134,9 +138,9 @@ class LlmClient:
             call.pending_batch = self.batch.rounds.pending.get(call.request.key)
         if call.pending_batch:
             self.budget.readmit(call.order)
-        if call.order not in self.budget.charged_usd:
+        if not self.budget.is_running(call.trials):
             self.calls.wait(call, Wait(NO_ROOM, blocked=True))
-            await self.budget.admit(call.order)
+            await self.budget.admit(call.trials)
             call.wait = None
         if call.damaged:
             await self._quarantine(call)
@@ -175,13 +179,13 @@ class LlmClient:
         label, key = call.label, call.request.key
         if sender.price_factor != 1.0:
             label = replace(label, worst_usd=label.worst_usd * sender.price_factor)
-        if self.calls.stopping or not (call.askers or call.pending_batch):
+        if self.calls.stopping or not (call.trials or call.pending_batch):
             raise self.calls.given_up(call)
         if call.pending_batch:
             reservation = Reservation.resume(self.budget, call.order, key, label)
         else:
             call.wait = Wait(NO_MONEY, blocked=True)
-            reservation = await self.budget.reserve(call.order, key, label)
+            reservation = await self.budget.reserve(call.trials, key, label)
         with closing(reservation):
             sent = await sender.send(call, reservation)
             usd = attempt_usd(sent, call.worst, self.endpoint, sender.price_factor)

@@ -58,8 +58,8 @@ def tried(actual, outcome="server_error"):
 
 async def attempt(budget, trial, worst, actual, turns=0, model="m"):
     """Spend on one attempt as a client does."""
-    await budget.admit(trial)
-    paid = await budget.reserve(trial, f"key {model}", asked(worst))
+    await budget.admit([trial])
+    paid = await budget.reserve([trial], f"key {model}", asked(worst))
     with contextlib.closing(paid):
         await paid.begin(1)
         for _ in range(turns):
@@ -77,7 +77,7 @@ def now(ledger, operation, *arguments):
 
 
 def set_aside(budget, trial, worst, driver=""):
-    return budget.reserve(trial, f"key {trial}", asked(worst, driver))
+    return budget.reserve([trial], f"key {trial}", asked(worst, driver))
 
 
 @settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -124,7 +124,7 @@ class Trials:
 
     async def job(self, trial, verb, worst=0, actual="0"):
         if verb == "begins":
-            await self.budget.admit(trial)
+            await self.budget.admit([trial])
         elif verb == "reserves":
             self.paid[trial] = await set_aside(self.budget, trial, float(worst))
         else:
@@ -189,22 +189,46 @@ async def test_the_ledger_refuses_what_two_processes_reserved_at_once(ledger, ca
     assert both[1].ledger.read().committed_usd == 0.75
 
 
-async def test_money_that_is_left_is_spent_although_an_older_trial_never_asks_for_its_own(
-    ledger, monkeypatch
+async def test_a_running_trial_never_waits_for_the_admission_of_another_that_shares_its_call(
+    ledger,
 ):
-    monkeypatch.setattr("merge_runner.llm.budget.PATIENCE_S", 0.01)
+    budget = budget_of(ledger, 3.0, each(2.0))
+    await budget.admit([1])
+    shared = [3]
+    admitted = asyncio.create_task(budget.admit(shared))
+    ahead = asyncio.create_task(budget.admit([2]))
+    await asyncio.sleep(0)
+    assert not admitted.done()
+    shared.append(1)
+    budget.queue.reorder()
+    await asyncio.wait_for(admitted, 5)
+    assert not ahead.done()
+    paid = await budget.reserve(shared, "key", asked(1.5))  # of the money that is kept for 1
+    assert (paid.trial, budget.charged_usd) == (1, {1: 1.5})
+    paid.close()
+    budget.leave(1)
+    await ahead
+
+
+async def test_an_attempt_takes_the_place_of_the_oldest_running_trial_that_shares_it(ledger):
     budget = budget_of(ledger, 4.0, each(2.0))
-    await budget.admit(1)
-    await budget.admit(2)
-    await attempt(budget, 2, 3.0, 3.0)
+    for trial in (1, 2):
+        await budget.admit([trial])
+    shared = [2]
+    waiting = asyncio.create_task(budget.reserve(shared, "key", asked(3.0)))
+    await asyncio.sleep(0)
+    assert not waiting.done()
+    shared.append(1)
+    budget.queue.reorder()
+    assert (await asyncio.wait_for(waiting, 5)).trial == 1
 
 
 async def test_trials_that_wait_for_money_are_counted_once(ledger):
     budget = budget_of(ledger, 3.0, each(2.0))
     client = SimpleNamespace(meter=Meter(), budget=budget)
     runner = LocalRunner(make_plan("baseline"), {"one": client, "other": client}, 9)
-    await budget.admit(1)
-    both = [asyncio.create_task(budget.admit(trial)) for trial in (2, 2, 3)]
+    await budget.admit([1])
+    both = [asyncio.create_task(budget.admit([trial])) for trial in (2, 2, 3)]
     await asyncio.sleep(0)
     assert (budget.waiting, runner.waiting_for_money) == ({2, 3}, 2)
     budget.leave(1)
@@ -322,14 +346,14 @@ def test_money_that_cannot_be_written_is_no_damaged_record(tmp_path):
 
 async def test_after_a_reply_that_cost_more_than_its_worst_case_as_much_is_set_aside(ledger, cache):
     budget = budget_of(ledger, 10.0)
-    with contextlib.closing(await budget.reserve(1, "key", O3)) as paid:
+    with contextlib.closing(await budget.reserve([1], "key", O3)) as paid:
         await paid.begin(1)
         await paid.settle(tried(0.75), nothing)
     assert (ledger.spending.spent_usd, ledger.spending.overrun_usd) == (0.75, 0.5)
     assert ledger.spending.largest_overruns == "o3 at gateway up to 3.00 times as much"
     next_run = budget_of(Ledger(cache, ledger.scope), 10.0)
     assert (await set_aside(next_run, 2, 0.25, "another driver")).usd == 0.25
-    with contextlib.closing(await next_run.reserve(1, "other", O3)) as paid:
+    with contextlib.closing(await next_run.reserve([1], "other", O3)) as paid:
         assert paid.usd == 0.75
         await paid.begin(1)
         # A reply within what is now set aside does not count as another overrun of it.
@@ -341,7 +365,7 @@ async def test_a_suspended_trial_says_what_the_cap_is_needed_for(ledger):
     budget = budget_of(ledger, 5.0, each(2.0))
     await attempt(budget, 1, 1.0, 0.5)
     await attempt(budget, 1, 0.5, None)
-    await budget.admit(2)
+    await budget.admit([2])
     with pytest.raises(TrialSuspended) as caught:
         await set_aside(budget, 1, 5.0)
     assert str(caught.value) == (
@@ -368,10 +392,10 @@ async def test_however_an_attempt_ends_its_money_ends_in_the_right_place(
     """``money``: what is kept for the trial, set aside for ever, and spent."""
     kept_usd, reserved_usd, spent_usd = money
     budget = budget_of(ledger, 1.0, each(1.0))
-    await budget.admit(1)
+    await budget.admit([1])
 
     async def ended():
-        with contextlib.closing(await budget.reserve(1, "key", asked(0.5))) as paid:
+        with contextlib.closing(await budget.reserve([1], "key", asked(0.5))) as paid:
             if begun:
                 await paid.begin(1)
             if tried:

@@ -254,3 +254,13 @@ async def test_what_is_set_aside_is_shown_with_its_reasons_and_released_by_name(
     shown = await merge_runner("ledger")
     assert "server_error" not in shown.out
     assert shown.out.split("\n")[0].split() == ["sweep", "spent_usd"]
+
+
+async def test_a_cap_ends_a_study_whose_trials_share_their_calls(merge_runner, tmp_path):
+    await merge_runner("init", tmp_path / "study")
+    study = tmp_path / "study" / "study.toml"
+    study.write_text(study.read_text().replace('["emulator"]', '["emulator-priced"]'))
+    run = await merge_runner("sweep", study, "--max-cost", 0.5, "--yes", "--trust", "--json")
+    assert run.code == 3, run.err
+    assert run.summary["trials"]["suspended"] > 0
+    assert 0.3 < run.summary["cost_usd"] <= 0.5

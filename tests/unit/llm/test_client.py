@@ -283,7 +283,7 @@ async def test_drain_gives_up_calls_that_wait_for_their_turn(make):
     assert not any(hasattr(result, "text") for result in results)
     assert (client.direct.transport.sent, now_s()) == ([], 0)
     # Their money is given back.
-    await client.budget.reserve(0, "key", CallLabel("", "", 0.0015))
+    await client.budget.reserve([0], "key", CallLabel("", "", 0.0015))
     assert client.budget.ledger.read().committed_usd == 0
     with pytest.raises(CallFailed, match="stopped"):
         await client.ask("prompt", slot(3))

@@ -105,7 +105,7 @@ class CacheMachine(RuleBasedStateMachine):
 
         async def at_once():
             key, asked = REQUESTS[question].key, CallLabel("", "", WORST_USD)
-            waiting = asyncio.create_task(process.budget.reserve(question, key, asked))
+            waiting = asyncio.create_task(process.budget.reserve([question], key, asked))
             for _ in range(3):
                 await asyncio.sleep(0)
             if not waiting.done():
