@@ -292,9 +292,11 @@ async def test_drain_gives_up_calls_that_wait_for_their_turn(make):
 @pytest.mark.parametrize("drains", [False, True])
 async def test_a_call_that_waits_for_its_coordinator_can_be_given_up(make, cache, drains):
     client, events = make(answer(), price=PRICE), []
-    client.money.ledger = RemoteLedger(cache, "test", lambda *event: events.append(event[:2]))
+    client.budget.ledger = RemoteLedger(
+        cache, "test", None, lambda *event: events.append(event[:2])
+    )
     asked = await begun(client.ask("prompt", slot()))
-    (waits,) = client.waits
+    (waits,) = client.calls.waits
     assert "coordinator" in waits.what
     if drains:
         await client.calls.drain()
@@ -302,9 +304,10 @@ async def test_a_call_that_waits_for_its_coordinator_can_be_given_up(make, cache
         asked.cancel()
     await asyncio.wait([asked])
     await ticks()
-    assert (client.transport.sent, client.waits, client.money.queued_usd) == ([], [], 0)
+    assert (client.direct.transport.sent, client.calls.waits) == ([], [])
+    assert client.budget.queued_usd == 0
     assert events == [("reserve", 1), ("cost", 1)]
-    assert client.money.ledger.read().open_attempts == 0
+    assert client.budget.ledger.read().open_attempts == 0
 
 
 @pytest.mark.parametrize("in_flight", [False, True])

@@ -36,7 +36,7 @@ def test_every_figure_is_that_of_the_meters():
     meters[0].count_attempt(Attempt(1, "ok", usage=Usage(100, 0, 50), cost_usd=1.5))
     meters[1].count_attempt(Attempt(1, "timeout"))
     meters[1].mismatches["o3 -> gpt-4o"] = 2
-    shown = progress(runner(*meters, running=5), cap_usd=20, began_at=ago(60))
+    shown = progress(runner(*meters, running=5), began_at=ago(60))
     shown.trials.stored += 7
     shown.trials.outcome_counts.update(finished=2, failed=1, suspended=1)
     shown.trials.done.update(baseline=3)
