@@ -219,9 +219,8 @@ def resolve_endpoint(name: str, entry: ModelEntry, env: Mapping[str, str] = os.e
     key = next(filter(None, map(env.get, entry.key_envs)), "")
     if not key and provider.key_needed:
         raise UsageError(
-            f"{name} needs a key: set {variables}. Without one: `merge-runner sweep baseline` runs "
-            f"the emulator, and `merge-runner replay baseline --model {name} --recording "
-            "FILE.parquet` replays a recording."
+            f"{name} needs a key: set {variables}. Without one, `--model emulator` rehearses the "
+            "study, and `merge-runner replay FILE.parquet` replays a recording."
         )
     if not (key.isascii() and key.isprintable() and " " not in key):
         raise UsageError(

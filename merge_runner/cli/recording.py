@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -15,9 +15,6 @@ from merge_runner.cli.options import print_out
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
 from merge_runner.text_safety import say
-
-if TYPE_CHECKING:
-    pass
 
 SWEEP = "A sweep_id, which may be repeated; the newest sweep if none is given."
 RecordingFile = Annotated[Path, typer.Argument(metavar="FILE", help="A recording (.parquet).")]
@@ -40,6 +37,7 @@ def recording_export(
     from merge_runner.llm.cache import ResponseCache
     from merge_runner.results.recorded_sweeps import carried_plugins, provenance_of
     from merge_runner.results.recording import export_recording
+    from merge_runner.results.store import results_digest
     from merge_runner.results.sweeps import recorded_sweeps, sweeps_with_calls
 
     if sweeps and study is not None:
@@ -56,6 +54,8 @@ def recording_export(
     with closing(ResponseCache(cache, read_only=True)) as opened:
         calls = export_recording(file, opened, keys, provenance)
     say(f"{calls} calls of {sweep_ids} are in {file}")
+    digest, trials = results_digest(db, [row["sweep_id"] for row in rows])
+    say(f"their digest, and that of a replay: {digest}  {trials} trials")
     if plugins := carried_plugins(provenance):
         say(f"with them the whole source of the study's plug-ins: {', '.join(plugins)}")
 

@@ -141,7 +141,8 @@ def _exported_rows(cache: ResponseCache, keys: list[str], damaged: list[str]) ->
             continue
         if entry is None:
             raise RecordingError(
-                f"the reply {key} is not in the cache {cache.folder}: run the sweep again with it"
+                f"the reply {key} is not in the cache {cache.folder}: its run replayed a "
+                "recording, which holds it, or had another --cache. --sweep ID names another run"
             )
         columns = asdict(entry.request)
         columns |= columns.pop("slot") | {

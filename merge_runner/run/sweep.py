@@ -71,7 +71,8 @@ async def play(
             expected = None
             if session.todo and not (options.replay or plan.is_free):
                 expected = await estimate_rest(session)
-                agree(expected)
+                if expected.trials:  # some call is not recorded yet
+                    agree(expected)
             return await run(session, expected, stopping)
 
 

@@ -54,12 +54,6 @@ from merge_runner_analysis.wording import (
 
 # Of a scripted stand-in, why both levels have the same trials.
 UNREAD = "not tested: the scripted stand-in does not read it, and no effect is planted for it"
-# The trials that a measure counts; those of equal drivers, words and course are one.
-COUNTED = {
-    LEFT_FIRST.name: "trials without a crash, equal ones once",
-    COLLISIONS.name: "trials that ended, equal ones once",
-    GAP.name: "trials that count, equal ones once",
-}
 # More levels that show nothing are counted, not listed.
 FEW = 3
 
@@ -108,7 +102,6 @@ class Answer:
     rest: str
     measure: str
     drivers: list[tuple[str, str]]
-    trials: int
     counted: str
     halves: bool
     charts: list[Chart]
@@ -164,8 +157,7 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
         unbroken(rest),
         capital(name_of(primary)),
         [(short[driver], shape) for driver, shape in shapes.items()],
-        sum(count_of(row, "n") for row in _of_one_factor(shown, drawn)),
-        COUNTED.get(metric, COUNTED[GAP.name]),
+        _counted(_of_one_factor(shown, drawn), metric),
         any(row.values["k"] is None for row in known) and metric == LEFT_FIRST.name,
         [chart for chart in charts if chart],
         OPPONENT if OPPONENT in names[1:] else names[-1] if len(names) > 1 else "",
@@ -393,6 +385,19 @@ def _crossing_of(levels: Sequence[Row]) -> str:
     """``In combination: hurry, persona``."""
     crossed = [str(row.values["factor"]) for row in levels if len(factors_of(row)) > 1]
     return f"In combination: {', '.join(crossed[0].split(TIMES))}" if crossed else ""
+
+
+def _counted(levels: Sequence[Row], metric: str) -> str:
+    """Return how many trials the measure counts, as in ``58 trials without a crash, 12 with one``.
+
+    Trials of equal drivers, words and course are one.
+    """
+    trials = f"{sum(count_of(row, 'n') for row in levels):,} trials"
+    crashed = sum(count_of(row, "crashed") for row in levels)
+    what = " that ended" if metric == COLLISIONS.name else " that count"
+    if metric == LEFT_FIRST.name:
+        what = f" without a crash, {crashed:,} with one" if crashed else " without a crash"
+    return f"{trials}{what}, equal ones once"
 
 
 def _of_one_factor(levels: Sequence[Row], drivers: Sequence[str]) -> list[Row]:

@@ -41,6 +41,8 @@ ELSEWHERE = (
     "cli/",
     "emulator/",
     "planted_effect.py",
+    "results/database.py",
+    "results/instance.py",
     "run/progress.py",
     "run/progress_file.py",
     "run/writer.py",

@@ -165,7 +165,8 @@ def test_a_side_has_its_count_and_the_chart_the_axis_of_its_data():
     assert (change.reference.name, change.level.name) == ("no", "yes")
     assert (change.mark.shape, crashes.mark.shape) == ("like", "open")
     assert (crashes.level.k, crashes.level.n, crashes.level.text[:4]) == (3, 103, "63.0")
-    assert made.trials == 400  # of both drivers, which are drawn
+    # Of both drivers, which are drawn.
+    assert made.counted == "400 trials without a crash, 12 with one, equal ones once"
     (chart,) = made.charts
     assert chart.title == "By factor"
     assert [line.name for line in chart.lines] == ["no", "yes"]
@@ -183,7 +184,7 @@ def test_levels_that_are_not_tested_are_not_drawn():
     )
     (chart,) = made.charts
     assert [line.head for line in chart.lines] == ["hurry", ""]
-    assert made.trials == 200
+    assert made.counted == "200 trials without a crash, 6 with one, equal ones once"
 
 
 def test_an_interaction_names_the_levels_of_both_factors():
