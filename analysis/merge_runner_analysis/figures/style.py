@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from merge_runner_analysis.stats.estimate import Estimate
 
@@ -46,6 +48,24 @@ def wrapped(text: str, width: int) -> str:
     """Return a name in lines of so many characters, broken at blanks or punctuation if any."""
     lines = re.findall(rf".{{1,{width}}}(?:(?<=[ +/-])|(?= )|$)|.{{1,{width}}}", text)
     return "\n".join(line.strip() for line in lines)
+
+
+def place(figure: Figure, panels: NDArray[Any]) -> None:
+    """Lay a figure out once: else each drawing does so, twice, which takes most of its time.
+
+    Of a grid of ``panels`` the left ones and those at the top and the bottom are measured.
+    """
+    inner = panels[1:-1, 1:]
+    for panel in inner.flat:
+        panel.set_in_layout(False)
+    engine = figure.get_layout_engine()
+    assert engine is not None
+    engine.execute(figure)
+    figure.set_layout_engine(None)
+    for (row, column), panel in np.ndenumerate(inner):
+        across = panels[0, column + 1].get_position()
+        down = panels[row + 1, 0].get_position()
+        panel.set_position((across.x0, down.y0, across.width, down.height))
 
 
 def draw_points(
