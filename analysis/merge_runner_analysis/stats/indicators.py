@@ -58,9 +58,9 @@ class Judgement(NamedTuple):
     why: Fact | None = None
 
 
-def disagree(one: Judgement, other: Judgement) -> bool:
+def disagree(first: Judgement, second: Judgement) -> bool:
     """Whether one says that an indicator holds and the other that it does not."""
-    return None not in {one.passed, other.passed} and one.passed != other.passed
+    return None not in {first.passed, second.passed} and first.passed != second.passed
 
 
 def judge(who_first: Regression, gap: Regression, *, robust: bool) -> dict[str, Judgement]:
@@ -131,12 +131,12 @@ def likeness(driver: pd.DataFrame, human: pd.DataFrame) -> Estimate:
     apart = (driver["gain"] - driver["condition"].map(usual)).dropna()
     if not spread:
         return Estimate(n=len(apart))
-    own, pairs = mean(apart / spread), mean(_independent(human, "apart") / spread)
-    if own.value is None or own.se is None or pairs.se is None:
-        return Estimate(own.value, n=own.n)
-    if test := difference(own, replace(pairs, value=0.0)):
-        return Estimate(own.value, test.low, test.high, own.n, test.se, test.freedom)
-    return Estimate(own.value, own.value, own.value, own.n, 0.0)  # nothing varies: it is sure
+    gain, human_gain = mean(apart / spread), mean(_independent(human, "apart") / spread)
+    if gain.value is None or gain.se is None or human_gain.se is None:
+        return Estimate(gain.value, n=gain.n)
+    if test := difference(gain, replace(human_gain, value=0.0)):
+        return Estimate(gain.value, test.low, test.high, gain.n, test.se, test.freedom)
+    return Estimate(gain.value, gain.value, gain.value, gain.n, 0.0)  # nothing varies: it is sure
 
 
 def _independent(trials: pd.DataFrame, column: str) -> pd.Series:
