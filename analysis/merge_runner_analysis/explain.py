@@ -11,7 +11,6 @@ from merge_runner.paths import DEFAULT_DB, command_at
 from merge_runner.registry import require
 from merge_runner.text_safety import quoted
 from merge_runner_analysis.cache import remembered
-from merge_runner_analysis.frames import KEYS
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.provenance import call_counts
 from merge_runner_analysis.published import HUMAN, citation
@@ -143,9 +142,11 @@ def _source(
         kept &= whole[rests_on].notna()
     if conditions:
         kept &= whole["condition"].isin(conditions)
-    if copies:
-        kept &= ~pd.MultiIndex.from_frame(whole[KEYS]).isin(copies)
     names = whole.loc[kept, "trial_id"]
+    if copies:
+        left_out = {*copies}
+        keys = zip(names, whole.loc[kept, "spec_hash"], strict=True)
+        names = names[[key not in left_out for key in keys]]
     trials: tuple[str, ...] = tuple(names)
     numerator: tuple[str, ...] = ()
     if counts:

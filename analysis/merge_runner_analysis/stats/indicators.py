@@ -29,13 +29,14 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from merge_runner.records import SIDES
 from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.frames import KEYS, SPEEDS, read
 from merge_runner_analysis.grouping import Group, of_trials
 from merge_runner_analysis.published import published
 from merge_runner_analysis.stats import regressions
 from merge_runner_analysis.stats.estimate import Estimate
-from merge_runner_analysis.stats.held import measure_profiles
+from merge_runner_analysis.stats.held import KEY, measure_profiles
 from merge_runner_analysis.stats.intervals import difference, mean
 from merge_runner_analysis.stats.regressions import Regression
 from merge_runner_analysis.study import Study
@@ -92,7 +93,9 @@ def profiles(study: Study, group: Group) -> pd.DataFrame:
 
 @remembered
 def _all_profiles(study: Study) -> pd.DataFrame:
-    return measure_profiles(read(study.db, SPEEDS))
+    # One side after the other: the samples of all vehicles take the most memory of all tables.
+    sides = (read(study.db, f"FROM ({SPEEDS}) WHERE side = '{side}'") for side in SIDES)
+    return pd.concat(map(measure_profiles, sides)).sort_values(KEY, ignore_index=True)
 
 
 @remembered
