@@ -115,8 +115,9 @@ def call_counts(study: Study, group: Group) -> pd.DataFrame:
     """
     trials = group.trials[KEYS].merge(study.frames.calls, how="left", on=KEYS)
     trials = trials.set_axis(group.trials.index).drop(columns=KEYS)
-    reasons = trials.pop("failures").dropna().str.split("\n").explode()
-    failures = pd.crosstab(reasons.index, reasons).reindex(trials.index, fill_value=0)
+    reasons = trials.pop("failures").dropna().str.split("\n").map(Counter)
+    failures = pd.DataFrame.from_dict(reasons.to_dict(), "index").reindex(trials.index)
+    failures = failures.fillna(0).astype(int).sort_index(axis=1)
     return trials.join(failures).assign(
         trials=1,
         failed=group.trials["status"] == "failed",
