@@ -45,8 +45,7 @@ def effects_figure(study: Study) -> Figure:
     across, down = min(ACROSS, len(metrics)) or 1, -(-len(metrics) // ACROSS) or 1
     height_in = down * (LINES_IN * len(lines) + 0.6) + LINE_IN * 2 * len(drivers)
     figure = Figure(figsize=(PAGE_IN, max(height_in, 1.5)), layout="constrained")
-    panels = figure.subplots(down, across, sharey=True, squeeze=False)
-    axes = panels.flatten()
+    axes = figure.subplots(down, across, sharey=True, squeeze=False).flatten()
     for axis, metric in zip(axes, metrics, strict=False):
         axis.set_xlabel(metric.heading)
         for number, (driver, look) in enumerate(looks.items()):
@@ -73,7 +72,7 @@ def effects_figure(study: Study) -> Figure:
     ]
     if handles:
         figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False)
-    place(figure, panels)
+    place(figure)
     return figure
 
 

@@ -34,8 +34,7 @@ def first_action(study: Study) -> Figure:
     labels = [wrapped(name, LEGEND) for _, name, _ in drawn]
     legend_in = LINE_IN * sum(label.count("\n") + 1.5 for label in labels)
     figure = Figure(figsize=(PAGE_IN, max(2.7, legend_in)), layout="constrained")
-    panels = figure.subplots(squeeze=False)
-    axis = panels[0, 0]
+    axis = figure.subplots()
     # Beside each other, and far from the next velocity.
     apart_mps = min(0.04, 0.4 / len(drawn))
     for number, (look, _, means) in enumerate(drawn):
@@ -46,7 +45,7 @@ def first_action(study: Study) -> Figure:
         for label, (look, _, _) in zip(labels, drawn, strict=True)
     ]
     figure.legend(handles=handles, loc="outside right center", frameon=False)
-    place(figure, panels)
+    place(figure)
     return figure
 
 

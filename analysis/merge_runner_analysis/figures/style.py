@@ -35,6 +35,7 @@ SETTINGS: Any = {
     "svg.hashsalt": "merge-runner",
     "savefig.dpi": 300,
 }
+NO_GRID: NDArray[Any] = np.empty((0, 0), dtype=object)
 Points = list[tuple[float, Estimate]]  # estimates at their places on an axis
 
 
@@ -50,12 +51,12 @@ def wrapped(text: str, width: int) -> str:
     return "\n".join(line.strip() for line in lines)
 
 
-def place(figure: Figure, panels: NDArray[Any]) -> None:
-    """Lay a figure out once: else each drawing does so, twice, which takes most of its time.
+def place(figure: Figure, grid: NDArray[Any] = NO_GRID) -> None:
+    """Lay a figure out once: matplotlib would do so at each drawing, and draw it once more.
 
-    Of a grid of ``panels`` the left ones and those at the top and the bottom are measured.
+    Of a ``grid`` of panels with shared scales those inside are placed by the others.
     """
-    inner = panels[1:-1, 1:]
+    inner = grid[1:-1, 1:]
     for panel in inner.flat:
         panel.set_in_layout(False)
     engine = figure.get_layout_engine()
@@ -63,9 +64,8 @@ def place(figure: Figure, panels: NDArray[Any]) -> None:
     engine.execute(figure)
     figure.set_layout_engine(None)
     for (row, column), panel in np.ndenumerate(inner):
-        across = panels[0, column + 1].get_position()
-        down = panels[row + 1, 0].get_position()
-        panel.set_position((across.x0, down.y0, across.width, down.height))
+        above, beside = (other.get_position() for other in (grid[0, column + 1], grid[row + 1, 0]))
+        panel.set_position((above.x0, beside.y0, above.width, beside.height))
 
 
 def draw_points(
