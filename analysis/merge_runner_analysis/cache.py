@@ -69,7 +69,7 @@ def program() -> str:
     sources = (*PACKAGES, *plugin_sources())
     files = [path for source in sources for path in (source, *source.rglob("*"))]
     times = [path.stat().st_mtime_ns for path in files if path.suffix in COMPUTING]
-    return json.dumps([releases, len(times), max(times)], sort_keys=True)
+    return json.dumps([releases, len(times), max(times, default=0)], sort_keys=True)
 
 
 def finished(db: Path, made_of: str, options: str, names: Sequence[str]) -> dict[str, str]:

@@ -420,12 +420,12 @@ def view(
         opened = not no_open and open_browser(address)
         say(f"{'' if opened else 'open this address in a browser; '}Ctrl-C ends the explorer")
 
-    def told(pages: int) -> None:
+    def progress(pages: int) -> None:
         if pages % TOLD_EVERY == 0:
             say(f"{pages} pages so far")
 
     if export is not None:
-        say(f"open {export_folder(db, export, wanted, told)}, or send the folder {export}")
+        say(f"open {export_folder(db, export, wanted, progress)}, or send the folder {export}")
     if single is not None:
         say(f"wrote {export_page(db, single, wanted)}")
     if export is None and single is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pandas as pd
 
@@ -136,23 +136,21 @@ def _source(
     copies: tuple[tuple[str, str], ...],
     counts: str,
 ) -> Source:
-    known = {STORED: group.trials, ENDED: group.ended, FINISHED: group.finished}
-    whole = known.get(rests_on, group.trials)
-    kept = pd.Series(True, whole.index)  # to take a part of all columns takes far longer
-    if rests_on not in known:
-        kept &= whole[rests_on].notna()
-    if conditions:
-        kept &= whole["condition"].isin(conditions)
-    if copies:
-        kept &= ~pd.MultiIndex.from_frame(whole[KEYS]).isin(copies)
-    names = whole.loc[kept, "trial_id"]
-    trials: tuple[str, ...] = tuple(names)
-    numerator: tuple[str, ...] = ()
+    left_out = {*copies}
+    names = {
+        place: name
+        for place, name, spec, condition in _rows(group, rests_on)
+        if (not conditions or condition in conditions) and (name, spec) not in left_out
+    }
+    trials, numerator = tuple(names.values()), tuple[str, ...]()
     if counts:
-        values = whole.get(counts)
+        values = group.trials.get(counts)
         if values is None:  # a failure that never occurred has no column
-            values = call_counts(study, group).get(counts, pd.Series(False, whole.index))
-        numerator = tuple(names[values.reindex(names.index).fillna(False).astype(bool)])
+            values = call_counts(study, group).get(counts, pd.Series(False, group.trials.index))
+        counted = values.reindex([*names]).fillna(False).astype(bool)
+        numerator = tuple(
+            name for name, counts_it in zip(trials, counted, strict=True) if counts_it
+        )
     outcomes = group.published_outcomes
     parts = (
         f"{len(trials)} of {len(group.trials)} trials; not finished: {group.left_out}",
@@ -167,8 +165,24 @@ def _source(
     return Source(group.id, text, _query(group, trials), trials, numerator)
 
 
+@remembered
+def _rows(group: Group, rests_on: str) -> list[tuple[Any, str, str, str]]:
+    """Return label, trial, spec and condition of the trials that rows of a table may rest on."""
+    known = {STORED: group.trials, ENDED: group.ended, FINISHED: group.finished}
+    rows = known.get(rests_on, group.trials)
+    if rests_on not in known:
+        rows = rows[rows[rests_on].notna()]
+    columns = (rows[name] for name in (*KEYS, "condition"))
+    return [*zip(rows.index, *columns, strict=True)]
+
+
+@remembered
+def _specs(group: Group) -> list[str]:
+    return sorted(group.trials["spec_hash"].unique())
+
+
 def _query(group: Group, trials: Sequence[str]) -> str:
     """The query that lists trials of a group; empty for none."""
-    specs = sorted(group.trials["spec_hash"].unique())
+    specs = _specs(group)
     named = QUERY.format(specs=", ".join(map(quoted, specs)), trials=", ".join(map(quoted, trials)))
     return named if trials else ""

@@ -30,8 +30,8 @@ from merge_runner_analysis.trials import judged, with_metrics
 # the ego's minus the other's, and the condition is the one with such numbers. Where only an ego on
 # the right has driven that, it is called after the one that was driven.
 _PUBLISHED = ", ".join(
-    f"({quoted(name)}, {one.projected_headway_m!r}::DOUBLE, {one.relative_velocity_mps!r}::DOUBLE)"
-    for name, one in HUMAN_CONDITIONS.items()
+    f"({quoted(name)}, {at.projected_headway_m!r}::DOUBLE, {at.relative_velocity_mps!r}::DOUBLE)"
+    for name, at in HUMAN_CONDITIONS.items()
 )
 TRIALS = f"""
 WITH placed AS (
@@ -174,8 +174,8 @@ class Studies(NamedTuple):
 
     def holds(self, study: str, frame: pd.DataFrame) -> pd.Series:
         """Return which rows of a frame are of trials that were played for a study."""
-        own = self.trials.loc[self.trials["study"] == study, KEYS]
-        held = pd.MultiIndex.from_frame(frame[KEYS]).isin(pd.MultiIndex.from_frame(own))
+        members = self.trials.loc[self.trials["study"] == study, KEYS]
+        held = pd.MultiIndex.from_frame(frame[KEYS]).isin(pd.MultiIndex.from_frame(members))
         return pd.Series(held, index=frame.index)
 
 

@@ -284,11 +284,12 @@ def groups_of(
         counts = of_trials(decisions, rows).groupby("model")[["invalid", "asked"]].sum()
         reasons = filter(None, (not_judged(*count) for count in counts.itertuples()))
         group = _model_group(trials.loc[rows.index], rows.iloc[0], Reason("; ".join(reasons)))
-        own = [specs.get(name, {}) for name in rows["spec_hash"].unique()]
+        stored = [specs.get(name, {}) for name in rows["spec_hash"].unique()]
         # Of a first decision that was only asked, what follows is not known: draws that differ
         # later may be equal until then.
-        only_asked = rows["source"].iloc[0] == "first_decision" and any(map(has_chance, own))
-        programs = all(map(programs_alone, own)) and not only_asked
+        is_first = rows["source"].iloc[0] == "first_decision"
+        only_asked = is_first and any(map(has_chance, stored))
+        programs = all(map(programs_alone, stored)) and not only_asked
         group = _distinct(group, programs=programs, scripted=group.scripted and not only_asked)
         groups.append(replace(group, levels=levels_of_group(levels, group)))
 

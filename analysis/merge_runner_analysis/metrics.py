@@ -87,11 +87,11 @@ class Metric:
     def selected(self) -> str:
         """Its columns as expressions of SQL over ``trials JOIN trial_metrics``."""
         typed = f"({self.value})::{'BOOLEAN' if self.rate else 'DOUBLE'}"
-        there = f"{self.value} IS NOT NULL"
+        is_known = f"{self.value} IS NOT NULL"
         if not self.value.isidentifier():  # what is no finite number is no value
-            there = f"({self.value}) IS NOT NULL" if self.rate else f"isfinite({typed})"
+            is_known = f"({self.value}) IS NOT NULL" if self.rate else f"isfinite({typed})"
         weight = f", ({self.weight})::DOUBLE AS {self.weight_column}" if self.weight else ""
-        counts = f"{STATUS[self.trials]} AND {there}"
+        counts = f"{STATUS[self.trials]} AND {is_known}"
         return f"CASE WHEN {counts} THEN {typed} END AS {self.column}{weight}"
 
 
@@ -105,7 +105,9 @@ def register(metric: Metric) -> Metric:
 
 def shown_in(place: str) -> list[Metric]:
     """The metrics that a place of SHOWN has, in the order of the list."""
-    return [one for one in METRICS.values() if one.shown and one.estimator in SHOWN[place]]
+    return [
+        metric for metric in METRICS.values() if metric.shown and metric.estimator in SHOWN[place]
+    ]
 
 
 COLLISIONS = Metric(

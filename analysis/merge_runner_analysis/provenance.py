@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from merge_runner.config import ScenarioConfig
 from merge_runner.records import NO_DECISION, SIDES
 from merge_runner.results import frames
 from merge_runner.results.database import read_database
@@ -18,6 +17,7 @@ from merge_runner.served_model import other_models, sql_of
 from merge_runner_analysis.frames import KEYS
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.study import Study
+from merge_runner_analysis.task import leaves, task_settings
 
 SWEEPS = """
 SELECT sweep_id, name, started_at, ended_at, git_commit, git_dirty, versions,
@@ -62,7 +62,6 @@ FROM calls LEFT JOIN sweep_trials USING (trial_id, spec_hash)
 WHERE http_status = 200 AND {others}
 GROUP BY ALL ORDER BY ALL
 """
-RULE = "collision_rule"
 MODEL_COSTS = """
 SELECT driver, count(*) AS trials,
     sum(calls) AS calls, sum(attempts) AS attempts,
@@ -116,8 +115,9 @@ def call_counts(study: Study, group: Group) -> pd.DataFrame:
     """
     trials = group.trials[KEYS].merge(study.frames.calls, how="left", on=KEYS)
     trials = trials.set_axis(group.trials.index).drop(columns=KEYS)
-    reasons = trials.pop("failures").dropna().str.split("\n").explode()
-    failures = pd.crosstab(reasons.index, reasons).reindex(trials.index, fill_value=0)
+    reasons = trials.pop("failures").dropna().str.split("\n").map(Counter)
+    failures = pd.DataFrame.from_dict(reasons.to_dict(), "index").reindex(trials.index)
+    failures = failures.fillna(0).astype(int).sort_index(axis=1)
     return trials.join(failures).assign(
         trials=1,
         failed=group.trials["status"] == "failed",
@@ -140,16 +140,4 @@ def _settings(spec: Mapping[str, Any]) -> Iterator[str]:
     for side in SIDES:
         body = spec.get(side, {}).get("body", {})
         sent = {k: v for k, v in body.items() if k != "model" and '""' not in json.dumps(v)}
-        yield from _leaves(sent)
-
-
-def task_settings(scenario: Mapping[str, Any]) -> Iterator[str]:
-    """The collision rule of a driving task, and what else of it differs from the defaults."""
-    defaults = ScenarioConfig().model_dump()
-    unusual = {name: value for name, value in scenario.items() if defaults.get(name) != value}
-    return _leaves({RULE: scenario.get(RULE, defaults[RULE]), **unusual})
-
-
-def _leaves(values: Mapping[str, Any]) -> Iterator[str]:
-    for name, value in values.items():
-        yield from _leaves(value) if isinstance(value, dict) else [f"{name} = {value}"]
+        yield from leaves(sent)

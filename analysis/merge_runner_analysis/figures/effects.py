@@ -12,6 +12,7 @@ from merge_runner_analysis.figures.style import (
     LINE_IN,
     PAGE_IN,
     draw_points,
+    place,
     style,
     wrapped,
 )
@@ -71,6 +72,7 @@ def effects_figure(study: Study) -> Figure:
     ]
     if handles:
         figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False)
+    place(figure)
     return figure
 
 

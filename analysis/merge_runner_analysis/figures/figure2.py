@@ -23,6 +23,7 @@ from merge_runner_analysis.figures.style import (
     Points,
     Style,
     draw_points,
+    place,
     style,
     wrapped,
 )
@@ -107,6 +108,7 @@ def figure2(study: Study, chosen: list[Group]) -> Figure:
         low, high = axis.get_view_interval()
         ticks = [tick for tick in axis.get_majorticklocs() if low <= tick <= high]
         axis.set_ticks(ticks, axis.get_major_formatter().format_ticks(ticks))
+    place(figure, axes)
     return figure
 
 

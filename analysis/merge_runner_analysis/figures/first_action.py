@@ -12,6 +12,7 @@ from merge_runner_analysis.figures.style import (
     PAGE_IN,
     Points,
     draw_points,
+    place,
     style,
     wrapped,
 )
@@ -36,14 +37,15 @@ def first_action(study: Study) -> Figure:
     axis = figure.subplots()
     # Beside each other, and far from the next velocity.
     apart_mps = min(0.04, 0.4 / len(drawn))
-    for place, (look, _, means) in enumerate(drawn):
-        draw_points(axis, means, apart_mps * place, look)
+    for number, (look, _, means) in enumerate(drawn):
+        draw_points(axis, means, apart_mps * number, look)
     axis.set(xlabel="own relative velocity (m/s)", ylabel="first action (m/s²)")
     handles = [
         Line2D([], [], label=label, **look)
         for label, (look, _, _) in zip(labels, drawn, strict=True)
     ]
     figure.legend(handles=handles, loc="outside right center", frameon=False)
+    place(figure)
     return figure
 
 

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from merge_runner_analysis.stats.estimate import Estimate
 
@@ -33,6 +35,7 @@ SETTINGS: Any = {
     "svg.hashsalt": "merge-runner",
     "savefig.dpi": 300,
 }
+NO_GRID: NDArray[Any] = np.empty((0, 0), dtype=object)
 Points = list[tuple[float, Estimate]]  # estimates at their places on an axis
 
 
@@ -46,6 +49,23 @@ def wrapped(text: str, width: int) -> str:
     """Return a name in lines of so many characters, broken at blanks or punctuation if any."""
     lines = re.findall(rf".{{1,{width}}}(?:(?<=[ +/-])|(?= )|$)|.{{1,{width}}}", text)
     return "\n".join(line.strip() for line in lines)
+
+
+def place(figure: Figure, grid: NDArray[Any] = NO_GRID) -> None:
+    """Lay a figure out once: matplotlib would do so at each drawing, and draw it once more.
+
+    Of a ``grid`` of panels with shared scales those inside are placed by the others.
+    """
+    inner = grid[1:-1, 1:]
+    for panel in inner.flat:
+        panel.set_in_layout(False)
+    engine = figure.get_layout_engine()
+    assert engine is not None
+    engine.execute(figure)
+    figure.set_layout_engine(None)
+    for (row, column), panel in np.ndenumerate(inner):
+        above, beside = (other.get_position() for other in (grid[0, column + 1], grid[row + 1, 0]))
+        panel.set_position((above.x0, beside.y0, above.width, beside.height))
 
 
 def draw_points(

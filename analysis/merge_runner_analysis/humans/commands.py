@@ -57,7 +57,7 @@ def human_import(path: PathArgument, db: DbOption = DEFAULT_DB) -> None:
     for line in findings(human_trials(db)):
         say(f"note: {line}")
     print_out(
-        f"{report.added} trials added, {report.there} there already, {len(report.unreadable)} "
+        f"{report.added} trials added, {report.stored} there already, {len(report.unreadable)} "
         "files could not be read"
     )
     sys.exit(1 if errors else 0)

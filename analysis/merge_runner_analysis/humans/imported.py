@@ -27,8 +27,8 @@ def human_trials(db: Path) -> pd.DataFrame:
 
 def of_published_pairs(trials: pd.DataFrame) -> pd.DataFrame:
     """The trials of the nine published pairs; all, where there is none of these."""
-    own = trials["pair"].isin(PAIRS.values())
-    return trials[own] if own.any() else trials
+    is_published = trials["pair"].isin(PAIRS.values())
+    return trials[is_published] if is_published.any() else trials
 
 
 def findings(trials: pd.DataFrame) -> Iterator[str]:
@@ -58,9 +58,9 @@ def by_pair(trials: pd.DataFrame) -> pd.DataFrame:
 
 def by_condition(trials: pd.DataFrame) -> pd.DataFrame:
     """The same of each condition over the published pairs, and how many trials are published."""
-    own = trials[trials["pair"].isin(PAIRS.values())]
+    published_pairs = trials[trials["pair"].isin(PAIRS.values())]
     known = published("human_outcomes").set_index("condition")[OUTCOMES].astype(str)
-    counts = _counted(own, "condition").reindex(HUMAN_CONDITIONS, fill_value=0)
+    counts = _counted(published_pairs, "condition").reindex(HUMAN_CONDITIONS, fill_value=0)
     return counts.assign(published=known.agg(" ".join, axis=1))
 
 

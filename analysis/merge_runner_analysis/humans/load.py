@@ -33,12 +33,12 @@ Source = tuple[str, int, int, File]
 class Report:
     """The outcome of an import.
 
-    ``added`` and ``there`` count the trials added and those already stored; ``differing`` are ids
+    ``added`` and ``stored`` count the trials added and those already stored; ``differing`` are ids
     of trials already stored with other values. ``unreadable`` holds file and reason.
     """
 
     added: int = 0
-    there: int = 0
+    stored: int = 0
     differing: list[str] = field(default_factory=list)
     unreadable: list[tuple[str, str]] = field(default_factory=list)
 
@@ -62,12 +62,16 @@ def import_trials(sources: Iterable[Source], store: Store) -> Report:
     while chunk := list(islice(records, CHUNK)):
         # A trial that was imported from the other kind of file is there.
         known = dict(query(store.path, IMPORTED)[1])
-        specs = (known.setdefault(one.spec.trial_id, one.spec.spec_hash) for one in chunk)
-        new = [one for one, spec in zip(chunk, specs, strict=True) if one.spec.spec_hash == spec]
+        new = [
+            record
+            for record in chunk
+            if known.setdefault(record.spec.trial_id, record.spec.spec_hash)
+            == record.spec.spec_hash
+        ]
         used = {name: SPECS[name] for name in {record.spec.spec_hash for record in new}}
-        added, there, differing = store.add_recorded(new, used)
+        added, stored, differing = store.add_recorded(new, used)
         report.added += added
-        report.there += there + len(chunk) - len(new)
+        report.stored += stored + len(chunk) - len(new)
         report.differing += differing
     return report
 

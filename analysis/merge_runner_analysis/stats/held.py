@@ -48,7 +48,7 @@ def measure_profiles(speeds: pd.DataFrame) -> pd.DataFrame:
     for row, (time_s, velocity_mps, resisted) in enumerate(zip(*columns, strict=True)):
         time, v = np.asarray(time_s, dtype=float), np.asarray(velocity_mps, dtype=float)
         driven = without_resistance(time, v) if resisted else v
-        apart = [np.abs(each - each.mean()).max() for each in (v, driven) if len(each)]
+        apart = [np.abs(speeds - speeds.mean()).max() for speeds in (v, driven) if len(speeds)]
         steady[row] = min(apart, default=np.inf) <= STEADY_MPS
         at = at_5_hz(time - time[:1], driven)
         if not steady[row] and len(at) >= SHORTEST_SAMPLES:
@@ -77,14 +77,14 @@ def without_resistance(time_s: Array, velocity_mps: Array) -> Array:
 
 def gains(velocity_mps: Array) -> Array:
     """The gains of vehicles with equally many samples at 5 Hz, (vehicles, samples)."""
-    n, found = velocity_mps.shape[1], []
+    n, parts = velocity_mps.shape[1], []
     for start in range(0, len(velocity_mps), AT_ONCE):
         lines, cubics = residuals(velocity_mps[start : start + AT_ONCE])
         # One acceleration from beginning to end leaves nothing to explain.
         whole = np.maximum(lines[0], n * STEADY_MPS**2)
         moving = _criterion(cubics / whole, CUBIC_COEFFICIENTS, n)
-        found.append((moving - _criterion(lines / whole, LINE_COEFFICIENTS, n)) / n)
-    return np.concatenate(found)
+        parts.append((moving - _criterion(lines / whole, LINE_COEFFICIENTS, n)) / n)
+    return np.concatenate(parts)
 
 
 def _criterion(left: Array, coefficients: int, n: int) -> Array:

@@ -29,13 +29,14 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from merge_runner.records import SIDES
 from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.frames import KEYS, SPEEDS, read
 from merge_runner_analysis.grouping import Group, of_trials
 from merge_runner_analysis.published import published
 from merge_runner_analysis.stats import regressions
 from merge_runner_analysis.stats.estimate import Estimate
-from merge_runner_analysis.stats.held import measure_profiles
+from merge_runner_analysis.stats.held import KEY, measure_profiles
 from merge_runner_analysis.stats.intervals import difference, mean
 from merge_runner_analysis.stats.regressions import Regression
 from merge_runner_analysis.study import Study
@@ -58,9 +59,9 @@ class Judgement(NamedTuple):
     why: Fact | None = None
 
 
-def disagree(one: Judgement, other: Judgement) -> bool:
+def disagree(first: Judgement, second: Judgement) -> bool:
     """Whether one says that an indicator holds and the other that it does not."""
-    return None not in {one.passed, other.passed} and one.passed != other.passed
+    return None not in {first.passed, second.passed} and first.passed != second.passed
 
 
 def judge(who_first: Regression, gap: Regression, *, robust: bool) -> dict[str, Judgement]:
@@ -92,7 +93,9 @@ def profiles(study: Study, group: Group) -> pd.DataFrame:
 
 @remembered
 def _all_profiles(study: Study) -> pd.DataFrame:
-    return measure_profiles(read(study.db, SPEEDS))
+    # One side after the other: the samples of all vehicles take the most memory of all tables.
+    sides = (read(study.db, f"FROM ({SPEEDS}) WHERE side = '{side}'") for side in SIDES)
+    return pd.concat(map(measure_profiles, sides)).sort_values(KEY, ignore_index=True)
 
 
 @remembered
@@ -131,12 +134,12 @@ def likeness(driver: pd.DataFrame, human: pd.DataFrame) -> Estimate:
     apart = (driver["gain"] - driver["condition"].map(usual)).dropna()
     if not spread:
         return Estimate(n=len(apart))
-    own, pairs = mean(apart / spread), mean(_independent(human, "apart") / spread)
-    if own.value is None or own.se is None or pairs.se is None:
-        return Estimate(own.value, n=own.n)
-    if test := difference(own, replace(pairs, value=0.0)):
-        return Estimate(own.value, test.low, test.high, own.n, test.se, test.freedom)
-    return Estimate(own.value, own.value, own.value, own.n, 0.0)  # nothing varies: it is sure
+    gain, human_gain = mean(apart / spread), mean(_independent(human, "apart") / spread)
+    if gain.value is None or gain.se is None or human_gain.se is None:
+        return Estimate(gain.value, n=gain.n)
+    if test := difference(gain, replace(human_gain, value=0.0)):
+        return Estimate(gain.value, test.low, test.high, gain.n, test.se, test.freedom)
+    return Estimate(gain.value, gain.value, gain.value, gain.n, 0.0)  # nothing varies: it is sure
 
 
 def _independent(trials: pd.DataFrame, column: str) -> pd.Series:

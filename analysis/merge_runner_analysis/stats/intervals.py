@@ -41,7 +41,7 @@ def proportion(successes: int, n: int) -> Estimate:
 
 
 def melded(
-    one: tuple[float, float], other: tuple[float, float], p: float, level: float = LEVEL
+    first: tuple[float, float], second: tuple[float, float], p: float, level: float = LEVEL
 ) -> tuple[float, float]:
     """Return the interval of one rate less another, (rate, trials) each, that agrees with ``p``.
 
@@ -51,7 +51,7 @@ def melded(
     ``p``, so that the interval excludes 0 exactly where ``p`` is below 1 - ``level``.
     """
     alpha = 1 - level
-    less, more = _at_most(one, other), _at_most(other, one)
+    less, more = _at_most(first, second), _at_most(second, first)
     tails = [less(0.0), more(0.0)]
     near = min(tails)
     wanted = min(alpha * near / max(p, TINY), (1 + near) / 2)
@@ -67,13 +67,13 @@ def _lower(at_most: Callable[[float], float], part: float) -> float:
     return float(optimize.brentq(lambda at: at_most(at) - part, -1.0, 1.0))
 
 
-def _at_most(one: tuple[float, float], other: tuple[float, float]) -> Callable[[float], float]:
+def _at_most(first: tuple[float, float], second: tuple[float, float]) -> Callable[[float], float]:
     """The chance that one rate at its lowest exceeds another at its highest by at most so much.
 
     They are the lower and the upper beta distribution of Clopper and Pearson (1934). At 0 it is the
     p of Fisher's exact test that the first rate is not the larger.
     """
-    (rate, n), (share, m) = one, other
+    (rate, n), (share, m) = first, second
     k, missed = rate * n, m - share * m
     if k < ROUNDING:
         if missed < ROUNDING:
@@ -110,15 +110,15 @@ def interval(
     return value - half, value + half
 
 
-def at(found: Estimate, level: float) -> Estimate:
+def at(result: Estimate, level: float) -> Estimate:
     """The same with its interval at a level; without its ends where there are none."""
     ends = None
-    if found.ends_at:
-        ends = found.ends_at(level)
-    elif found.value is not None and found.se is not None:
-        ends = interval(found.value, found.se, found.freedom, level)
+    if result.ends_at:
+        ends = result.ends_at(level)
+    elif result.value is not None and result.se is not None:
+        ends = interval(result.value, result.se, result.freedom, level)
     low, high = ends or (None, None)
-    return replace(found, low=low, high=high, level=level)
+    return replace(result, low=low, high=high, level=level)
 
 
 def two_sided_p(statistic: float, freedom: float = inf) -> float:
@@ -135,19 +135,19 @@ def tested(value: float, se: float, freedom: float) -> Estimate:
     return Estimate(value, *ends, se=se, freedom=freedom, p=p, detectable=detectable(se, freedom))
 
 
-def difference(one: Estimate, other: Estimate) -> Estimate | None:
+def difference(first: Estimate, second: Estimate) -> Estimate | None:
     """One independent estimate less another.
 
     It is tested as Welch (1947) does, so that the 5 % hold also where the groups differ in size and
     in variance, with the degrees of freedom of a sum of variances (Satterthwaite 1946). None where
     a value or an error is missing, and where neither has an error: there is nothing to test.
     """
-    if one.value is None or other.value is None or one.se is None or other.se is None:
+    if first.value is None or second.value is None or first.se is None or second.se is None:
         return None
-    if not (se := hypot(one.se, other.se)):
+    if not (se := hypot(first.se, second.se)):
         return None
-    spread = one.se**4 / one.freedom + other.se**4 / other.freedom
-    return tested(one.value - other.value, se, se**4 / spread if spread else inf)
+    spread = first.se**4 / first.freedom + second.se**4 / second.freedom
+    return tested(first.value - second.value, se, se**4 / spread if spread else inf)
 
 
 def detectable(se: float, freedom: float = inf) -> float:

@@ -73,28 +73,28 @@ class Counts:
         b = starts.copy()
         free = np.array([place != term for place in range(b.shape[1])])
         b[:, ~free] = value
-        here = self.penalised(b)
-        regular = np.isfinite(here.likelihood)
-        b, here = b[regular], Penalised(*(part[regular] for part in here))
+        reached = self.penalised(b)
+        regular = np.isfinite(reached.likelihood)
+        b, reached = b[regular], Penalised(*(part[regular] for part in reached))
         top = np.zeros(len(b), bool)
         for _ in range(MOST_STEPS):
             if top.all():
                 break
-            bends, directions = np.linalg.eigh(here.curvature[:, free][:, :, free])
-            uphill = (here.score[:, None, free] @ directions)[:, 0]
+            bends, directions = np.linalg.eigh(reached.curvature[:, free][:, :, free])
+            uphill = (reached.score[:, None, free] @ directions)[:, 0]
             uphill /= np.maximum(np.abs(bends), FLAT)
             step = np.zeros_like(b)
             step[:, free] = (directions @ uphill[:, :, None])[:, :, 0]
-            top = (here.score * step).sum(axis=1) < FLAT
-            there = self.penalised(b + step)
-            while (lower := there.likelihood < here.likelihood - ROUNDING).any():
+            top = (reached.score * step).sum(axis=1) < FLAT
+            ahead = self.penalised(b + step)
+            while (lower := ahead.likelihood < reached.likelihood - ROUNDING).any():
                 step[lower] /= 2
-                there = self.penalised(b + step)
-            b, here = b + step, there
+                ahead = self.penalised(b + step)
+            b, reached = b + step, ahead
         if not top.any():
             return None
-        best = int(np.where(top, here.likelihood, -inf).argmax())
-        return Fit(self, b[best], float(here.likelihood[best]), here.information[best])
+        best = int(np.where(top, reached.likelihood, -inf).argmax())
+        return Fit(self, b[best], float(reached.likelihood[best]), reached.information[best])
 
     def infinite(self) -> NDArray[np.bool_]:
         """Return which coefficients have no finite maximum likelihood estimate, (terms,).
@@ -103,10 +103,10 @@ class Counts:
         of Konis (2007) finds the one that gains most.
         """
         signed = np.vstack([self.design[self.chosen > 0], -self.design[self.chosen < self.n]])
-        found = linprog(
+        solution = linprog(
             -signed.sum(axis=0), A_ub=-signed, b_ub=np.zeros(len(signed)), bounds=(-1, 1)
         )
-        return np.asarray(np.abs(found.x) > 1e-4)
+        return np.asarray(np.abs(solution.x) > 1e-4)
 
     def likelihood(self, b: Array) -> tuple[Array, Array, Array, Array]:
         """Return of ``b`` (starts, terms) penalised log-likelihoods, chances, weights, information.
@@ -431,8 +431,8 @@ def who_first_firth(trials: pd.DataFrame, less: pd.DataFrame | None = None) -> R
     tests = [fit.p(place) for place in range(len(WHO_FIRST_TERMS))] if fit else [np.nan]
     if fit is None or not np.isfinite(tests).all():
         return Regression(n, {}, Fact(Why.NO_FIRTH))
-    found = zip(WHO_FIRST_TERMS, fit.b.tolist(), fit.errors.tolist(), tests, strict=False)
-    terms = {name: Term(b, se, None, p) for name, b, se, p in found}
+    rows = zip(WHO_FIRST_TERMS, fit.b.tolist(), fit.errors.tolist(), tests, strict=False)
+    terms = {name: Term(b, se, None, p) for name, b, se, p in rows}
     return Regression(n, terms, profile=fit)
 
 
@@ -460,10 +460,10 @@ def gap_ols(trials: pd.DataFrame, measure: str = "gap_m", *, robust: bool = Fals
     with_velocity = np.eye(len(GAP_TERMS))[2:]
     told_apart = np.linalg.matrix_rank(covariance[2:, 2:]) == len(with_velocity)
     terms = _terms(GAP_TERMS, fit.params, fit.bse, freedom)
-    found = Regression(len(gap), terms, freedom=freedom, covariance=covariance)
-    moved = found.moved(chosen)
+    regression = Regression(len(gap), terms, freedom=freedom, covariance=covariance)
+    moved = regression.moved(chosen)
     return replace(
-        found,
+        regression,
         equivalence_p=moved.within_p if moved else None,
         velocity_p=float(fit.f_test(with_velocity).pvalue) if told_apart else None,
     )
@@ -496,11 +496,11 @@ def by_pairs(
 
 
 def _terms(names: Sequence[str], b: Array, se: Array, freedom: float = inf) -> dict[str, Term]:
-    found = {}
+    terms = {}
     for name, value, error in zip(names, b.tolist(), se.tolist(), strict=True):
         statistic = value / error if error else inf
-        found[name] = Term(value, error, statistic, intervals.two_sided_p(statistic, freedom))
-    return found
+        terms[name] = Term(value, error, statistic, intervals.two_sided_p(statistic, freedom))
+    return terms
 
 
 def unfit_for_logit(design: Array, left: Array) -> Fact | None:

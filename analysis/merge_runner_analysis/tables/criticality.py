@@ -17,7 +17,9 @@ def criticality(study: Study) -> Table:
         f"merge never close in faster than {NO_CONFLICT_MPS} m/s are in no conflict, and have no "
         "time to collision"
     )
-    ended = ", ".join(one.heading for one in shown_in("criticality") if one.trials == "ended")
+    ended = ", ".join(
+        metric.heading for metric in shown_in("criticality") if metric.trials == "ended"
+    )
     medians = (
         "medians are of finished trials that have the measure; their number stands before each"
     )

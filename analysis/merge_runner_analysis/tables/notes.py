@@ -17,12 +17,12 @@ from merge_runner_analysis.tables.model import Table
 def footnoted(table: Table, study: Study) -> Table:
     """The table with notes on its trials, and ``*`` for what is said of drivers, told in a note."""
     drivers = (*study.groups, *study.asked, *study.unjudged, *study.unjudged_asked)
-    said = {text for group in drivers for text in (group.posing, group.said)}
+    remarks = {text for group in drivers for text in (group.posing, group.said)}
     whose: dict[str, dict[str, None]] = {}
     rows = []
     for row in table.rows:
         driver, _, text = str(row.values.get("driver")).removesuffix(")").rpartition(" (")
-        if text in said:
+        if text in remarks:
             whose.setdefault(text, {})[driver] = None
             row = replace(row, values={**row.values, "driver": f"{driver}*"})  # noqa: PLW2901
         rows.append(row)
@@ -55,10 +55,12 @@ def _of_trials(table: Table, study: Study) -> Iterator[str]:
     if study.human in groups:
         yield from _human_notes(study, table)
         for group in groups:
-            own = group.trials.loc[~group.trials["condition"].isin(HUMAN_CONDITIONS), "condition"]
-            if len(own):
+            driven_in = group.trials["condition"]
+            unknown = driven_in[~driven_in.isin(HUMAN_CONDITIONS)]
+            if len(unknown):
+                names = ", ".join(sorted({*unknown}))
                 yield (
-                    f"{group.id}: no human drove {', '.join(sorted({*own}))} ({len(own)} trials), "
+                    f"{group.id}: no human drove {names} ({len(unknown)} trials), "
                     "which rates and regressions rest on too, but no difference from the humans"
                 )
     if counts := [f"{g.id}: {g.repeated} of {len(g.stored.trials)}" for g in groups if g.repeated]:

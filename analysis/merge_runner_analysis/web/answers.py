@@ -14,7 +14,7 @@ import duckdb
 from merge_runner.errors import UsageError
 from merge_runner.results.database import read_database
 from merge_runner.text_safety import first_line
-from merge_runner_analysis.cache import digest_of, kept, present_state, stamp_of
+from merge_runner_analysis.cache import digest_of, finished, kept, present_state, stamp_of
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.tables.model import from_text, to_text
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 OF = " of"  # behind a column that counts: all of which it counts some
 FOUND = 3  # findings of a run that its page shows
+COUNT = "trials"  # by this name the number of trials is kept
 Request = tuple[str, ...]
 """``table NAME [SWEEP CONDITION]``, ``comparison GROUP GROUP SWEEP CONDITION``,
 ``cell TABLE ROW COLUMN SWEEP CONDITION``, ``figure NAME FORM``, ``digest``, ``audit``."""
@@ -41,6 +42,32 @@ def answer(db: Path, request: Request) -> dict[str, Any]:
         raise UsageError(f"{db} cannot be read: {first_line(exc)}") from exc
 
 
+def kept_answer(db: Path, request: Request) -> dict[str, Any] | None:
+    """Return a table that is kept beside the database, at once; None where it is not."""
+    match request:
+        case ["table", name, *part]:
+            pass
+        case ["comparison", first, second, *part]:
+            name = _name_of(first, second)
+        case _:
+            return None
+    state = present_state(db)
+    tables = finished(db, state, _selected(*part).key(db), [name])
+    counts = finished(db, state, "", [COUNT])
+    if not tables or not counts:
+        return None
+    return {"counted": int(counts[COUNT]), "table": tables[name]}
+
+
+def _name_of(first: str, second: str) -> str:
+    """Return by what name a comparison of two drivers is kept."""
+    return f"comparison {first} {second}"
+
+
+def _selected(sweep: str = "", condition: str = "") -> Selection:
+    return Selection(sweep=sweep, condition=condition)
+
+
 class Numbers:
     """Answers from one state of a database, whose trials are read once something needs them."""
 
@@ -54,24 +81,27 @@ class Numbers:
         """
         match request:
             case ["table", name, *part]:
-                found: dict[str, Any] = {"table": self._table(name, *part)}
-            case ["comparison", one, other, *part]:
-                found = {"table": self._comparison(one, other, *part)}
+                result: dict[str, Any] = {"table": self._table(name, *part)}
+            case ["comparison", first, second, *part]:
+                result = {"table": self._comparison(first, second, *part)}
             case ["cell", table, row, column, *part]:
-                found = self._cell(table, row, column, *part)
+                result = self._cell(table, row, column, *part)
             case ["figure", name, "svg" | "png" as form]:
-                found = {"file": self._figure(name, form), "digest": self._digest}
+                result = {"file": self._figure(name, form), "digest": self._digest}
             case ["digest"]:
-                found = {"digest": self._digest}
+                result = {"digest": self._digest}
             case ["audit"]:
-                found = {"notes": json.loads(self._kept("audit", self._audit))}
+                result = {"notes": json.loads(self._kept("audit", self._audit))}
             case _:
                 raise UsageError(f"nothing answers {request!r}")
+        return {"counted": int(kept(self.db, self._state, "", COUNT, self._count)), **result}
+
+    def _count(self) -> str:
         with read_database(self.db) as connection:
             counted = connection.execute(
                 "SELECT count(*) FROM trials WHERE source <> 'first_decision'"
             )
-            return {"counted": counted.fetchall()[0][0], **found}
+            return str(counted.fetchall()[0][0])
 
     @cached_property
     def study(self) -> Study:
@@ -93,23 +123,23 @@ class Numbers:
 
     def _table(self, name: str, sweep: str = "", condition: str = "") -> str:
         """Return a table of all trials, or of those of a sweep and a condition."""
-        part = Selection(sweep=sweep, condition=condition)
+        part = _selected(sweep, condition)
         return self._kept(
             name,
             lambda: to_text(make_tables(self._part(part), [name])[0]),
             part.key(self.db),
         )
 
-    def _comparison(self, one: str, other: str, sweep: str = "", condition: str = "") -> str:
+    def _comparison(self, first: str, second: str, sweep: str = "", condition: str = "") -> str:
         """Return how two drivers differ, each with its prompt, as ``_table`` does."""
-        part = Selection(sweep=sweep, condition=condition)
+        part = _selected(sweep, condition)
 
         def make() -> str:
             from merge_runner_analysis.tables.effects import comparison
 
-            return to_text(comparison(self._part(part), one, other))
+            return to_text(comparison(self._part(part), first, second))
 
-        return self._kept(f"comparison {one} {other}", make, part.key(self.db))
+        return self._kept(_name_of(first, second), make, part.key(self.db))
 
     def _part(self, selection: Selection) -> Study:
         from merge_runner_analysis.study import Study
@@ -130,12 +160,13 @@ class Numbers:
         """Return what the audit of each run found and notes, by its id; nothing is replayed."""
         from merge_runner.audit.checks import audited_database, check_sweep
 
-        told = {}
+        notes = {}
         with audited_database(self.db) as connection:
             for run, ended in connection.execute(RUNS).fetchall():
                 audit = check_sweep(connection, run, (), finished=ended)
-                told[run] = [f"found: {one}" for one in audit.findings[:FOUND]] + audit.notes
-        return json.dumps(told)
+                findings = [f"found: {finding}" for finding in audit.findings[:FOUND]]
+                notes[run] = findings + audit.notes
+        return json.dumps(notes)
 
     def _cell(
         self, name: str, row: str, column: str, sweep: str = "", condition: str = ""
@@ -144,13 +175,13 @@ class Numbers:
         from merge_runner_analysis.explain import explain
 
         table = from_text(self._table(name, sweep, condition))
-        study = self._part(Selection(sweep=sweep, condition=condition))
+        study = self._part(_selected(sweep, condition))
         column, of, _ = column.partition(OF)
         try:
-            found = explain(study, table, f"{row}:{column}")
+            explained = explain(study, table, f"{row}:{column}")
         except UsageError as exc:
             return {"absent": str(exc)}
-        counts = not of and any(one.counts for one in table.columns if one.name == column)
+        counts = not of and any(shown.counts for shown in table.columns if shown.name == column)
         specs = {
             group.id: dict(zip(trials["trial_id"], trials["spec_hash"], strict=True))
             for group in (*study.measured, *study.asked, *study.unjudged, *study.unjudged_asked)
@@ -158,10 +189,10 @@ class Numbers:
         }
         trials = [
             (trial, specs[source.group][trial])
-            for source in found.sources
+            for source in explained.sources
             for trial in (source.numerator if counts else source.trials)
         ]
-        return {"explained": found, "trials": trials}
+        return {"explained": explained, "trials": trials}
 
 
 @lru_cache(1)

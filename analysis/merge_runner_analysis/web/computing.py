@@ -24,7 +24,7 @@ from merge_runner.errors import MergeRunnerError
 from merge_runner.registry import in_use, use
 from merge_runner.study.file import StudyFile
 from merge_runner.study.parts import catalogue_of
-from merge_runner_analysis.web.answers import Request, answer
+from merge_runner_analysis.web.answers import Request, answer, kept_answer
 
 REMEMBERED = 100
 # While a run goes on the database changes all the time: an answer stands for some seconds.
@@ -80,9 +80,11 @@ class Computing:
         db: Path,
         compute: Callable[[Path, Request], dict[str, Any]] = answer,
         start: Callable[[], Executor] | None = None,
+        look_up: Callable[[Path, Request], dict[str, Any] | None] = kept_answer,
     ) -> None:
+        """Compute by a function, in what ``start`` begins, unless ``look_up`` has the answer."""
         self.db = db
-        self._compute, self._start = compute, start or processes
+        self._compute, self._start, self._look_up = compute, start or processes, look_up
         self._lock = threading.Lock()
         self._jobs: dict[Request, Job] = {}
         self._executor: Executor | None = None
@@ -118,6 +120,10 @@ class Computing:
         return replace(job, older=job.state != state)
 
     def _submit(self, request: Request) -> Future[dict[str, Any]]:
+        if (known := self._look_up(self.db, request)) is not None:
+            done = Future[dict[str, Any]]()
+            done.set_result(known)
+            return done
         if self._executor is not None:
             with suppress(BrokenProcessPool):  # another process takes its place
                 return self._executor.submit(self._compute, self.db, request)

@@ -72,12 +72,12 @@ def export_folder(
     db: Path,
     folder: Path,
     wanted: Sequence[str] = (),
-    told: Callable[[int], object] = lambda _: None,
+    progress: Callable[[int], object] = lambda _: None,
 ) -> Path:
     """Write the pages of a study into a folder; returns the first of them.
 
     ``wanted`` are names of trials, in which * stands for anything: then it is their list and their
-    pages alone. ``told`` gets the number of pages so far. An earlier export in the folder goes.
+    pages alone. ``progress`` gets the number of pages so far. An earlier export in the folder goes.
     Raises UsageError; then, as where a page holds a key or a path of this machine, the folder stays
     as it was.
     """
@@ -95,7 +95,7 @@ def export_folder(
         else:
             _begin_to_compute(site)
         try:
-            asyncio.run(_crawl(site, rows, begin, heads, stage, told))
+            asyncio.run(_crawl(site, rows, begin, heads, stage, progress))
         except BrokenProcessPool:
             raise UsageError("nothing was written: a process that helped was ended") from None
     return index
@@ -126,7 +126,7 @@ async def _crawl(
     begin: str,
     heads: tuple[str, ...],
     stage: Path,
-    told: Callable[[int], object],
+    progress: Callable[[int], object],
 ) -> None:
     """Save the pages to which links lead, and those of all trials."""
     files, waiting = {begin: INDEX}, [(False, 0, begin)]
@@ -168,7 +168,7 @@ async def _crawl(
             parts[place] = escape(root + file) if file else ""
         (stage / files[page]).parent.mkdir(exist_ok=True)
         (stage / files[page]).write_text(linked("".join(parts)), encoding="utf-8")
-        told(next(done))
+        progress(next(done))
 
     for row in rows:
         named(Links().trial(row))
@@ -286,9 +286,9 @@ def _opened(site: Site, wanted: Sequence[str]) -> Iterator[list[Row]]:
 @contextmanager
 def _staged(folder: Path) -> Iterator[Path]:
     """Give a temporary folder, of which all goes into this one in the end; raises UsageError."""
-    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.is_dir())
+    parent = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.is_dir())
     try:
-        with tempfile.TemporaryDirectory(prefix=".merge-runner-", dir=there) as stage:
+        with tempfile.TemporaryDirectory(prefix=".merge-runner-", dir=parent) as stage:
             yield Path(stage)
             folder.mkdir(parents=True, exist_ok=True)
             for path in Path(stage).iterdir():

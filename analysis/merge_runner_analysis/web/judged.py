@@ -59,11 +59,11 @@ class Driver:
 
 def judged(site: Site, bar: Bar, asked: Mapping[str, str]) -> tuple[list[Driver], dict[str, Any]]:
     """The drivers of a scope, and the values of every page that shows their verdicts."""
-    found, table = computed_table(site, TABLE, bar.scope.sweep, bar.scope.condition)
+    job, table = computed_table(site, TABLE, bar.scope.sweep, bar.scope.condition)
     return drivers_of(site, table, bar.scope), {
         "bar": bar,
         "carried": carried(asked),
-        "computed": found,
+        "computed": job,
         "table": table,
         "headings": KINDS,
         "human": humans_of(table),
@@ -72,21 +72,23 @@ def judged(site: Site, bar: Bar, asked: Mapping[str, str]) -> tuple[list[Driver]
     }
 
 
-def humans_of(table: Table | None, own: Driver | None = None) -> dict[str, Any]:
+def humans_of(table: Table | None, driver: Driver | None = None) -> dict[str, Any]:
     """The humans' cells by measure, where their bands lie, and which humans they are.
 
     Beside a driver they are those that it is compared with, in its conditions.
     """
     rows = table.rows if table else ()
-    found, measures = by_group(rows).get(HUMAN, {}), measures_of(rows)
-    label = str(next(iter(found.values()))["driver"]) if found else HUMAN
-    for name, cell in own.cells.items() if own else ():
-        beside = {"estimate": cell.values.get("human"), "ci": cell.values.get("human_ci")}
-        found[name] = {**found[name], **beside}
+    verdicts, measures = by_group(rows).get(HUMAN, {}), measures_of(rows)
+    label = str(next(iter(verdicts.values()))["driver"]) if verdicts else HUMAN
+    for name, cell in driver.cells.items() if driver else ():
+        compared = {"estimate": cell.values.get("human"), "ci": cell.values.get("human_ci")}
+        verdicts[name] = {**verdicts[name], **compared}
     return {
         "about": label.partition("(")[2].rstrip(")") or "990 trials of nine pairs, as published",
-        "cells": cells(found, measures),
-        "bands": {name: band(measure, found.get(name, {})) for name, measure in measures.items()},
+        "cells": cells(verdicts, measures),
+        "bands": {
+            name: band(measure, verdicts.get(name, {})) for name, measure in measures.items()
+        },
     }
 
 
@@ -131,15 +133,15 @@ def _kind(facts: Row | None) -> str:
 
 def by_kind(drivers: Sequence[Driver]) -> dict[str, list[Driver]]:
     """Drivers by their kinds."""
-    return {kind: [one for one in drivers if one.kind == kind] for kind in KINDS}
+    return {kind: [driver for driver in drivers if driver.kind == kind] for kind in KINDS}
 
 
 def noted(drivers: Sequence[Driver]) -> list[tuple[str, str, str]]:
     """What is to be known of a number: driver, measure and note, each at its cell (†)."""
     return [
-        (one.name, cell.measure.trait, capital(str(cell.values["note"])))
-        for one in drivers
-        for cell in one.cells.values()
+        (driver.name, cell.measure.trait, capital(str(cell.values["note"])))
+        for driver in drivers
+        for cell in driver.cells.values()
         if cell.values["note"]
     ]
 
@@ -151,14 +153,14 @@ def by_condition(site: Site, scope: Scope, drivers: Sequence[Driver]) -> dict[st
     """
     rows = site.catalogue.counts(scope.trials(), "model", "variant", "condition")
     counted = {(row["model"], row["variant"], row["condition"]): _merged(row) for row in rows}
-    of = [(one, (unmarked(one.name), one.prompt)) for one in drivers]
+    of = [(driver, (unmarked(driver.name), driver.prompt)) for driver in drivers]
     known = {name: _merged(counts._asdict()) for name, counts in human_counts().items()}
     played = {name for *key, name in counted if tuple(key) in [driver for _, driver in of]}
     names = ordered(played or known)
     return {
         "names": names,
         "humans": [known.get(name) for name in names],
-        "rows": [(one, [counted.get((*key, name)) for name in names]) for one, key in of],
+        "rows": [(driver, [counted.get((*key, name)) for name in names]) for driver, key in of],
     }
 
 

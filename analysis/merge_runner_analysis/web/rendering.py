@@ -5,8 +5,9 @@ from __future__ import annotations
 import base64
 import hashlib
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import jinja2
 from jinja2.bccache import Bucket
@@ -47,19 +48,14 @@ class Environment(jinja2.Environment):
         return super().getattr(obj, attribute)
 
 
-class Compiled(jinja2.BytecodeCache):
-    """Templates that this process has compiled, for every study that it shows."""
-
-    kept: ClassVar[dict[str, bytes]] = {}
-
-    def load_bytecode(self, bucket: Bucket) -> None:
-        """Take a template from what is kept, if it is there."""
-        if bucket.key in self.kept:
-            bucket.bytecode_from_string(self.kept[bucket.key])
+class Compiled(jinja2.FileSystemBytecodeCache):
+    """Compiled templates in a folder beside them, as Python keeps modules, if it can be written."""
 
     def dump_bytecode(self, bucket: Bucket) -> None:
         """Keep a template."""
-        self.kept[bucket.key] = bucket.bytecode_to_string()
+        with suppress(OSError):
+            Path(self.directory).mkdir(exist_ok=True)
+            super().dump_bytecode(bucket)
 
 
 def environment(
@@ -74,7 +70,7 @@ def environment(
         loader=jinja2.FileSystemLoader(TEMPLATES),
         autoescape=True,
         auto_reload=False,
-        bytecode_cache=Compiled(),
+        bytecode_cache=Compiled(str(TEMPLATES / "__pycache__")),
         # A misspelt name fails the page rather than leaving a blank in it.
         undefined=jinja2.StrictUndefined,
         # Whatever a page says shows itself; what a form sends back is escaped before.

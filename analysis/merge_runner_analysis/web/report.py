@@ -112,15 +112,15 @@ def write_report(
 def finished_figures(study: Study, say: Callable[[str], object] = str) -> dict[str, str]:
     """Every figure by name as SVG in Base64: read from the database where stored, else drawn."""
     files = {f"{name}.svg": name for name in FIGURES}  # a table may have the name alone
-    found = finished(study.db, study.state, study.options, list(files))
+    stored = finished(study.db, study.state, study.options, list(files))
     drawn = {}
     for file, name in files.items():
-        if file not in found:
+        if file not in stored:
             say(f"drawing {name}")
             drawn[file] = base64.b64encode(rendered(study, name, "svg")).decode()
     if drawn:
         keep_finished(study.db, study.state, study.options, drawn)
-    return {name: (found | drawn)[file] for file, name in files.items()}
+    return {name: (stored | drawn)[file] for file, name in files.items()}
 
 
 def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> str:
@@ -146,8 +146,8 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
         headline = f"{apart.claim} {headline}"
     made = {table.name: table for table in tables}
     question = answer_of(made.get("effects"), made.get("levels"))
-    beside = (against(table, study) if table.name in FILES else table for table in tables)
-    views = [table_view(table, number) for table in beside]
+    compared = (against(table, study) if table.name in FILES else table for table in tables)
+    views = [table_view(table, number) for table in compared]
     if study.groups == study.baselines:  # it would stand there twice
         figures = {name: data for name, data in figures.items() if name != "figure2-variants"}
     inlined = inlined_texts([STYLE])
@@ -196,19 +196,19 @@ def _apart(study: Study) -> Comparison | None:
     groups = [group for group in study.models if group.setting == study.reference]
     if len(groups) != 2:
         return None
-    one, other = groups
-    named = short_names([one.driver, other.driver])
-    names = (named[one.driver], named[other.driver])
-    return comparison_of(comparison(study, one.id, other.id), names, (no_trials, no_trials))
+    first, second = groups
+    named = short_names([first.driver, second.driver])
+    names = (named[first.driver], named[second.driver])
+    return comparison_of(comparison(study, first.id, second.id), names, (no_trials, no_trials))
 
 
 def _once(tables: Iterable[Mapping[str, Any]]) -> dict[str, list[str]]:
     """The notes of each table by its name, without those of a table before it."""
-    said: dict[str, None] = {}
+    earlier: dict[str, None] = {}
     notes = {}
     for table in tables:
-        notes[table["name"]] = [note for note in table["notes"] if note not in said]
-        said |= dict.fromkeys(table["notes"])
+        notes[table["name"]] = [note for note in table["notes"] if note not in earlier]
+        earlier |= dict.fromkeys(table["notes"])
     return notes
 
 
@@ -253,15 +253,15 @@ def _changes(baseline: str, prompt: str) -> str:
 
 def _plain(rows: pd.DataFrame) -> tuple[list[str], list[list[str]]]:
     """Return rows of the database as a reader sees them; # stands before the names of numbers."""
-    found = rows.convert_dtypes()
+    frame = rows.convert_dtypes()
     names = [
-        ("" if is_string_dtype(found[name]) else "#")
+        ("" if is_string_dtype(frame[name]) else "#")
         + str(name).replace("_usd", " (USD)").replace("_", " ")
-        for name in found
+        for name in frame
     ]
     cells = [
         ["" if pd.isna(value) else _shown(value) for value in row]
-        for row in found.itertuples(index=False)
+        for row in frame.itertuples(index=False)
     ]
     return names, cells
 
@@ -280,10 +280,10 @@ def alarms(study: Study, origin: Provenance) -> dict[str, tuple[list[str], str]]
 
     Of each the findings, one for each group or run, and what they mean.
     """
-    found: dict[str, list[str]] = {title: [] for title in MEANINGS}
+    findings: dict[str, list[str]] = {title: [] for title in MEANINGS}
     for title, text in _found(study, origin):
-        found[title].append(text)
-    return {title: (texts, MEANINGS[title]) for title, texts in found.items() if texts}
+        findings[title].append(text)
+    return {title: (texts, MEANINGS[title]) for title, texts in findings.items() if texts}
 
 
 def crashes(study: Study) -> dict[str, dict[str, int]]:
@@ -328,10 +328,10 @@ def _repeats(study: Study) -> Iterator[str]:
 
 
 def _found(study: Study, origin: Provenance) -> Iterator[tuple[str, str]]:
-    for one in origin.mismatches.itertuples():
-        answers = f"{one.answers} answer{'s' * (one.answers != 1)}"
-        said = f"{one.requested} was asked for, {one.served} answered: {answers}, in {one.sweeps}"
-        yield "Another model answered", said
+    for pair in origin.mismatches.itertuples():
+        answers = f"{pair.answers} answer{'s' * (pair.answers != 1)}"
+        asked = f"{pair.requested} was asked for, {pair.served} answered"
+        yield "Another model answered", f"{asked}: {answers}, in {pair.sweeps}"
     for group in (*study.unjudged, *study.unjudged_asked):
         yield "Too few valid decisions", f"{group.id}: {group.unjudged}"
     names: dict[str, dict[str, None]] = {}
@@ -349,13 +349,13 @@ def _found(study: Study, origin: Provenance) -> Iterator[tuple[str, str]]:
         fallbacks, decisions = counts["fallback"], counts["decisions"]
         if not group.unjudged and fallbacks > MANY_FALLBACKS * decisions:
             share = number(100 * fallbacks / decisions)
-            said = f"{fallbacks} of {decisions} decisions of {group.id} ({share} %)"
-            yield "Many fallbacks", said
+            text = f"{fallbacks} of {decisions} decisions of {group.id} ({share} %)"
+            yield "Many fallbacks", text
         if missing := counts[NO_DECISION]:
             yield "Decisions are missing", f"{missing} of {decisions} decisions of {group.id}"
         if counts["unknown"]:
-            said = f"{counts['unknown']} of {counts['attempts']} of {group.id}"
-            yield "Attempts of unknown fate", said
+            text = f"{counts['unknown']} of {counts['attempts']} of {group.id}"
+            yield "Attempts of unknown fate", text
     yield from (("Trials repeat earlier ones", text) for text in _repeats(study))
     for marked in names.values():
         if len(marked) > 1:

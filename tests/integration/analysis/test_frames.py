@@ -29,7 +29,7 @@ def test_the_menu_is_small_and_loads_nothing_before_it_is_used():
         "an import of the module would hide the name"
     )
     loaded = "print('pandas' in sys.modules or 'scipy' in sys.modules)"
-    code = f"import sys, merge_runner_analysis.commands; {loaded}"
+    code = f"import sys, merge_runner_analysis.commands, merge_runner_analysis.web.app; {loaded}"
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "False"
 
 

@@ -4,9 +4,11 @@ import os
 import re
 import signal
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from contextvars import copy_context
 from dataclasses import replace
+from functools import partial
 from html import unescape
 from urllib.parse import parse_qs, unquote, urlsplit
 
@@ -29,7 +31,7 @@ from merge_runner_analysis.web.answers import answer, numbers
 from merge_runner_analysis.web.computing import Computing
 from tests.support.cases import cases
 from tests.support.gate import HANGS_S
-from tests.support.serving import Page, client_of, in_process, listed
+from tests.support.serving import Page, client_of, in_process, listed, never
 from tests.support.studies import Said, write_study, yielding
 
 HOSTILE = '<img src=x onerror="alert(1)">'
@@ -263,6 +265,18 @@ def test_a_process_of_its_own_answers_alike_takes_no_file_of_the_users_and_is_re
     with closing(Computing(db)) as computing:
         computing.ask(("table", "attempts"), (1, 1))
     assert set(threading.enumerate()) <= threads, "a program could stumble over it"
+
+
+def test_a_kept_table_is_shown_at_once_and_computed_again_once_the_results_differ(tmp_path):
+    db = write_study(tmp_path / "study.duckdb", yielding("o3", reps=1))
+    request = ("table", "attempts", "", "")
+    made = answer(db, request)
+    with closing(Computing(db, never, partial(ThreadPoolExecutor, 1))) as computing:
+        assert computing.ask(request, (1, 1)).content == made
+        assert computing.ask(("table", "gap", "", ""), (1, 1), HANGS_S).failure == "not now"
+    os.utime(db)
+    with closing(Computing(db, never, partial(ThreadPoolExecutor, 1))) as computing:
+        assert computing.ask(request, (1, 1), HANGS_S).failure == "not now"
 
 
 def test_what_the_pages_compute_knows_the_study_as_the_explorer_was_given_it(golden_copy):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from merge_runner.llm.ledger import APART
-from merge_runner_analysis.provenance import task_settings
+from merge_runner_analysis.task import task_settings
 from merge_runner_analysis.web.computed import computed
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.listing import MISSING

@@ -162,21 +162,21 @@ def collision_class(course: Course, decisions: Decided) -> str:
 
 def judged_at(course: Course) -> int:
     """The last sample from which one driver alone avoids the collision; the end where none is."""
-    found = -1
+    latest = -1
     for side in SIDES:
         for action in (BRAKING, SPEEDING_UP):
-            later = course.last_chance(side, action, found)
-            found = found if later is None else later
-    return course.last if found < 0 else found
+            later = course.last_chance(side, action, latest)
+            latest = latest if later is None else later
+    return course.last if latest < 0 else latest
 
 
 def _drove_no_plan_of_its_own(course: Course, decisions: Decided, side: Side) -> bool:
-    own = [decision for decision in decisions if decision["side"] == side]
-    if not any(decision["fallback"] for decision in own):
+    made_by_side = [decision for decision in decisions if decision["side"] == side]
+    if not any(decision["fallback"] for decision in made_by_side):
         return False
     chance = course.last_chance(side, BRAKING)
     until_s = -1.0 if chance is None else course.times_s[chance] + TICK_S
-    made = [decision["fallback"] for decision in own if decision["time_s"] <= until_s]
+    made = [decision["fallback"] for decision in made_by_side if decision["time_s"] <= until_s]
     return bool(made and made[-1])
 
 

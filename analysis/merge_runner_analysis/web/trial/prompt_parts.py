@@ -45,10 +45,10 @@ def parts_of(
     Those that are only in the one before come last. Without one before, nothing is marked. The
     ``digests`` of its blocks, as its spec has them, name the words of a study.
     """
-    own = tuple((digests or {}).items())
+    named = tuple((digests or {}).items())
     if before is None:
-        return [Part(name, (("same", text),)) for name, text in _blocks(prompt, own)]
-    earlier, now = dict(_blocks(before, own)), _blocks(prompt, own)
+        return [Part(name, (("same", text),)) for name, text in _blocks(prompt, named)]
+    earlier, now = dict(_blocks(before, named)), _blocks(prompt, named)
     gone = [(name, "") for name in earlier if name not in dict(now)]
     return [Part(name, _compared(earlier.get(name, ""), text)) for name, text in (*now, *gone)]
 
@@ -69,18 +69,18 @@ def words_of(prompt: str, digests: Mapping[str, str]) -> list[tuple[str, str]]:
 
 
 @lru_cache(KEPT)
-def _blocks(prompt: str, own: tuple[tuple[str, str], ...]) -> list[tuple[str, str]]:
+def _blocks(prompt: str, digests: tuple[tuple[str, str], ...]) -> list[tuple[str, str]]:
     """Name and text of each block; what belongs to none that is known here has no name.
 
     Of the blocks whose paragraphs begin like the next ones the one with the longest beginnings is
-    meant. ``own`` are name and digest of all that the prompt has.
+    meant. ``digests`` are name and digest of all that the prompt has.
     """
     known = [
         (name, _begun(template))
         for name, block in BLOCKS.items()
         for template in filter(None, (block.merge, block.straight))
     ]
-    found: list[tuple[str, str]] = []
+    blocks: list[tuple[str, str]] = []
     paragraphs = prompt.rstrip("\n").split("\n\n")
     while paragraphs:
         alike = (
@@ -90,23 +90,24 @@ def _blocks(prompt: str, own: tuple[tuple[str, str], ...]) -> list[tuple[str, st
         )
         _, name, length = max(alike, default=(0, "", 1))
         if not name:
-            name, length = _own_block(paragraphs, own)
+            name, length = _own_block(paragraphs, digests)
         text = "\n\n".join(paragraphs[:length])
-        if found and name == found[-1][0]:
-            text = f"{found.pop()[1]}\n\n{text}"
-        found.append((name, text))
+        if blocks and name == blocks[-1][0]:
+            text = f"{blocks.pop()[1]}\n\n{text}"
+        blocks.append((name, text))
         del paragraphs[:length]
     # Words with values in them are not known by their digest: those that are left are meant.
-    left = {level_of(name) for name, _ in own if name not in BLOCKS} - {name for name, _ in found}
-    return [(name or ", ".join(sorted(left)), text) for name, text in found]
+    levels = {level_of(name) for name, _ in digests if name not in BLOCKS}
+    left = levels - {name for name, _ in blocks}
+    return [(name or ", ".join(sorted(left)), text) for name, text in blocks]
 
 
-def _own_block(paragraphs: Sequence[str], own: Iterable[tuple[str, str]]) -> tuple[str, int]:
+def _own_block(paragraphs: Sequence[str], digests: Iterable[tuple[str, str]]) -> tuple[str, int]:
     """The name of the block that comes next, known by the digest of its text, and its length.
 
     The digest covers what the block stands before, too.
     """
-    names = {digest: name for name, digest in own}
+    names = {digest: name for name, digest in digests}
     for length in range(len(paragraphs) if names else 0, 0, -1):
         text = "\n\n".join(paragraphs[:length])
         roads = ((text, text), (text, None), (None, text))

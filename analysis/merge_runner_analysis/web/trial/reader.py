@@ -73,16 +73,16 @@ class Trial:
 
 def read_trials(connection: DuckDBPyConnection, keys: Sequence[Key]) -> list[Trial]:
     """Read trials that are known to be there, by their names and specs."""
-    them = {"trials": [name for name, _ in keys], "specs": [spec for _, spec in keys]}
+    wanted = {"trials": [name for name, _ in keys], "specs": [spec for _, spec in keys]}
     states, calls, tasks = (
-        _by_trial(records(connection, sql, them)) for sql in (STATES, CALLS, TASKS)
+        _by_trial(records(connection, sql, wanted)) for sql in (STATES, CALLS, TASKS)
     )
-    result = connection.execute(DECISIONS, them)
+    result = connection.execute(DECISIONS, wanted)
     lost = dict.fromkeys(names_of(result)) | {"valid": False, "fallback": False, "lost": True}
     rows = list(by_name(result))
     is_told = any(row["other_seen"] is not None for row in rows)
     decisions = _by_trial(rows)
-    perceived = _by_trial(records(connection, PERCEIVED, them) if is_told else ())
+    perceived = _by_trial(records(connection, PERCEIVED, wanted) if is_told else ())
     return [
         _trial(tasks[key][0], states[key], decisions[key], calls[key], perceived[key], lost)
         for key in keys
@@ -91,10 +91,10 @@ def read_trials(connection: DuckDBPyConnection, keys: Sequence[Key]) -> list[Tri
 
 def _by_trial(rows: Iterable[Row]) -> dict[Key, list[Row]]:
     """Return rows by the name and the spec of their trial."""
-    found = defaultdict[Key, list[Row]](list)
+    by_trial = defaultdict[Key, list[Row]](list)
     for row in rows:
-        found[row["trial_id"], row["spec_hash"]].append(row)
-    return found
+        by_trial[row["trial_id"], row["spec_hash"]].append(row)
+    return by_trial
 
 
 def _trial(
@@ -113,14 +113,14 @@ def _trial(
         row = made.setdefault(place, lost | dict(zip(("decision", "side"), place, strict=True)))
         row.setdefault("attempts", []).append(call)
     perceived = {(row["decision"], row["side"]): row for row in perceptions}
-    told = json.loads(task["spec"] or "{}")
-    scenario = scenario_of(task["source"], told.get("scenario"))
+    spec = json.loads(task["spec"] or "{}")
+    scenario = scenario_of(task["source"], spec.get("scenario"))
     trial = Trial(
         scenario,
-        {side: pace_of(scenario, told.get(side, {})) for side in SIDES},
+        {side: pace_of(scenario, spec.get(side, {})) for side in SIDES},
         {row["side"]: row for row in states},
         [made[place] for place in sorted(made)],
-        {side: digests_of(told.get("prompt_blocks") or {}, side) for side in SIDES},
+        {side: digests_of(spec.get("prompt_blocks") or {}, side) for side in SIDES},
     )
     before: dict[str, Row] = {}
     for row in trial.decisions:
@@ -135,10 +135,10 @@ def _trial(
     return trial
 
 
-def scenario_of(source: str, told: Mapping[str, Any] | None) -> ScenarioConfig:
+def scenario_of(source: str, spec: Mapping[str, Any] | None) -> ScenarioConfig:
     """The task of a trial, as its spec tells it, or as it usually is."""
     usual = HUMAN_TASK if source == "human" else {}
-    return ScenarioConfig.model_validate(usual if told is None else told)
+    return ScenarioConfig.model_validate(usual if spec is None else spec)
 
 
 def controlled(samples: Row, name: str) -> list[float]:

@@ -69,18 +69,18 @@ def replay_data(row: Row, trial: Trial, account: Account | None) -> dict[str, An
 
 def marks(row: Row, trial: Trial, account: Account | None) -> list[dict[str, Any]]:
     """The moments that matter, in order: merges, a collision, and those of the account."""
-    found: list[tuple[float, str, str, str]] = [
+    moments: list[tuple[float, str, str, str]] = [
         (reached_s, side, "merge", f"{side} merges")
         for side, samples in trial.states.items()
         if (reached_s := reaches_s(samples, TRACK.merge_point_m)) is not None
     ]
     if row["status"] == "collided":
-        found.append((trial.end_s, "", "collision", "collision"))
+        moments.append((trial.end_s, "", "collision", "collision"))
     if account:
-        found += [(mark.time_s, mark.side, mark.kind, mark.text) for mark in account.marks]
+        moments += [(mark.time_s, mark.side, mark.kind, mark.text) for mark in account.marks]
     return [
         {"t": round(time_s, 3), "side": side, "kind": kind, "text": text}
-        for time_s, side, kind, text in sorted(found, key=lambda mark: mark[0])
+        for time_s, side, kind, text in sorted(moments, key=lambda mark: mark[0])
     ]
 
 

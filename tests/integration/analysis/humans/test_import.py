@@ -41,7 +41,7 @@ def changed(recording: Recording, name: str, row: int, value: object) -> bytes:
 
 def test_a_trial_is_stored_as_its_record_says_and_its_spec_too(path):
     report = imported(path, {"d/experiment_6_iter_1.csv": LEFT.csv()})
-    assert (report.added, report.there, report.differing) == (1, 0, [])
+    assert (report.added, report.stored, report.differing) == (1, 0, [])
     record = trial_record(parse_csv(LEFT.csv()), 6, 1)
     assert rows(path, "from trials") == rows_of(record)["trials"]
     assert rows(path, "from states order by step, side") == rows_of(record)["states"]
@@ -59,7 +59,7 @@ def test_importing_twice_or_beside_a_sweep_leaves_the_database_as_it_was(path):
     assert rows(path, "select count(*), count(distinct trial_id) from trials") == [(5, 4)]
     before = results_digest(path)
     again = imported(path, files)
-    assert (again.added, again.there, again.differing) == (0, 4, [])
+    assert (again.added, again.stored, again.differing) == (0, 4, [])
     assert results_digest(path) == before
 
 
@@ -75,12 +75,12 @@ def test_a_trial_that_is_stored_with_other_values_is_named_and_kept(path):
     names = [f"experiment_4_iter_{number}.csv" for number in range(len(OTHER))]
     first = {f"{folder}/{name}": LEFT.csv() for name in names for folder in "ab"}
     report = imported(path, first)
-    assert (report.added, report.there) == (4, 4)
+    assert (report.added, report.stored) == (4, 4)
     kept = "from states where trial_id not like '%iter009' order by trial_id, step, side"
     before = rows(path, "from trials order by rep"), rows(path, kept)
     other = {name: changed(LEFT, *change) for name, change in zip(names, OTHER, strict=True)}
     report = imported(path, other | {"experiment_4_iter_9.csv": LEFT.csv()})
-    assert (report.added, report.there) == (1, 0)
+    assert (report.added, report.stored) == (1, 0)
     assert sorted(report.differing) == [f"human/pair1/L_4_0/iter00{number}" for number in range(4)]
     assert (rows(path, "from trials where rep < 9 order by rep"), rows(path, kept)) == before
 
@@ -128,7 +128,7 @@ def test_what_is_stored_before_an_interruption_stays(path, monkeypatch):
         import_trials(sort_files(stopped), Store(path))
     assert rows(path, "select rep from trials order by rep") == [(0,), (1,)]
     report = import_trials(sort_files(files), Store(path))
-    assert (report.added, report.there) == (3, 2)
+    assert (report.added, report.stored) == (3, 2)
 
 
 def test_a_page_gives_the_trials_that_the_recordings_give(tmp_path):
@@ -151,4 +151,4 @@ def test_a_page_gives_the_trials_that_the_recordings_give(tmp_path):
     assert np.abs(apart).max() < 1e-9
     # Recordings after pages leave these as they are.
     report = imported(one, recordings)
-    assert (report.added, report.there, report.differing) == (0, 2, [])
+    assert (report.added, report.stored, report.differing) == (0, 2, [])
