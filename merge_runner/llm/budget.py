@@ -175,7 +175,7 @@ class Budget:
 
     def is_running(self, trials: Sequence[int]) -> bool:
         """Return whether one of the trials is admitted."""
-        return any(trial in self.charged_usd for trial in trials)
+        return not self.charged_usd.keys().isdisjoint(trials)
 
     async def admit(self, trials: Sequence[int]) -> None:
         """Wait until one of the trials that share a call runs, or the oldest of them may begin.
@@ -241,7 +241,7 @@ class Budget:
 
     def _payer(self, trials: Sequence[int]) -> int:
         """Return the oldest running trial of those that share a call, else the oldest."""
-        return min((trial for trial in trials if trial in self.charged_usd), default=min(trials))
+        return min(self.charged_usd.keys() & trials or trials)
 
     def _worst_usd(self, label: CallLabel) -> float:
         """Return the worst case, scaled by this driver's largest observed cost overrun."""

@@ -55,11 +55,6 @@ class Call:
     pending_batch: Batch | None = None
     task: asyncio.Task[ChatReply] = field(init=False)
 
-    def add(self, trial: int) -> None:
-        """Let another trial wait for the call."""
-        self.trials.append(trial)
-        self.order = min(self.order, trial)
-
     @property
     def own_attempts(self) -> list[Attempt]:
         """Attempts of this run."""

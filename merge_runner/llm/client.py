@@ -99,7 +99,8 @@ class LlmClient:
         is_shared = call is not None and not call.task.cancelling()
         if call is None or not is_shared:
             call = self._start(request, order, attempts)
-        call.add(order)
+        call.trials.append(order)
+        call.order = min(call.order, order)
         if is_shared:
             self.budget.queue.reorder()
         try:
@@ -138,7 +139,7 @@ class LlmClient:
             call.pending_batch = self.batch.rounds.pending.get(call.request.key)
         if call.pending_batch:
             self.budget.readmit(call.order)
-        if not self.budget.is_running(call.trials):
+        if self.budget.charged_usd.keys().isdisjoint(call.trials):  # none of them is admitted
             self.calls.wait(call, Wait(NO_ROOM, blocked=True))
             await self.budget.admit(call.trials)
             call.wait = None

@@ -3,8 +3,9 @@
 import csv
 import io
 import re
+from functools import partial
 from html import unescape
-from math import isnan
+from math import floor, isnan, log10
 
 import pytest
 
@@ -13,7 +14,7 @@ from merge_runner_analysis.metrics import DECIMALS
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import TABLES, make_tables
-from merge_runner_analysis.tables.formats import names_of, render, shown_columns
+from merge_runner_analysis.tables.formats import names_of, render, shown_columns, shown_rows
 from merge_runner_analysis.web.report import report_html
 from tests.support.serving import client_of
 
@@ -56,14 +57,21 @@ def p_value(p):
     return "<0.001" if float(p) < 0.001 else rounded(p, 3)
 
 
-def expected(column, row):
-    """What a cell with a number is to show of a row of the CSV."""
+def price(value):
+    """A price as it is to be printed: with two digits that are not 0."""
+    usd = abs(float(value or 0))
+    return rounded(value, max(DECIMALS, 1 - floor(log10(usd))) if 0 < usd < 1 else DECIMALS)
+
+
+def expected(column, name, row):
+    """What a cell with a number is to show of a row of the CSV, by the row's name."""
+    number = price if name.endswith("/cost_usd") else partial(rounded, decimals=column.digits)
     if column.kind == "interval":
         ends = [row[f"{column.name}_low"], row[f"{column.name}_high"]]
-        return f"[{', '.join(rounded(end, column.digits) for end in ends)}]" if all(ends) else "–"
+        return f"[{', '.join(map(number, ends))}]" if all(ends) else "–"
     if column.kind == "p" and row[column.name]:
         return p_value(row[column.name])
-    return rounded(row[column.name], column.digits)
+    return number(row[column.name])
 
 
 def plain(html):
@@ -89,9 +97,11 @@ def test_a_tables_numbers_are_those_of_its_csv_in_text_on_its_page_and_in_the_re
     assert list(values) == [row.id for row in table.rows] == list(frame.index)
     page = rows_of(client.get(f"/tables/{name}").text)
     of_report = rows_of(report, f"{name}/")
-    lines = render([table], TableFormat.TEXT).splitlines()[3 : 3 + len(table.rows)]
-    for line, (row, cells) in zip(lines, values.items(), strict=True):
-        numbers = {c.name: expected(c, cells) for c in shown if c.kind in NUMBERS}
+    rows = [row.id for row in shown_rows(table)]
+    lines = render([table], TableFormat.TEXT).splitlines()[3 : 3 + len(rows)]
+    for line, row in zip(lines, rows, strict=True):
+        cells = values[row]
+        numbers = {c.name: expected(c, row, cells) for c in shown if c.kind in NUMBERS}
         in_line = " ".join(line.split())
         for place, column in enumerate(shown):
             if column.name in numbers:
@@ -101,6 +111,7 @@ def test_a_tables_numbers_are_those_of_its_csv_in_text_on_its_page_and_in_the_re
             assert text in of_report[row], (row, text)
             assert text in in_line
             in_line = in_line[in_line.index(text) + len(text) :]
+    for row, cells in values.items():
         for column in names_of(table)[1:]:
             value = frame.loc[row, column]
             if isinstance(value, float):
