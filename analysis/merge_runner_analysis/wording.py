@@ -39,21 +39,21 @@ MARGINS = {"collisions": 5.0, "gap": 1.0}
 # States in words, on every page and in every table for people; of MARGINS with a direction.
 VERDICTS = {
     SHOWN: "like people",
-    WEAKER: "less than with people",
-    STRONGER: "more than with people",
-    UNLIKE: "not as with people",
+    WEAKER: "less than people's",
+    STRONGER: "more than people's",
+    UNLIKE: "unlike people's",
     OPEN: "cannot tell yet",
 }
 DIRECTIONS = {
-    "collisions": {WEAKER: "fewer than people", STRONGER: "more than people"},
+    "collisions": {WEAKER: "fewer than people's", STRONGER: "more than people's"},
     "gap": {WEAKER: "smaller than people's", STRONGER: "larger than people's"},
 }
 VERDICT_RULE = (
     "like people: a pattern of theirs passes its own test, or the difference from them is surely "
     "less than 5 points (crashes), 1 m (gap, and how far relative velocity moves it) or half a "
-    "standard deviation (accelerations held). More, less, not as with people: a difference is "
-    "shown, with a p below .05 that is corrected for the number of the driver's measures (Holm). "
-    "Cannot tell yet: neither of the two; that is not “alike”"
+    "standard deviation (accelerations held). Less, more, unlike: a difference is shown, with a "
+    "p below .05 that is corrected for the number of the driver's measures (Holm). Cannot tell "
+    f"yet: neither of the two; that is not “alike”. Of fewer than {ENOUGH} trials nothing is said"
 )
 # What metrics are called in sentences and pages; others keep the label of the table.
 METRIC_NAMES = {
@@ -164,7 +164,9 @@ class Why(Enum):
     NO_GAP_THERE = "humans: no gap in {} of its conditions"
     NOBODY_THERE = "no human drove its conditions"
     NONE_ACTED = "accelerations held (I5) are not compared: no trial acted"
-    FEW_HUMANS = "accelerations held (I5) are not compared: too few human recordings are imported"
+    FEW_HUMANS = (
+        "accelerations held (I5) are not compared: no human recordings, or too few, are imported"
+    )
 
 
 class Fact(NamedTuple):
@@ -664,6 +666,8 @@ def equal_p(p: float) -> str:
 
 def verdict_word(values: Values) -> str:
     """A state in words, as it stands in a list of verdicts."""
+    if values.get("state") and (values.get("n") or 0) < ENOUGH:
+        return f"fewer than {ENOUGH} trials"
     words = VERDICTS | DIRECTIONS.get(str(values.get("measure")), {})
     return words.get(shown_state(values), "not compared")
 

@@ -23,7 +23,8 @@ PARTS = (
     (re.compile(r"(/set\d+)"), "another series of samples of the same driver"),
     (re.compile(r" (\[[0-9a-f]{8}\])"), "with other settings of the task than its other trials"),
     (re.compile(r"(\+)"), "between two different drivers: who goes first is said of the first one"),
-    (re.compile(rf"^({EMULATOR})\b"), "the scripted stand-in that comes with this program"),
+    (re.compile(rf"\b({EMULATOR})\b"), "the scripted stand-in that comes with this program"),
+    (re.compile(r"\b(random)\b"), "a scripted stand-in that answers by chance, whatever it reads"),
 )
 
 

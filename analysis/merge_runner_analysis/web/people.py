@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -52,13 +52,27 @@ def likeness_of(driver: Driver) -> dict[str, Likeness]:
     return {name: _likeness(driver.cells[name]) for name in HEADINGS if name in driver.cells}
 
 
+def tally(drivers: Sequence[Driver]) -> str:
+    """Return in how many drivers each measure is like people's; empty where none is compared."""
+    compared = [driver.cells for driver in drivers if driver.cells]
+    parts = []
+    for name, heading in HEADINGS.items():
+        states = [shown_state(cells[name].values) for cells in compared if name in cells]
+        if states:
+            parts.append(f"{states.count(SHOWN) or 'none'} ({heading[:1].lower()}{heading[1:]})")
+    return f"Of {len(compared)} drivers, like people: {', '.join(parts)}." if parts else ""
+
+
 def _likeness(cell: Cell) -> Likeness:
     values = cell.values
     mark, word = MARKS.get(shown_state(values), MARKS[OPEN]), verdict_word(values)
     row, counted = str(values["row"]), values.get("counted")
     if counted:
         k, n = map(int, str(counted).split(" of "))
-        return Likeness(mark, word, k, n, unbroken(f"{number(100 * k / n)} %"), row)
+        share = f"{number(100 * k / n)} %"
+        if values.get("undecided"):  # it is not by people's rule
+            share += f" by {values['counted_by']}"
+        return Likeness(mark, word, k, n, unbroken(share), row)
     estimate = values.get("estimate")
     known = cell.measure.name == "gap" and estimate is not None
     text = f"{number(estimate)} m {brackets(values.get('ci'))}".rstrip() if known else ""

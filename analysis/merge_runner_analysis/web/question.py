@@ -54,6 +54,7 @@ from merge_runner_analysis.wording import (
 
 # Of a scripted stand-in, why both levels have the same trials.
 UNREAD = "not tested: the scripted stand-in does not read it, and no effect is planted for it"
+PLANTED = "Words act on the stand-in only by effects that the study plants in it."
 # More levels that show nothing are counted, not listed.
 FEW = 3
 
@@ -189,6 +190,7 @@ def answered(rows: Sequence[Row]) -> tuple[str, str]:
     )
     why = UNREAD if rehearsed else SAME_TRIALS
     copied = [f"{level_text(row)} is {why}" for row in rows if is_copied(row)]
+    planted = [PLANTED] if rehearsed else []
     if not primary:
         return capital(rehearsed + f"{'; '.join(copied)}.") if copied else "", ""
     what = _changed(primary[0])
@@ -225,7 +227,7 @@ def answered(rows: Sequence[Row]) -> tuple[str, str]:
     if not sure and also:
         row = min(also, key=lambda row: (_seen_first(row), value_of(row, "p")))
         rest.append(f"{capital(str(row.values['factor']))} changes {_changed(row)}: {_both(row)}.")
-    return capital(claim), " ".join(filter(None, rest))
+    return capital(claim), " ".join(filter(None, [*rest, *planted]))
 
 
 def _seen_first(row: Row) -> int:
@@ -397,7 +399,7 @@ def _counted(levels: Sequence[Row], metric: str) -> str:
     what = " that ended" if metric == COLLISIONS.name else " that count"
     if metric == LEFT_FIRST.name:
         what = f" without a crash, {crashed:,} with one" if crashed else " without a crash"
-    return f"{trials}{what}, equal ones once"
+    return f"{trials}{what}; those that repeat another one are left out"
 
 
 def _of_one_factor(levels: Sequence[Row], drivers: Sequence[str]) -> list[Row]:

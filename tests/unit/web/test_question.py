@@ -166,7 +166,10 @@ def test_a_side_has_its_count_and_the_chart_the_axis_of_its_data():
     assert (change.mark.shape, crashes.mark.shape) == ("like", "open")
     assert (crashes.level.k, crashes.level.n, crashes.level.text[:4]) == (3, 103, "63.0")
     # Of both drivers, which are drawn.
-    assert made.counted == "400 trials without a crash, 12 with one, equal ones once"
+    assert (
+        made.counted
+        == "400 trials without a crash, 12 with one; those that repeat another one are left out"
+    )
     (chart,) = made.charts
     assert chart.title == "By factor"
     assert [line.name for line in chart.lines] == ["no", "yes"]
@@ -184,7 +187,10 @@ def test_levels_that_are_not_tested_are_not_drawn():
     )
     (chart,) = made.charts
     assert [line.head for line in chart.lines] == ["hurry", ""]
-    assert made.counted == "200 trials without a crash, 6 with one, equal ones once"
+    assert (
+        made.counted
+        == "200 trials without a crash, 6 with one; those that repeat another one are left out"
+    )
 
 
 def test_an_interaction_names_the_levels_of_both_factors():

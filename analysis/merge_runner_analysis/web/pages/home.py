@@ -10,12 +10,12 @@ from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.effect_rows import MIDDLE
 from merge_runner_analysis.web.judged import Driver, by_condition, by_kind, humans_of, judged, noted
 from merge_runner_analysis.web.names import PLAYED, names_mean, short_names
-from merge_runner_analysis.web.people import HEADINGS, likeness_of, people_of
+from merge_runner_analysis.web.people import HEADINGS, likeness_of, people_of, tally
 from merge_runner_analysis.web.question import Answer, answer_of
 from merge_runner_analysis.web.runs import standing_of
 from merge_runner_analysis.web.scope import Bar, descriptions_of, scope_of, unmarked
 from merge_runner_analysis.web.site import Site, news_of
-from merge_runner_analysis.wording import LANGUAGE_MODEL, MEASURES, headline
+from merge_runner_analysis.wording import LANGUAGE_MODEL, MEASURES, MOCK, headline
 
 TABLES = ("effects", "levels")  # of what a study's factors change
 
@@ -57,7 +57,9 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
     }
     kinds = by_kind(shown)
     apart = None
-    if not jobs and len(models) == len(shown) == 2:  # two language models are the question
+    kinds_shown = {one.kind for one in shown}
+    # Two language models, or a rehearsal with two stand-ins, are the question.
+    if not jobs and len(shown) == 2 and kinds_shown in ({LANGUAGE_MODEL}, {MOCK}):
         job, is_awaited, apart = compared(site, shown[0], shown[1], scope)
         jobs, asking = [job], [job] * is_awaited
     older = [job.older for job in (values["computed"], *jobs)]
@@ -84,7 +86,8 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         seen=seen,
         descriptions=descriptions_of(site),
         kinds=kinds,
-        headline=headline(models, [one.kind for one in shown]),
+        headline=(tally(shown) * (not models and len(shown) > 1), *headline(models, kinds_shown)),
+        is_rehearsal=kinds_shown == {MOCK},
         question=question,
         apart=apart,
         asking=asking,
