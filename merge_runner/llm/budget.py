@@ -14,10 +14,9 @@ flight only while twice their worst cases fit, and one reply at most, the last, 
 from __future__ import annotations
 
 import asyncio
-import bisect
 import math
 from asyncio import Future
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -78,6 +77,7 @@ class Reservation:
             raise TrialSuspended(USED_UP)
         self.queued = False
         self.budget.queued_usd -= self.usd
+        self.budget.queue.wake()
 
     def settle(self, attempt: Attempt, keep: Callable[[Execute], ResultT]) -> Future[ResultT]:
         """Keep what the attempt brought and book its cost, in one durable transaction."""
@@ -111,31 +111,36 @@ class Waiter:
     is_admission: bool
     changed: asyncio.Event = field(default_factory=asyncio.Event)
 
-    def place(self) -> tuple[bool, float]:
-        """Return the place in the queue; the lowest is first."""
-        return self.is_admission, min(self.trials, default=math.inf)
-
 
 class MoneyQueue:
-    """Priority queue: attempts before trials that wait for admission, then by oldest trial."""
+    """Priority queue: calls of ``running`` trials before trials that wait for admission.
 
-    def __init__(self, ledger: Ledger) -> None:
+    A call of a running trial has the place of the oldest one, whatever it waits for.
+    """
+
+    def __init__(self, ledger: Ledger, running: Mapping[int, float]) -> None:
         self.waiters: list[Waiter] = []
         self._ledger = ledger
+        self._running = running
+
+    def place(self, waiter: Waiter) -> tuple[bool, float]:
+        """Return the place of a waiter; the lowest is first."""
+        running = self._running.keys() & waiter.trials
+        return waiter.is_admission and not running, min(running or waiter.trials, default=math.inf)
 
     def wake(self) -> None:
-        """Let the first in the queue check whether it may go on."""
-        if self.waiters:
-            self.waiters[0].changed.set()
+        """Let the first in the queue check whether it may go on.
 
-    def reorder(self) -> None:
-        """Sort anew, since the trials that share a call have changed."""
-        self.waiters.sort(key=Waiter.place)
-        self.wake()
+        The order depends on the trials that run, and on those that share a call.
+        """
+        if self.waiters:
+            self.waiters.sort(key=self.place)
+            self.waiters[0].changed.set()
 
     async def wait(self, waiter: Waiter, may_go: Callable[[], bool]) -> None:
         """Wait in the queue until ``may_go`` is True."""
-        bisect.insort(self.waiters, waiter, key=Waiter.place)
+        self.waiters.append(waiter)
+        self.waiters.sort(key=self.place)
         try:
             while self.waiters[0] is not waiter or not may_go():
                 waiter.changed.clear()
@@ -166,7 +171,7 @@ class Budget:
         self._largest_usd = 0.0
         self._spent_before = ledger.spending.committed_usd > 0
         self._left: set[int] = set()
-        self.queue = MoneyQueue(ledger)
+        self.queue = MoneyQueue(ledger, self.charged_usd)
 
     @property
     def waiting(self) -> set[int]:
@@ -192,6 +197,7 @@ class Budget:
         """Admit a trial at once: an earlier run has asked for it."""
         if self.ledger.cap is not None and trial not in self._left:
             self.charged_usd.setdefault(trial, 0.0)
+            self.queue.wake()
 
     def leave(self, trial: int) -> None:
         """Free the money of a trial that has ended or is suspended."""

@@ -53,7 +53,13 @@ class Call:
     trials: list[int] = field(default_factory=list)
     bypass_batch: bool = False
     pending_batch: Batch | None = None
+    given_up: bool = False
     task: asyncio.Task[ChatReply] = field(init=False)
+
+    def give_up(self) -> None:
+        """Cancel the call: who asks for its key from now on begins another one."""
+        self.given_up = True
+        self.task.cancel()
 
     @property
     def own_attempts(self) -> list[Attempt]:
@@ -120,5 +126,5 @@ class Calls:
         for call in calls:
             # An attempt in flight may be billed whether or not anybody waits for it.
             if call.wait is not None:
-                call.task.cancel()
+                call.give_up()
         await asyncio.gather(*(call.task for call in calls), return_exceptions=True)

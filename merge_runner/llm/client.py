@@ -96,22 +96,22 @@ class LlmClient:
     ) -> ChatReply:
         """Return the reply of the call under way for a request, or of a new one."""
         call = self.calls.under_way.get(request.key)
-        is_shared = call is not None and not call.task.cancelling()
+        is_shared = call is not None and not call.given_up
         if call is None or not is_shared:
             call = self._start(request, order, attempts)
         call.trials.append(order)
         call.order = min(call.order, order)
         if is_shared:
-            self.budget.queue.reorder()
+            self.budget.queue.wake()
         try:
             # Shielded: the call may be paid for already when its trial is cancelled.
             reply = await asyncio.shield(call.task)
         finally:
             call.trials.remove(order)
             if call.trials:
-                self.budget.queue.reorder()
+                self.budget.queue.wake()
             elif call.wait is not None and not call.wait.charged:
-                call.task.cancel()  # or it would take money for a trial that is left
+                call.give_up()  # or it would take money for a trial that is left
         # The attempts are counted once, for whoever asked first.
         return replace(reply, earlier=len(reply.attempts)) if is_shared else reply
 
@@ -125,7 +125,7 @@ class LlmClient:
         self.calls.under_way[request.key] = call
 
         def forget(done: asyncio.Task[ChatReply]) -> None:
-            if self.calls.under_way[request.key] is call:  # no new call has replaced it
+            if self.calls.under_way.get(request.key) is call:  # no new call has replaced it
                 del self.calls.under_way[request.key]
             if not done.cancelled():
                 done.exception()  # retrieved, since all who asked may be gone by now

@@ -131,6 +131,7 @@ class Ledger:
         self.cap = cap
         self.spending = Spending()
         self.committed_usd = 0.0
+        self._in_transaction_usd = 0.0  # as committed_usd; no read() of another thread changes it
         self._others = json.dumps([name for name in cap.scopes if name != scope] if cap else [])
         # A replay spends nothing and needs no record: a damaged one is an error only in a live run.
         with contextlib.suppress(UsageError, CacheFailed, RecordingError):
@@ -145,11 +146,11 @@ class Ledger:
     def read(self) -> Spending:
         """Sum the record and return the spending; raise UsageError where it is damaged."""
         if self.scope:
-            self._sum(self.store.rows(_SUMS, self.scope, self._others))
+            self.committed_usd = self._sum(self.store.rows(_SUMS, self.scope, self._others))
         return self.spending
 
-    def _sum(self, rows: Iterable[tuple[Any, ...]]) -> None:
-        """Take the rows of _SUMS; raise UsageError for impossible sums."""
+    def _sum(self, rows: Iterable[tuple[Any, ...]]) -> float:
+        """Take the rows of _SUMS, and return their sum; raise UsageError for impossible ones."""
         (_, reserved_usd, attempts, _), (_, elsewhere_usd, _, _), *spent = rows
         spent_usd = overrun_usd = 0.0
         overruns = {}
@@ -167,12 +168,13 @@ class Ledger:
                 "on with --cache NEW, which counts from 0"
             )
         self.spending = Spending(spent_usd, reserved_usd, attempts, overrun_usd, overruns)
-        self.committed_usd = spent_usd + reserved_usd + elsewhere_usd
+        committed_usd: float = spent_usd + reserved_usd + elsewhere_usd
+        return committed_usd
 
     def _sum_once(self, execute: Execute) -> None:
         """Sum before the first change of this ledger in a transaction."""
         if self.store.summed is not self:
-            self._sum(execute(_SUMS, (self.scope, self._others)))
+            self._in_transaction_usd = self._sum(execute(_SUMS, (self.scope, self._others)))
             self.store.summed = self
 
     def reserve(
@@ -180,12 +182,14 @@ class Ledger:
     ) -> bool:
         """Reserve the worst case of an attempt; False if it exceeds the cap; an operation."""
         self._sum_once(execute)
-        if self.cap is not None and self.committed_usd + usd > self.cap.usd + TOLERANCE_USD:
+        if self.cap is not None and (self._in_transaction_usd + usd > self.cap.usd + TOLERANCE_USD):
+            self.committed_usd = self._in_transaction_usd
             return False
         since = datetime.now(UTC).isoformat(timespec="milliseconds")
         place = (label.driver, label.slot, label.worst_usd, since, "in flight")
         execute(_OPEN, (self.scope, key, number, usd, *place))
-        self.committed_usd += usd
+        self._in_transaction_usd += usd
+        self.committed_usd = self._in_transaction_usd
         return True
 
     async def ask_coordinator(self, key: str, usd: float, label: CallLabel) -> bool:
@@ -222,9 +226,10 @@ class Ledger:
         over = (usd - reserved_usd, usd / max(worst_usd, TOLERANCE_USD)) if exceeds else (0.0, 0.0)
         execute(_PAY, (scope, driver, usd, *over))
         if exceeds or not closed or scope != self.scope:
-            self._sum(execute(_SUMS, (self.scope, self._others)))
+            self._in_transaction_usd = self._sum(execute(_SUMS, (self.scope, self._others)))
         else:
-            self.committed_usd += usd - reserved_usd
+            self._in_transaction_usd += usd - reserved_usd
+        self.committed_usd = self._in_transaction_usd
         return driver, usd, over[0]
 
     def reserved_usd(self, key: str) -> float:

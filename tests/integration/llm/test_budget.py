@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from merge_runner.errors import CacheFailed, RecordingError, TrialSuspended, UsageError
 from merge_runner.llm.attempts import Meter
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.ledger import CallLabel, Ledger
+from merge_runner.llm.ledger import CallLabel, Cap, Ledger
 from merge_runner.llm.store import CachedCall
 from merge_runner.records import Attempt, Slot, make_request
 from merge_runner.run.local_runner import LocalRunner
@@ -200,7 +200,7 @@ async def test_a_running_trial_never_waits_for_the_admission_of_another_that_sha
     await asyncio.sleep(0)
     assert not admitted.done()
     shared.append(1)
-    budget.queue.reorder()
+    budget.queue.wake()
     await asyncio.wait_for(admitted, 5)
     assert not ahead.done()
     paid = await budget.reserve(shared, "key", asked(1.5))  # of the money that is kept for 1
@@ -208,6 +208,64 @@ async def test_a_running_trial_never_waits_for_the_admission_of_another_that_sha
     paid.close()
     budget.leave(1)
     await ahead
+
+
+LABEL = asked(1.0)
+# In each a running trial shares a call: who begins, which calls wait, who joins them, which go on.
+SHARED = {
+    "an admission behind that of an older trial": (
+        14.0, {7: 0.0}, [("admit", [3]), ("admit", [5])], [(1, 7)], {1}),
+    "an attempt that a trial joins which does not run": (
+        9.5, {5: 0.0, 7: 0.0}, [("reserve", [7]), ("reserve", [5])], [(0, 3)], {1}),
+    "an admission behind an attempt": (
+        9.5, {5: 0.0, 7: 0.0}, [("admit", [3]), ("reserve", [7])], [(0, 5)], {0}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("cap", "running", "calls", "joined", "go_on"), SHARED.values(), ids=SHARED
+)
+async def test_a_call_of_a_running_trial_has_its_place_whatever_it_waits_for(
+    ledger, cap, running, calls, joined, go_on
+):
+    budget = budget_of(ledger, cap, each(10.0))
+    budget.charged_usd.update(running)
+    budget._spent_before = True
+    tasks = []
+    for number, (wait, trials) in enumerate(calls):
+        waiting = budget.admit(trials) if wait == "admit" else budget.reserve(trials, "", LABEL)
+        tasks.append(asyncio.create_task(waiting))
+        await asyncio.sleep(0)
+        for call, trial in joined:
+            if call == number:
+                trials.append(trial)
+                budget.queue.wake()
+    done, _ = await asyncio.wait(tasks, timeout=0.1)
+    assert {tasks.index(task) for task in done} == go_on
+    for task in tasks:
+        task.cancel()
+
+
+async def test_a_trial_that_is_admitted_anew_lets_its_other_call_go_on(ledger):
+    budget = budget_of(ledger, 14.0, each(10.0))
+    await budget.admit([1])
+    older, other = (asyncio.create_task(budget.admit([trial])) for trial in (3, 5))
+    await asyncio.sleep(0)
+    budget.readmit(5)
+    await asyncio.wait_for(other, 5)
+    assert not older.done()
+    older.cancel()
+
+
+def test_a_sum_read_meanwhile_changes_no_check_of_a_transaction(ledger, cache):
+    ledger.cap = Cap(1.0)
+
+    def twice(execute):
+        first = ledger.reserve("a", 1, 0.6, O3, execute)
+        ledger.committed_usd = 0.0  # as another thread reads it from before the transaction
+        return first, ledger.reserve("b", 1, 0.6, O3, execute)
+
+    assert cache.run_now([twice]) == [(True, False)]
 
 
 async def test_an_attempt_takes_the_place_of_the_oldest_running_trial_that_shares_it(ledger):
@@ -219,7 +277,7 @@ async def test_an_attempt_takes_the_place_of_the_oldest_running_trial_that_share
     await asyncio.sleep(0)
     assert not waiting.done()
     shared.append(1)
-    budget.queue.reorder()
+    budget.queue.wake()
     assert (await asyncio.wait_for(waiting, 5)).trial == 1
 
 
