@@ -68,6 +68,31 @@ async def test_two_who_ask_the_same_at_once_share_one_call(make):
     assert (meter.calls_live, meter.calls_cached, meter.calls_shared) == (1, 1, 1)
 
 
+async def test_a_call_whose_wait_for_money_times_out_is_no_call_that_was_given_up(
+    make, monkeypatch
+):
+    """A timeout cancels its own task for a moment, in which others may ask the same."""
+    client, expire = make(answer(), price=PRICE, cap=0.0015), asyncio.Timeout._on_timeout
+    client.budget.trial_usd = lambda _: 0.0014
+    await client.budget.admit([1])
+    calls, shared = client.calls.under_way, []
+
+    def expires(timeout):
+        expire(timeout)
+        asking = client.ask("prompt", slot(), order=6)
+        before = [*calls.values()]
+        asking.send(None)
+        shared.append([*calls.values()] == before)
+        asking.close()
+
+    monkeypatch.setattr(asyncio.Timeout, "_on_timeout", expires)
+    asked = await begun(client.ask("prompt", slot(), order=5))
+    await asyncio.sleep(100)
+    assert shared == [True]
+    asked.cancel()
+    await ticks()
+
+
 async def test_every_slot_is_a_sample_of_its_own(make):
     client = make(*(answer(str(number)) for number in range(20)))
     slots = [slot(repetition, side) for repetition in range(1, 11) for side in ("left", "right")]
