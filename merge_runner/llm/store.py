@@ -98,12 +98,13 @@ class CallStore:
         *,
         overlay: Callable[[], AbstractContextManager[Overlay]] | None = None,
         read_only: bool = False,
-        before: bool = False,
+        allow_previous: bool = False,
     ) -> None:
         """Open or make the folder; ``overlay`` opens a recording, which takes precedence.
 
-        ``read_only`` changes nothing in the folder, which must exist, and may have the format
-        ``before``; otherwise it is upgraded. Raises UsageError for a folder that cannot be used.
+        ``read_only`` changes nothing in the folder, which must exist. A folder of the previous
+        format is upgraded, or read as it is if ``read_only`` and ``allow_previous``. Raises
+        UsageError for a folder that cannot be used.
         """
         self.folder = folder
         self.locks = ModelLocks(folder)
@@ -112,7 +113,7 @@ class CallStore:
         self.write = self._writer.write
         self.summed: object = None  # the ledger that knows its sums in the transaction under way
         try:
-            prepare(folder, read_only=read_only, before=before)
+            prepare(folder, read_only=read_only, allow_previous=allow_previous)
             self._opened = self._file
             self._one_query = Lock()
             with contextlib.ExitStack() as unless_opened:
@@ -187,7 +188,7 @@ class CallStore:
             raise
         except (MergeRunnerError, *DAMAGED) as exc:
             alone = len(operations) == 1
-            return [exc] if alone else [self._run_each([each])[0] for each in operations]
+            return [exc] if alone else [self._run_each([operation])[0] for operation in operations]
 
     def read(self, name: str) -> str | None:
         """Return the text under a name, or None; raise RecordingError where it is damaged."""

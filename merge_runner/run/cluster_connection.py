@@ -26,14 +26,14 @@ VALID = (
     "valid: local:N (N workers on this machine), a scheduler's tcp://HOST:PORT or tls://HOST:PORT, "
     "or its file PATH.json"
 )
-# Those with a level of their own: Dask logs tracebacks for what we report in a line, such as lost
-# workers, and so do the libraries below it.
+# Loggers with a level of their own. Dask and its libraries log tracebacks of errors that a run
+# reports in one line, such as lost workers.
 LOGGERS = ("distributed", "distributed.client", "tornado", "tornado.application")
 
 
 @contextmanager
 def _silenced(loggers: Iterable[logging.Logger]) -> Iterator[None]:
-    """Let loggers say nothing for a while."""
+    """Silence loggers within a ``with`` block."""
     levels = [(logger, logger.level) for logger in loggers]
     try:
         for logger, _ in levels:
@@ -46,7 +46,7 @@ def _silenced(loggers: Iterable[logging.Logger]) -> Iterator[None]:
 
 @contextmanager
 def _environment_restored() -> Iterator[None]:
-    """Undo what is set meanwhile: Dask sets variables of this process for those it starts."""
+    """Restore the environment after a ``with`` block: Dask sets variables for its children."""
     before = {**os.environ}
     try:
         yield

@@ -554,7 +554,7 @@ def test_calls_are_counted_by_kind_once_whichever_process_kept_them(cache, other
         == templates.answer_counts(other)
         == ({}, counted([*first, *later]))
     )
-    assert [template.own for template in counted(later)] == [True, True, False]
+    assert [template.genuine for template in counted(later)] == [True, True, False]
     monkeypatch.setattr(CachedCall, "from_json", lambda text: pytest.fail("it is read again"))
     assert templates.answer_counts(cache) == ({}, counted([*first, *later]))
 
