@@ -180,7 +180,7 @@ class Study:
         first: bool = False,
         grid: str | None = None,
         stop: asyncio.Event | None = None,
-        **how: Any,  # noqa: ANN401 # fields of Options
+        **fields: Any,  # noqa: ANN401 # fields of Options
     ) -> StudyOutcome:
         """Play all trials that are not stored yet; ``yes`` agrees to spend money.
 
@@ -195,7 +195,7 @@ class Study:
                 raise UsageError(f"this run spends money; yes=True goes ahead: {lines}")
 
         plan = self.plan(first=first, grid=grid)
-        options = Options(self.db, self.cache, **how)
+        options = Options(self.db, self.cache, **fields)
         whole = any(self._choices.get(name) is not None for name in PARTS)
         how_to_stop = on_event(stop)
         return StudyOutcome(

@@ -36,7 +36,7 @@ class ResponseCache(CallStore):
     def put_now(
         self,
         entries: Iterable[CachedCall],
-        tried: Iterable[tuple[str, Attempts]] = (),
+        unanswered: Iterable[tuple[str, Attempts]] = (),
         money: Iterable[Operation] = (),
     ) -> list[CachedCall]:
         """Store entries, and attempts of calls without an answer, in one transaction here.
@@ -47,7 +47,7 @@ class ResponseCache(CallStore):
         damaged = [partial(self.quarantine, entry.request.key) for entry in entries]
         kept = [partial(self.keep, entry) for entry in entries]
         others = [partial(self.remove, UNANSWERED + entry.request.key) for entry in entries]
-        others += [partial(self.keep_attempts, *attempts) for attempts in tried]
+        others += [partial(self.keep_attempts, *attempts) for attempts in unanswered]
         return self.run_now([*damaged, *kept, *others, *money])[len(damaged) :][: len(kept)]
 
     def add_missing(self, entries: Iterable[CachedCall]) -> tuple[int, int]:
@@ -62,7 +62,7 @@ class ResponseCache(CallStore):
     def all_unanswered(self) -> dict[str, Attempts]:
         """Return the attempts of all calls without an answer, by call key."""
         keys = (name.removeprefix(UNANSWERED) for name in self.names(UNANSWERED))
-        return {key: self._tried(key) for key in keys}
+        return {key: self._unanswered(key) for key in keys}
 
     def entries(self, left_out: list[str] | None = None) -> Iterator[CachedCall]:
         """Yield all verified entries, of the folder and of the recording.
@@ -91,7 +91,7 @@ class ResponseCache(CallStore):
         for (key,) in self.rows(_NEWEST, most):
             call = None
             with contextlib.suppress(RecordingError):
-                call = self._kept(key.decode(errors="replace"))
+                call = self._entry(key.decode(errors="replace"))
             if call is not None:
                 yield call
 
@@ -106,7 +106,7 @@ class ResponseCache(CallStore):
         Returns the names of what was damaged.
         """
         damaged = []
-        for name, check in ((key, self._kept), (UNANSWERED + key, self._tried)):
+        for name, check in ((key, self._entry), (UNANSWERED + key, self._unanswered)):
             try:
                 check(key)
             except RecordingError:

@@ -131,11 +131,11 @@ class ModelLocks:
         while self._files:
             os.close(self._files.pop())
 
-    def _lock(self, name: str, how: int) -> bool:
+    def _lock(self, name: str, flags: int) -> bool:
         try:
             file = os.open(self._folder / name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
             self._files.append(file)
-            fcntl.flock(file, how)
+            fcntl.flock(file, flags)
         except BlockingIOError:
             os.close(self._files.pop())
             return False

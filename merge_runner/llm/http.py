@@ -149,9 +149,9 @@ class HttpTransport:
         self._echoes_ids = False
         for header in ID_HEADERS:
             for part in reply.headers.get(header, "").split(","):
-                named = part.strip()
-                self._echoes_ids |= named.startswith(self._id_prefix)
-                if named.startswith(self._id_prefix) and named != request_id:
+                echoed = part.strip()
+                self._echoes_ids |= echoed.startswith(self._id_prefix)
+                if echoed.startswith(self._id_prefix) and echoed != request_id:
                     why = "the server sent the answer to another request"
                     raise TransportFailure("wrong_answer", why)
 
@@ -220,27 +220,27 @@ class HttpTransport:
                 "the certificates that SSL_CERT_FILE names cannot be read "
                 f"({exc.strerror or exc}): correct it or unset it"
             ) from exc
-        kept = {"limit": connections, "keepalive_timeout": KEPT_S, "ssl": trusted}
+        options = {"limit": connections, "keepalive_timeout": KEPT_S, "ssl": trusted}
 
         def session() -> aiohttp.ClientSession:
             return aiohttp.ClientSession(
-                connector=Connections(self, **kept),
+                connector=Connections(self, **options),
                 max_line_size=MOST_HEADER_BYTES,
                 max_field_size=MOST_HEADER_BYTES,
                 cookie_jar=aiohttp.DummyCookieJar(),  # one would tie independent samples together
             )
 
         proxies = getproxies_environment()
-        named = proxies.get(url.scheme) or proxies.get("all")
+        proxy_url = proxies.get(url.scheme) or proxies.get("all")
         proxy = None
-        if named and url.host not in LOOPBACK and not proxy_bypass(url.netloc.decode()):
-            named = named if "://" in named else f"http://{named}"
-            if http_url(named) is None:  # not shown: it may contain a password
+        if proxy_url and url.host not in LOOPBACK and not proxy_bypass(url.netloc.decode()):
+            proxy_url = proxy_url if "://" in proxy_url else f"http://{proxy_url}"
+            if http_url(proxy_url) is None:  # not shown: it may contain a password
                 raise UsageError(
                     f"{url.scheme.upper()}_PROXY or ALL_PROXY is no URL of an HTTP proxy: set it "
                     "to http://HOST:PORT or unset it; a SOCKS proxy needs an HTTP proxy before it"
                 )
-            proxy = httpx.Proxy(named)
+            proxy = httpx.Proxy(proxy_url)
         return AiohttpTransport(verify=trusted, client=session, proxy=proxy)
 
 

@@ -59,9 +59,9 @@ def _environment_restored() -> Iterator[None]:
 @asynccontextmanager
 async def connected(where: str) -> AsyncIterator[Client]:
     """Connect to the cluster that ``--dask`` names, or start a local one; raises UsageError."""
-    named = _WHERE.fullmatch(where)
+    match = _WHERE.fullmatch(where)
     is_file = Path(where).is_file()  # noqa: ASYNC240 # nothing else runs yet
-    if named is None or (named["file"] and not is_file):
+    if match is None or (match["file"] and not is_file):
         raise UsageError(f"--dask {where!r} names no cluster; {VALID}")
     try:
         import distributed
@@ -72,8 +72,8 @@ async def connected(where: str) -> AsyncIterator[Client]:
 
     async with AsyncExitStack() as stack:
         stack.enter_context(_silenced(map(logging.getLogger, LOGGERS)))
-        scheduler = {"scheduler_file" if named["file"] else "address": where}
-        if named["workers"]:
+        scheduler = {"scheduler_file" if match["file"] else "address": where}
+        if match["workers"]:
             stack.enter_context(_environment_restored())
             os.environ["PYTHONSAFEPATH"] = "1"  # workers import nothing of this folder
             # A terminal's Ctrl-C reaches this process alone, which stops them in order: children
@@ -82,7 +82,7 @@ async def connected(where: str) -> AsyncIterator[Client]:
             before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGHUP))
             try:
                 local = distributed.LocalCluster(
-                    n_workers=int(named["workers"]),
+                    n_workers=int(match["workers"]),
                     threads_per_worker=1,
                     dashboard_address=None,
                     # Its server of HTTP is started all the same: at any port that is free.
@@ -102,6 +102,6 @@ async def connected(where: str) -> AsyncIterator[Client]:
                 f"no Dask scheduler answers at {where} within {CONNECT_TIMEOUT_S} s; {VALID}"
             ) from exc
         stack.push_async_callback(client.close, timeout=CONNECT_TIMEOUT_S)
-        if named["workers"]:  # the first of them would get the share of all
-            await client.wait_for_workers(int(named["workers"]))
+        if match["workers"]:  # the first of them would get the share of all
+            await client.wait_for_workers(int(match["workers"]))
         yield client
