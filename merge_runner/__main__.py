@@ -1,4 +1,4 @@
-"""Runs the command line: the program ``merge-runner``, and ``python -m merge_runner``."""
+"""Entry point of the program ``merge-runner`` and of ``python -m merge_runner``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    # ``python -m`` looks for modules in the working folder before all others: not for ours.
+    # ``python -m`` puts the working folder first on the path: no file there may shadow a module.
     home = os.path.dirname(os.path.dirname(os.path.realpath(__file__)))
     if not sys.flags.safe_path and os.path.realpath(sys.path[0]) != home:
         del sys.path[0]

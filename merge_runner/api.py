@@ -125,7 +125,7 @@ class Study:
         cache: Path | str | None = None,
         only: Mapping[str, JsonValue] | None = None,
         prompts: Sequence[str] | None = None,
-        **wanted: Any,  # noqa: ANN401 # as for make_plan
+        **choices: Any,  # noqa: ANN401 # as for make_plan
     ) -> None:
         self.file = str(file)
         home = home_of(self.file)
@@ -134,8 +134,8 @@ class Study:
             name: [level_text(level) for level in (given if isinstance(given, list) else [given])]
             for name, given in (only or {}).items()
         }
-        self._own = self._planned = Catalogue()
-        self._wanted: dict[str, Any] = {"only": levels, "variants": prompts, **wanted}
+        self._added = self._planned = Catalogue()
+        self._choices: dict[str, Any] = {"only": levels, "variants": prompts, **choices}
 
     def register(self, registry: Registry[T], name: str, thing: T) -> T:
         """Add a prompt, a condition, a metric, ... to this study, and return it.
@@ -143,11 +143,11 @@ class Study:
         It replaces an earlier one of this name, so that a cell can be run again; a run under way
         keeps the one that it started with. Raise UsageError if the name is taken elsewhere.
         """
-        self._own.parts.get(registry.kind, {}).pop(name, None)
-        with collecting(self._own):
+        self._added.parts.get(registry.kind, {}).pop(name, None)
+        with collecting(self._added):
             registry.register(name, thing)
-        known, own = self._planned.parts, self._own.parts
-        parts = {kind: {**known.get(kind, {}), **own.get(kind, {})} for kind in {**known, **own}}
+        known, new = self._planned.parts, self._added.parts
+        parts = {kind: {**known.get(kind, {}), **new.get(kind, {})} for kind in {**known, **new}}
         remember(self.db, replace(self._planned, parts=parts))
         return thing
 
@@ -163,8 +163,8 @@ class Study:
 
     def plan(self, *, first: bool = False, grid: str | None = None) -> Plan:
         """Return the plan of a run, or of its first decisions only; raise UsageError."""
-        wanted = {"db": self.db, "first": first, "grid": grid, **self._wanted}
-        plan = make_plan(self.file, own=self._own, **wanted)
+        choices = {"db": self.db, "first": first, "grid": grid, **self._choices}
+        plan = make_plan(self.file, registered=self._added, **choices)
         self._planned = plan.parts.catalogue
         remember(self.db, self._planned)
         return plan
@@ -180,7 +180,7 @@ class Study:
         first: bool = False,
         grid: str | None = None,
         stop: asyncio.Event | None = None,
-        **how: Any,  # noqa: ANN401 # fields of Options
+        **fields: Any,  # noqa: ANN401 # fields of Options
     ) -> StudyOutcome:
         """Play all trials that are not stored yet; ``yes`` agrees to spend money.
 
@@ -195,8 +195,8 @@ class Study:
                 raise UsageError(f"this run spends money; yes=True goes ahead: {lines}")
 
         plan = self.plan(first=first, grid=grid)
-        options = Options(self.db, self.cache, **how)
-        whole = any(self._wanted.get(each) is not None for each in PARTS)
+        options = Options(self.db, self.cache, **fields)
+        whole = any(self._choices.get(name) is not None for name in PARTS)
         how_to_stop = on_event(stop)
         return StudyOutcome(
             await play(plan, options, whole=whole, say=say, agree=agree, stopping=how_to_stop)

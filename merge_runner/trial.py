@@ -1,4 +1,4 @@
-"""Closed loop of one trial: both drivers observe one state, those whose step it is decide.
+"""Closed loop of one trial: both drivers observe one state, and decide at their decision steps.
 
 A trial does no I/O. A program decides at once. A language model's prompt is a question; the caller
 gets the answer from a server, a recording or a person.

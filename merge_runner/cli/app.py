@@ -28,7 +28,7 @@ from merge_runner.text_safety import say
 OUTPUT_ERRORS = (errno.ENOSPC, errno.EFBIG, errno.EIO)
 # An error of Click, whose name Typer keeps to itself.
 USAGE: type[typer.BadParameter] = typer.BadParameter.__mro__[2]
-# A user can act on some of them: see _code_and_line.
+# Errors that _code_and_line describes if a user can act on them.
 EXPECTED = (MergeRunnerError, ModuleNotFoundError, OSError, RuntimeError)
 COMPLETION = "_MERGE_RUNNER_COMPLETE"  # set by the shell's script that typer installs
 
@@ -37,7 +37,7 @@ def common(
     debug: Annotated[bool, flag("--debug", "Show a traceback on errors.")] = False,
     version: Annotated[bool, flag("--version", "Print the version.")] = False,
 ) -> None:
-    """Finds out whether a language model drives like a human."""
+    """Print the version if the option asks for it."""
     if version:
         print_out(f"merge-runner {__version__}")
         raise typer.Exit
@@ -50,7 +50,7 @@ app = Program(
     pretty_exceptions_enable=False,
 )
 app.callback(invoke_without_command=True)(common)
-# The groups of the menu, in which the commands of the analysis take their places, too.
+# Groups of the commands in --help, also of those of the analysis.
 PLAY, LOOK, KEEP, CHECK = "Play", "Look", "Keep", "Check"
 for _panel, _commands in {
     PLAY: (sweep, replay, init, models, emulate),
@@ -62,8 +62,8 @@ for _panel, _commands in {
         app.command(rich_help_panel=_panel)(_command)
 app.add_typer(recording_app, name="recording", rich_help_panel=KEEP)
 # To run one of these, the commands of other packages are not looked up.
-OWN = {info.callback.__name__ for info in app.registered_commands if info.callback}
-OWN |= {str(info.name) for info in app.registered_groups}
+BUILT_IN = {info.callback.__name__ for info in app.registered_commands if info.callback}
+BUILT_IN |= {str(info.name) for info in app.registered_groups}
 
 
 def complete_app() -> typer.Typer:
@@ -73,9 +73,9 @@ def complete_app() -> typer.Typer:
 
 
 def app_with_one_command(command: str | None) -> typer.Typer:
-    """Return the program with the options of one command: making those of all takes as long again.
+    """Return the program with the options of one command, in half the time that all would take.
 
-    The others are there by their names and their help.
+    The other commands have only a name and a help text.
     """
     light = copy(app)
     light.registered_commands = [copy(info) for info in app.registered_commands]
@@ -88,7 +88,7 @@ def app_with_one_command(command: str | None) -> typer.Typer:
 
 
 def main() -> None:
-    """Run the command line and exit with the contract's code."""
+    """Run the command line and exit with its exit code."""
     # A trial's objects live until it ends, so frequent garbage collections would find almost none.
     gc.set_threshold(20_000, 10, 100)
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.encoding.lower() != "utf-8":
@@ -99,7 +99,7 @@ def main() -> None:
     words = (argument for argument in sys.argv[1:] if not argument.startswith("-"))
     try:
         command = next(words, None)
-        if completing or sys.argv[1:2] != [command] or command not in OWN:
+        if completing or sys.argv[1:2] != [command] or command not in BUILT_IN:
             load_commands()
         run = app if completing else app_with_one_command(command)
         sys.exit(run(prog_name="merge-runner", standalone_mode=False))

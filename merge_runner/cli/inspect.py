@@ -7,7 +7,7 @@ import shutil
 import sys
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -16,9 +16,6 @@ from merge_runner.cli.options import agree, print_out
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_DB
 from merge_runner.text_safety import say
-
-if TYPE_CHECKING:
-    pass
 
 CACHE = "Replay from this cache folder, not from the stored replies."
 Form = Literal["text", "csv", "json"]

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import json
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from merge_runner.cli import options as cli
 from merge_runner.cli.options import print_out
 from merge_runner.text_safety import say
-
-if TYPE_CHECKING:
-    pass
 
 
 def models(as_json: cli.JsonOption = False) -> None:

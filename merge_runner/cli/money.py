@@ -46,7 +46,7 @@ def ledger(
             {"sweep": ledger.scope, **asdict(ledger.read()), "reasons": ledger.reasons()}
             for ledger in ledgers
         ]
-        # Without a process nothing is awaited, but by a batch: the next run asks for that.
+        # Without a live run only batches are in flight, and the next run asks for them.
         if opened.locks.take_all():
             for reason in (reason for row in rows for reason in row["reasons"]):
                 if reason["outcome"] == "in flight":

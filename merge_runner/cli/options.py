@@ -110,7 +110,7 @@ NOT_BOTH = "--sweep names a run, --study all runs of a study: leave one of them 
 
 
 def use_study(file: str | None, *, trust: bool) -> None:
-    """Use what the study of ``--study`` adds, once the user agrees to its code."""
+    """Use the parts of the study of ``--study``, once the user agrees to its code."""
     if file is not None:
         from merge_runner.registry import use
         from merge_runner.study.parts import load_study
@@ -156,7 +156,7 @@ def terminal_width() -> int | None:
 
 
 def agree(what: str, question: str, *, otherwise: str, yes: bool) -> None:
-    """Say what is about to be done, and ask once; ``otherwise`` says that it was not done."""
+    """Show an action and ask for agreement; raise UsageError(``otherwise``) without it."""
     say(what)
     if yes:
         return

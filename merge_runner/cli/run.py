@@ -170,7 +170,7 @@ def _play_all(
     options: Options,
 ) -> int:
     """Play studies one after the other; return the first exit code that is not 0."""
-    if len(studies) > 1:  # all are looked at before the first one is played
+    if len(studies) > 1:  # all plans are made before the first one is played
         ledgers = [plan.ledger for name in studies for plan in plans(name)]
         options = replace(options, ledgers=() if options.max_cost_usd is None else ledgers)
     codes = []
@@ -189,7 +189,7 @@ def _play_all(
 def _plans(
     name: str, *, make: Callable[[str], Plan], options: Options, chosen: bool, trust: bool
 ) -> list[Plan]:
-    """Return the plan of a study, or those in a recording; ``chosen``: only a part is wanted."""
+    """Return the plan of a study, or those in a recording; ``chosen``: the user selects a part."""
     from merge_runner.run.recorded_plans import recorded_plans
 
     if name.endswith(".parquet"):

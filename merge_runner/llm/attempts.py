@@ -1,4 +1,4 @@
-"""Attempts at calls: their record, and the counts of them that are shown."""
+"""Records of attempts at calls, and their counts for the display."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 class Meter:
     """Counts of calls, attempts and cost.
 
-    Of ``calls_cached``, ``calls_shared`` were asked in this run for another trial, and
-    ``calls_recorded`` are in a recording that was named. ``stand_ins`` counts replies of a mock
-    model in the model's name, ``underpriced`` replies that cost more than the registry knows, by
-    service tier. ``damaged`` are the keys of recorded replies in quarantine, ``notes`` lines for
-    the user.
+    ``calls_cached`` were answered without a request, ``calls_shared`` of them by a call of this run
+    for another trial, ``calls_recorded`` of them by a recording that the user named.
+    ``mock_replies`` counts replies of a mock model in the model's name, ``underpriced`` replies
+    that cost more than the registry knows, by service tier. ``damaged`` are the keys of recorded
+    replies in quarantine, ``notes`` lines for the user.
     """
 
     calls_live: int = 0
@@ -35,7 +35,7 @@ class Meter:
     cost_unknown: int = 0
     outcomes: Counter[str] = field(default_factory=Counter)
     mismatches: Counter[str] = field(default_factory=Counter)
-    stand_ins: int = 0
+    mock_replies: int = 0
     underpriced: Counter[str] = field(default_factory=Counter)
     notes: deque[str] = field(default_factory=deque)
     damaged: list[str] = field(default_factory=list)
@@ -53,8 +53,8 @@ class Meter:
 
     def add(self, other: Meter) -> None:
         """Add the counts of another meter."""
-        for each in fields(self):
-            setattr(self, each.name, getattr(self, each.name) + getattr(other, each.name))
+        for name in (count.name for count in fields(self)):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
 
 
 def record(
@@ -87,7 +87,7 @@ def record(
     meter.count_attempt(attempt)
     if reading.service_tier in endpoint.underpriced_tiers:
         meter.underpriced[reading.service_tier] += 1
-    # Nothing is reserved where a user has released it meanwhile.
+    # The reservation is 0 where a user has released it meanwhile.
     if reservation.usd and (usd or 0.0) > reservation.usd + TOLERANCE_USD:
         meter.notes.append(
             f"{endpoint.driver}: {call.label.slot}: the reply cost {usd:.4f} USD, and "

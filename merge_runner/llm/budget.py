@@ -2,7 +2,7 @@
 
 A trial is admitted only if its expected cost, and what the running trials are still expected to
 cost, fit under the cap. So money finishes trials instead of beginning more. Expectations err, so
-an attempt leaves room for older trials alone: the oldest trial is suspended only where the money
+an attempt leaves room only for older trials: the oldest trial is suspended only where the money
 left does not pay for a single attempt. A call that several trials share is paid by the oldest
 running one, so that a running trial never waits for the admission of another.
 
@@ -185,7 +185,7 @@ class Budget:
     async def admit(self, trials: Sequence[int]) -> None:
         """Wait until one of the trials that share a call runs, or the oldest of them may begin.
 
-        ``trials`` may change meanwhile. Raise TrialSuspended when no trial's end can let it begin.
+        ``trials`` may change meanwhile. Raise TrialSuspended if no other trial can free money.
         """
         if self.ledger.cap is not None and not self.is_running(trials):
             await self.queue.wait(
@@ -220,7 +220,7 @@ class Budget:
         return Reservation(self, self._payer(trials), key, label, usd)
 
     def _may_begin(self, trial: int) -> bool:
-        """Admit a trial if its expected cost fits beside the running ones; raise TrialSuspended."""
+        """Admit a trial if its expected cost fits beside those running; raise TrialSuspended."""
         if trial in self._left:
             raise TrialSuspended("its trial is suspended")
         needed_usd, left_usd = self.trial_usd(trial), self._left_usd()
@@ -270,7 +270,7 @@ class Budget:
         """Return the error of a trial for which the money left is too little."""
         spending, expected_usd = self.ledger.read(), self._needed_usd()
         assert self.ledger.cap is not None
-        reserved_usd = max(0.0, spending.reserved_usd + self.queued_usd)  # not minus nothing
+        reserved_usd = max(0.0, spending.reserved_usd + self.queued_usd)  # never -0.0000
         elsewhere_usd = self.ledger.committed_usd - spending.committed_usd
         is_elsewhere = elsewhere_usd > TOLERANCE_USD
         elsewhere = f", {elsewhere_usd:.4f} by others under this cap" if is_elsewhere else ""

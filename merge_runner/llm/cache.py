@@ -36,22 +36,22 @@ class ResponseCache(CallStore):
     def put_now(
         self,
         entries: Iterable[CachedCall],
-        tried: Iterable[tuple[str, Attempts]] = (),
+        unanswered: Iterable[tuple[str, Attempts]] = (),
         money: Iterable[Operation] = (),
     ) -> list[CachedCall]:
         """Store entries, and attempts of calls without an answer, in one transaction here.
 
-        The operations ``money`` book their costs in it. Returns the entries that are stored.
+        The operations ``money`` book their costs in it, too. Returns the entries that are stored.
         """
         entries = list(entries)
         damaged = [partial(self.quarantine, entry.request.key) for entry in entries]
         kept = [partial(self.keep, entry) for entry in entries]
         others = [partial(self.remove, UNANSWERED + entry.request.key) for entry in entries]
-        others += [partial(self.keep_attempts, *each) for each in tried]
+        others += [partial(self.keep_attempts, *attempts) for attempts in unanswered]
         return self.run_now([*damaged, *kept, *others, *money])[len(damaged) :][: len(kept)]
 
     def add_missing(self, entries: Iterable[CachedCall]) -> tuple[int, int]:
-        """Store the entries that the cache lacks; return (added, already there)."""
+        """Store the entries that the cache lacks; return (added, already present)."""
         added = seen = 0
         waiting = iter(entries)
         while batch := list(islice(waiting, BATCH)):
@@ -62,7 +62,7 @@ class ResponseCache(CallStore):
     def all_unanswered(self) -> dict[str, Attempts]:
         """Return the attempts of all calls without an answer, by call key."""
         keys = (name.removeprefix(UNANSWERED) for name in self.names(UNANSWERED))
-        return {key: self._tried(key) for key in keys}
+        return {key: self._unanswered(key) for key in keys}
 
     def entries(self, left_out: list[str] | None = None) -> Iterator[CachedCall]:
         """Yield all verified entries, of the folder and of the recording.
@@ -91,7 +91,7 @@ class ResponseCache(CallStore):
         for (key,) in self.rows(_NEWEST, most):
             call = None
             with contextlib.suppress(RecordingError):
-                call = self._kept(key.decode(errors="replace"))
+                call = self._entry(key.decode(errors="replace"))
             if call is not None:
                 yield call
 
@@ -106,7 +106,7 @@ class ResponseCache(CallStore):
         Returns the names of what was damaged.
         """
         damaged = []
-        for name, check in ((key, self._kept), (UNANSWERED + key, self._tried)):
+        for name, check in ((key, self._entry), (UNANSWERED + key, self._unanswered)):
             try:
                 check(key)
             except RecordingError:
@@ -116,16 +116,16 @@ class ResponseCache(CallStore):
 
 
 def import_folder(folder: Path, cache: ResponseCache) -> tuple[int, int]:
-    """Add the replies of another folder that the cache lacks; return (added, already there).
+    """Add the replies of another folder that the cache lacks; return (added, already present).
 
     The folder is only read. Raises RecordingError after all others are added, if any was damaged.
     """
     left_out: list[str] = []
-    with closing(ResponseCache(folder, read_only=True, before=True)) as source:
-        added, there = cache.add_missing(source.entries(left_out))
+    with closing(ResponseCache(folder, read_only=True, allow_previous=True)) as source:
+        added, known = cache.add_missing(source.entries(left_out))
     if left_out:
         raise RecordingError(
-            f"{added} calls of {folder} added to {cache.folder}, {there} were there already, and "
+            f"{added} calls of {folder} added to {cache.folder}, {known} were there already, and "
             f"{len(left_out)} rows are left out, the first: {left_out[0]}"
         )
-    return added, there
+    return added, known

@@ -1,4 +1,4 @@
-"""File of a cache folder: create it atomically, refuse one of another program, upgrade it.
+"""File of a cache folder: create it atomically, refuse a foreign one, upgrade it.
 
 Any program may have written the file, and diskcache unpickles keys and values, opens and removes
 the files that rows name, and applies the settings it reads. So ``TextDisk`` stores and returns text
@@ -142,7 +142,7 @@ def make(folder: Path) -> None:
 
 
 def upgrade(folder: Path) -> None:
-    """Upgrade a folder of the format before, with its ledger."""
+    """Upgrade a folder of the previous format, with its ledger."""
     locks = ModelLocks(folder)
     with folder_lock(folder), closing(connect(folder / FILE, "rw")) as database, closing(locks):
         if refuse_others(folder) == FORMAT.encode():
@@ -162,16 +162,16 @@ def upgrade(folder: Path) -> None:
             database.execute(sql, [FORMAT, FORMAT_KEY])
 
 
-def prepare(folder: Path, *, read_only: bool, before: bool) -> None:
-    """Create a missing folder, and upgrade one of the format before; raise UsageError.
+def prepare(folder: Path, *, read_only: bool, allow_previous: bool) -> None:
+    """Create a missing folder, and upgrade one of the previous format; raise UsageError.
 
-    With ``read_only`` it must exist, and may have that format only if ``before`` is True.
+    With ``read_only`` it must exist, and may have that format only with ``allow_previous``.
     """
     if read_only:
         require(folder)
     else:
         make(folder)
-    if refuse_others(folder) == BEFORE.encode() and not before:
+    if refuse_others(folder) == BEFORE.encode() and not allow_previous:
         if read_only:
             raise UsageError(
                 f"the cache {folder} has format {BEFORE}: a sweep or a replay with it brings it to "

@@ -38,7 +38,7 @@ NO_MONEY = "for calls in flight to be paid, under --max-cost"
 
 @dataclass(slots=True)
 class LlmClient:
-    """Answers prompts of one model.
+    """Client of one model, which answers its prompts.
 
     ``direct`` sends normal requests, ``batch`` what goes into batches. ``calls`` are those of the
     run. A call whose trials are all cancelled goes on while it may be billed, so that its reply is
@@ -57,11 +57,13 @@ class LlmClient:
     retry: Retry = field(init=False)
 
     def __post_init__(self) -> None:
-        """Derive what every call needs."""
-        of, entry = self.endpoint, self.endpoint.entry
-        self.recorded = RecordedReplies(of.name, entry, of.identity, of.wire, self.cache)
-        self.probe = Probe(of, self.calls, self.meter)
-        self.retry = Retry(of, self.calls, self.meter)
+        """Make the parts that all calls share."""
+        endpoint, entry = self.endpoint, self.endpoint.entry
+        self.recorded = RecordedReplies(
+            endpoint.name, entry, endpoint.identity, endpoint.wire, self.cache
+        )
+        self.probe = Probe(endpoint, self.calls, self.meter)
+        self.retry = Retry(endpoint, self.calls, self.meter)
 
     @property
     def meter(self) -> Meter:
@@ -112,7 +114,7 @@ class LlmClient:
                 self.budget.queue.wake()
             elif call.wait is not None and not call.wait.charged:
                 call.give_up()  # or it would take money for a trial that is left
-        # The attempts are counted once, for whoever asked first.
+        # The attempts are counted once, for the first trial that asked.
         return replace(reply, earlier=len(reply.attempts)) if is_shared else reply
 
     def _start(self, request: ChatRequest, order: int, earlier: Attempts | None) -> Call:
@@ -153,7 +155,7 @@ class LlmClient:
         return await self._attempts(call)
 
     async def _quarantine(self, call: Call) -> None:
-        """Quarantine what is damaged of a call, and take what is left of its attempts."""
+        """Quarantine the damaged rows of a call, and reload its valid attempts."""
         key = call.request.key
         for name in await self.cache.write(partial(self.cache.quarantine, key)):
             self.meter.damaged.append(name)
@@ -211,7 +213,7 @@ class LlmClient:
         answered = CachedCall(call.request, attempts)
         kept = await reservation.settle(attempt, partial(self.cache.keep, answered))
         self.calls.answered.add(key)
-        if kept is not answered:  # an import has stored another reply first, which counts
+        if kept is not answered:  # an import has stored another reply first, which is used
             return self.recorded.read(kept, call.earlier)
         text = outcome.reading.text
         return ChatReply(text, attempt.outcome, call.request, attempts, call.earlier)

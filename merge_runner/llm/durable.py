@@ -28,6 +28,7 @@ ResultT = TypeVar("ResultT")
 Rows = list[tuple[Any, ...]]
 # Executes a statement in the transaction of an operation.
 Execute = Callable[..., sqlite3.Cursor]
+# A step of a durable transaction; docstrings of such functions name them "an operation".
 Operation = Callable[[Execute], Any]
 
 
@@ -55,7 +56,7 @@ def connect(file: Path, mode: str = "ro") -> sqlite3.Connection:
 
 
 class GroupWriter:
-    """Group commit: a thread hands the operations that have gathered to ``run``.
+    """Group commit: a thread passes all gathered operations to ``run``.
 
     ``run`` returns their results, and the error of each that failed.
     """
@@ -122,7 +123,7 @@ class ModelLocks:
             os.write(self._files[-1], f"PID {os.getpid()} on {os.uname().nodename}".encode())
 
     def take_all(self) -> bool:
-        """Keep live runs from beginning; return False while there is any."""
+        """Lock out live runs; return False if one is under way."""
         return self._lock(LIVE, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
     def close(self) -> None:
@@ -130,11 +131,11 @@ class ModelLocks:
         while self._files:
             os.close(self._files.pop())
 
-    def _lock(self, name: str, how: int) -> bool:
+    def _lock(self, name: str, flags: int) -> bool:
         try:
             file = os.open(self._folder / name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
             self._files.append(file)
-            fcntl.flock(file, how)
+            fcntl.flock(file, flags)
         except BlockingIOError:
             os.close(self._files.pop())
             return False

@@ -17,9 +17,9 @@ from merge_runner.records import CallFailed
 
 # How long a first call waits for a server that refuses connections.
 NOBODY_S = 5.0
-# A format may know empty answers as a fault of its service.
+# For formats that know empty answers as a transient fault of their service.
 MAX_EMPTY_RETRIES = 2
-# Refusals by an endpoint that has answered before which mean the configuration.
+# So many refusals by an endpoint that has answered before mean a wrong configuration.
 MAX_REFUSALS = 3
 # Part of the name of Gemini's daily quotas, whose delay is meaningless.
 GEMINI_DAY = "PerDay"
@@ -74,7 +74,7 @@ class EndpointState:
         return None
 
     def _why_closed(self, outcome: AttemptOutcome) -> str:
-        """Return why the account gets no answer for now, and until when; empty if it does."""
+        """Return the reason why the account is closed, and until when; empty if it is open."""
         delay_s, closed = outcome.delay_s or 0.0, ""
         if outcome.action == "quota":
             closed = "the account's quota is exhausted"

@@ -40,8 +40,8 @@ MOST_BYTES = 16_000_000
 # Some gateways send policies of more than the 8,190 bytes that aiohttp takes by default.
 MOST_HEADER_BYTES = 65_536
 KEPT_S = 5.0
-# As the official SDKs set them: on a connection that is silent while a model thinks, a router with
-# address translation would forget it, and the answer be lost.
+# As the official SDKs set them: a router with address translation forgets a connection that is
+# silent while a model thinks, and the answer would be lost.
 ALIVE = {"TCP_KEEPIDLE": 60, "TCP_KEEPALIVE": 60, "TCP_KEEPINTVL": 60, "TCP_KEEPCNT": 5}
 # A server that processes one call at a time may be busy with one.
 LIST_TIMEOUT_S = 60.0
@@ -61,7 +61,7 @@ TOO_LONG, LONGEST = "Got more than", 300
 
 
 class HttpTransport:
-    """Sends requests to one endpoint over at most ``connections`` connections.
+    """Transport to one endpoint over at most ``connections`` connections.
 
     A reply of more than ``most_bytes`` is refused. Proxies are those of the environment; loopback
     never goes through one. Only the emulator gets the slot. Each attempt has an id; a reply that
@@ -86,20 +86,20 @@ class HttpTransport:
         secrets = {secret for secret in secrets if len(secret) >= SHORTEST_SECRET}
         self._has_secrets, self._mask = bool(secrets), Mask(secrets)
         self.doubted = False
-        self._answers_named = False
-        # Each id is a UUID, as some servers demand (llama-cpp-python): a random part, this
-        # transport's own, and the number of the request.
-        self._own = str(uuid4())[:24]
+        self._echoes_ids = False
+        # Each id is a UUID, as some servers demand (llama-cpp-python): a random prefix of this
+        # transport, and the number of the request.
+        self._id_prefix = str(uuid4())[:24]
         self._ids = map("{:012x}".format, itertools.count(1))
         self._carrier = carrier or self._network(connections)
 
     @property
-    def one_each(self) -> bool:
-        """Whether each connection serves one request, so that no late reply is read."""
-        return self.doubted and not self._answers_named
+    def single_use(self) -> bool:
+        """True where each connection serves one request, so that no late reply is read."""
+        return self.doubted and not self._echoes_ids
 
     async def send(self, request: ChatRequest, *, attempt: int, timeout_s: float) -> RawReply:
-        """Post the hashed bytes; raise TransportFailure."""
+        """Post a request, byte for byte as hashed; raise TransportFailure."""
         headers = request.headers
         if self._sends_slot:
             # In the canonical form: the emulator's replies depend on it.
@@ -119,17 +119,17 @@ class HttpTransport:
         most_bytes: int | None = None,
     ) -> RawReply:
         """Send any request; every error of the libraries becomes a TransportFailure."""
-        own_id = self._own + next(self._ids)
+        request_id = self._id_prefix + next(self._ids)
         sent = {**HEADERS, **headers, **self._endpoint.auth_headers}
-        sent |= dict.fromkeys(ID_HEADERS, own_id)
-        sent["connection"] = "close" if self.one_each else "keep-alive"
+        sent |= dict.fromkeys(ID_HEADERS, request_id)
+        sent["connection"] = "close" if self.single_use else "keep-alive"
         url = url_of(self._endpoint.base_url, path, self._endpoint.place)
         request = httpx.Request(method, url, headers=sent, content=body)
         try:
             async with asyncio.timeout(timeout_s):
                 reply = await self._carrier.handle_async_request(request)
                 async with aclosing(reply):
-                    self._refuse_others(reply, own_id)
+                    self._refuse_others(reply, request_id)
                     return await self._read(reply, most_bytes or self._most_bytes)
         except TransportFailure:
             self.doubted = True
@@ -144,14 +144,14 @@ class HttpTransport:
         """Close all connections."""
         await self._carrier.aclose()
 
-    def _refuse_others(self, reply: httpx.Response, own_id: str) -> None:
+    def _refuse_others(self, reply: httpx.Response, request_id: str) -> None:
         """Raise TransportFailure where a reply echoes the id of another request."""
-        self._answers_named = False
+        self._echoes_ids = False
         for header in ID_HEADERS:
             for part in reply.headers.get(header, "").split(","):
-                named = part.strip()
-                self._answers_named |= named.startswith(self._own)
-                if named.startswith(self._own) and named != own_id:
+                echoed = part.strip()
+                self._echoes_ids |= echoed.startswith(self._id_prefix)
+                if echoed.startswith(self._id_prefix) and echoed != request_id:
                     why = "the server sent the answer to another request"
                     raise TransportFailure("wrong_answer", why)
 
@@ -220,27 +220,27 @@ class HttpTransport:
                 "the certificates that SSL_CERT_FILE names cannot be read "
                 f"({exc.strerror or exc}): correct it or unset it"
             ) from exc
-        kept = {"limit": connections, "keepalive_timeout": KEPT_S, "ssl": trusted}
+        options = {"limit": connections, "keepalive_timeout": KEPT_S, "ssl": trusted}
 
         def session() -> aiohttp.ClientSession:
             return aiohttp.ClientSession(
-                connector=Connections(self, **kept),
+                connector=Connections(self, **options),
                 max_line_size=MOST_HEADER_BYTES,
                 max_field_size=MOST_HEADER_BYTES,
                 cookie_jar=aiohttp.DummyCookieJar(),  # one would tie independent samples together
             )
 
         proxies = getproxies_environment()
-        named = proxies.get(url.scheme) or proxies.get("all")
+        proxy_url = proxies.get(url.scheme) or proxies.get("all")
         proxy = None
-        if named and url.host not in LOOPBACK and not proxy_bypass(url.netloc.decode()):
-            named = named if "://" in named else f"http://{named}"
-            if http_url(named) is None:  # not shown: it may contain a password
+        if proxy_url and url.host not in LOOPBACK and not proxy_bypass(url.netloc.decode()):
+            proxy_url = proxy_url if "://" in proxy_url else f"http://{proxy_url}"
+            if http_url(proxy_url) is None:  # not shown: it may contain a password
                 raise UsageError(
                     f"{url.scheme.upper()}_PROXY or ALL_PROXY is no URL of an HTTP proxy: set it "
                     "to http://HOST:PORT or unset it; a SOCKS proxy needs an HTTP proxy before it"
                 )
-            proxy = httpx.Proxy(named)
+            proxy = httpx.Proxy(proxy_url)
         return AiohttpTransport(verify=trusted, client=session, proxy=proxy)
 
 
@@ -271,7 +271,7 @@ class Connections(aiohttp.TCPConnector):
             arrived = select.poll()
             arrived.register(channel.get_extra_info("socket").fileno(), select.POLLIN)
             self._transport.doubted |= handler.should_close
-            if not (handler.should_close or arrived.poll(0) or self._transport.one_each):
+            if not (handler.should_close or arrived.poll(0) or self._transport.single_use):
                 return connection
             connection.close()
 

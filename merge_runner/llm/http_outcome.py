@@ -10,7 +10,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.delays import server_delay_s
@@ -25,9 +25,6 @@ from merge_runner.llm.formats.wire import (
     read_reply,
 )
 from merge_runner.providers import PROVIDERS
-
-if TYPE_CHECKING:
-    pass
 
 Action = Literal["accept", "retry", "fail", "quota", "refused"]
 EXCERPT = 200
@@ -67,7 +64,7 @@ WITHIN = {
     **dict.fromkeys(("server_error", "api_error", "internal_server_error", "INTERNAL"), 500),
     **dict.fromkeys(("base_resp 1000", "base_resp 1013"), 500),
 }
-# What follows; anything else fails its call.
+# Action after an outcome; any other outcome fails its call.
 ACTIONS: dict[str, Action] = {
     "refusal": "accept",
     "quota_exhausted": "quota",
@@ -111,7 +108,7 @@ class RawReply:
 
     @property
     def is_web_page(self) -> bool:
-        """Whether the body is HTML, which no API sends."""
+        """True where the body is HTML, which no API sends."""
         return self.body.lstrip("\ufeff \t\r\n")[:9].lower().startswith(("<!doctype", "<html"))
 
     @property
@@ -183,16 +180,16 @@ class AttemptOutcome:
 def may_be_charged(raw: RawReply, endpoint: str) -> bool:
     """Return whether a reply without usage may have been billed.
 
-    A refusal before any work is not, nor an error in the documented form of a provider whose own
-    host answered, by ``endpoint``. An error of a gateway, or a timeout, may follow a generated
-    answer.
+    Refusals before any work are not billed, nor errors in the documented form of a provider from
+    its own host (``endpoint`` identifies the host). An error of a gateway, or a timeout, may follow
+    a generated answer.
     """
-    own = PROVIDERS.get(endpoint)
+    provider = PROVIDERS.get(endpoint)
     if raw.status < 300 or raw.status in TOO_LATE or '"usage' in raw.body:
         return True
     if raw.status < 500:
-        return own is None and bool(raw.error.names & CHARGED_ERRORS)
-    members = own.error_members if own else frozenset()
+        return provider is None and bool(raw.error.names & CHARGED_ERRORS)
+    members = provider.error_members if provider else frozenset()
     return not members or not members <= as_dict(as_dict(raw.payload).get("error")).keys()
 
 

@@ -193,7 +193,7 @@ class Ledger:
         return True
 
     async def ask_coordinator(self, key: str, usd: float, label: CallLabel) -> bool:
-        """Return whether the coordinator reserves an attempt; without one it is not asked."""
+        """Return whether the coordinator reserves an attempt; True without a coordinator."""
         return True
 
     def report_cost(self, key: str, usd: float | None) -> None:
@@ -220,7 +220,7 @@ class Ledger:
         """
         self._sum_once(execute)
         closed = execute(_CLOSE, (key, number)).fetchall()
-        # Without one a user has released it. A batch's is of the sweep that has submitted it.
+        # No row: a user has released it. The reservation of a batch is of the sweep that sent it.
         scope, reserved_usd, worst_usd = closed[0] if closed else (self.scope, usd, usd)
         exceeds = usd > reserved_usd + TOLERANCE_USD
         over = (usd - reserved_usd, usd / max(worst_usd, TOLERANCE_USD)) if exceeds else (0.0, 0.0)
@@ -243,7 +243,7 @@ class Ledger:
         return self.store.rows(_SPENT, self.scope), [row[1:] for row in opened]
 
     def share(self, name: str, spent: Rows, opened: Rows, execute: Execute) -> None:
-        """Replace what is reserved for a cluster's task by its costs and reservations.
+        """Replace the reservation of a cluster's task by its costs and open reservations.
 
         An operation.
         """

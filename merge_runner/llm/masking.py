@@ -18,7 +18,7 @@ CONTROLS = {"b": "\b", "f": "\f", "n": "\n", "r": "\r", "t": "\t"}
 
 
 class Mask:
-    """Replaces secrets, and runs of at least RUN of their characters.
+    """Replacement of secrets, and of runs of at least RUN of their characters, by MASK.
 
     They may contain escapes of JSON, also in a string within a string.
     """

@@ -22,23 +22,25 @@ SOON_DAYS = 30
 CAP, EFFORT = "max_output_tokens", "reasoning_effort"
 
 
-def load_models(beside: Path | None = None) -> dict[str, ModelEntry]:
+def load_models(study_folder: Path | None = None) -> dict[str, ModelEntry]:
     """Return the entries by name, each with a known format and provider; raise UsageError.
 
-    Entries of a ``models.toml`` in the working directory, in its ``experiments``, or ``beside`` a
-    study are added to those that ship, and replace those of the same name.
+    Entries of a ``models.toml`` in the working directory, in its ``experiments``, or in
+    ``study_folder`` are added to those that ship, and replace those of the same name.
     """
     load_plugins()  # first, so that an error in a plug-in is not reported as the file's
     entries: dict[str, ModelEntry] = {}
-    for path in registry_files(beside):
+    for path in registry_files(study_folder):
         entries |= read_models(path)
     return entries
 
 
-def registry_files(beside: Path | None = None) -> list[Path]:
+def registry_files(study_folder: Path | None = None) -> list[Path]:
     """Return the files of ``load_models``, in order: an entry replaces an earlier one."""
-    folders = [*reversed(experiments()), Path(), *([] if beside is None else [beside])]
-    return [path for path in dict.fromkeys(each / REGISTRY for each in folders) if path.is_file()]
+    folders = [*reversed(experiments()), Path(), *([] if study_folder is None else [study_folder])]
+    return [
+        path for path in dict.fromkeys(folder / REGISTRY for folder in folders) if path.is_file()
+    ]
 
 
 def read_entries(path: Path) -> dict[str, ModelEntry]:
@@ -118,9 +120,9 @@ def with_parameter(name: str, entry: ModelEntry, parameter: str, level: JsonValu
     parameters: dict[str, Any] = deepcopy(entry.parameters)
     *outer, last = places.get(parameter, (parameter,))
     table = parameters
-    for each in outer:
-        if not isinstance(table.get(each), dict):
-            table[each] = {}
-        table = table[each]
+    for member in outer:
+        if not isinstance(table.get(member), dict):
+            table[member] = {}
+        table = table[member]
     table[last] = level
     return entry.model_copy(update={"parameters": parameters})

@@ -36,7 +36,7 @@ _END_OF_CHANNEL = re.compile(r"<\|(?:end|return|call|start)\|>")
 _QUOTES = {"`": "`", '"': '"', "'": "'", "(": ")", "\u201c": "\u201d", "\u2018": "\u2019"}
 _FENCE = "```"
 # Characters of a line that are checked on both sides of a tag.
-_BESIDE = 80
+_NEARBY = 80
 
 
 class Parts(NamedTuple):
@@ -56,7 +56,7 @@ def split_reasoning(text: str) -> Parts:
     ends = _ends(rest)
     if not ends:
         return Parts(rest, "", cut=True)
-    end = next((each for each in ends if _is_followed(rest, each)), ends[0])
+    end = next((tag for tag in ends if _is_followed(rest, tag)), ends[0])
     thoughts, answer = rest[: end.start()], _answer(rest, end)
     if again := _OPENING.match(answer):  # and no closing tag follows that
         return Parts(thoughts + answer[again.end() :], "", cut=True)
@@ -95,6 +95,6 @@ def _is_quoted(text: str, tag: re.Match[str]) -> bool:
 
 
 def _is_a_word(text: str, tag: re.Match[str]) -> bool:
-    before = text[max(0, tag.start() - _BESIDE) : tag.start()].rpartition("\n")[2]
-    after = text[tag.end() : tag.end() + _BESIDE].partition("\n")[0]
+    before = text[max(0, tag.start() - _NEARBY) : tag.start()].rpartition("\n")[2]
+    after = text[tag.end() : tag.end() + _NEARBY].partition("\n")[0]
     return before[-1:].isspace() and bool(before.strip() and after.strip())

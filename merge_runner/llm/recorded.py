@@ -36,7 +36,7 @@ class RecordedCalls(Protocol):
         ...
 
     def in_recording(self, key: str) -> bool:
-        """Return whether a recording that was named holds the call with this key."""
+        """Return whether a recording that the user named holds the call with this key."""
         ...
 
 
@@ -74,7 +74,7 @@ class RecordedReplies:
         return question.decide(prompt, reply)
 
     def prompt(self, question: Question) -> str:
-        """Return the prompt of a question, in its older words where only these are recorded."""
+        """Return the prompt of a question, or its older wording if only that is recorded."""
         prompt, older, slot = question.prompt, question.older, question.slot
         if older is None or self.has_asked(prompt, slot) or not self.has_asked(older, slot):
             return prompt
@@ -112,9 +112,9 @@ class RecordedReplies:
         return ChatReply(reading.text, last.outcome, recorded.request, attempts, earlier)
 
     def count(self, reply: ChatReply, *, shared: bool = False) -> None:
-        """Count a reply that a trial uses, and the model that gave it where it is another one.
+        """Count a reply that a trial uses, and its model where another one was asked for.
 
-        ``shared``: this run has asked it for another trial.
+        ``shared``: this run has sent its call for another trial.
         """
         last, meter = reply.attempts[-1], self.meter
         cached = reply.earlier == len(reply.attempts)
@@ -126,4 +126,4 @@ class RecordedReplies:
         if last.model_served not in self.own_names:
             meter.mismatches[f"{self.entry.id} -> {last.model_served}"] += 1
         if self.entry.provider != "emulator":
-            meter.stand_ins += is_scripted(reply.request, last)
+            meter.mock_replies += is_scripted(reply.request, last)

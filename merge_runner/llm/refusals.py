@@ -58,8 +58,8 @@ def reason_of(outcome: AttemptOutcome, url: str) -> str | None:
         return raw.kind
     if outcome.action == "fail":
         return "request" if raw.status in REQUEST_ITSELF else "other_format"
-    is_told = is_error(as_dict(raw.payload).get("error"))
-    if outcome.action == "retry" and raw.status == 200 and is_told and not raw.error.names:
+    reports_error = is_error(as_dict(raw.payload).get("error"))
+    if outcome.action == "retry" and raw.status == 200 and reports_error and not raw.error.names:
         return "other_error"
     message = as_dict(at(raw.payload, "choices.0.message"))
     # Thoughts within the text are the model's, not the server's, doing.

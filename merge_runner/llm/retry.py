@@ -18,7 +18,7 @@ from merge_runner.records import ChatReply
 
 @dataclass(slots=True)
 class Retry:
-    """Makes further attempts of a call until one brings an answer."""
+    """Further attempts at a call, with backoff, until one brings an answer."""
 
     endpoint: EndpointState
     calls: Calls
@@ -30,7 +30,7 @@ class Retry:
         failures: list[TryAgain],
         attempt: Callable[[Call], Awaitable[ChatReply]],
     ) -> ChatReply:
-        """Return the answer after the first of the ``failures``, which is taken out."""
+        """Retry a call after the failure in ``failures``, which is removed; return the answer."""
         # Only here, since it costs time and memory that most calls need not spend.
         from tenacity import AsyncRetrying, retry_if_exception_type
 

@@ -31,7 +31,7 @@ class Sent(NamedTuple):
 
 
 class Sender(Protocol):
-    """Sends attempts at ``price_factor`` times the normal price."""
+    """Sender of attempts at ``price_factor`` times the normal price."""
 
     price_factor: float
 
@@ -45,7 +45,7 @@ class Sender(Protocol):
 
 @dataclass(slots=True)
 class DirectSender:
-    """Sends normal (synchronous) requests to one model, under its rate limits."""
+    """Sender of normal (synchronous) requests to one model, under its rate limits."""
 
     entry: ModelEntry
     wire: WireFormat
@@ -54,7 +54,7 @@ class DirectSender:
     price_factor: float = 1.0
 
     async def send(self, call: Call, reservation: Reservation) -> Sent:
-        """Wait for a turn, begin the reservation, and send; see ``Sender``."""
+        """Wait for a turn, begin the reservation, and send the attempt."""
         # The wait comes first: a turn must be used at once, or the limits do not hold.
         call.wait = Wait("for a turn under the rate limits")
         # Providers count a request when they admit it: about four bytes a token, and the whole cap.

@@ -98,12 +98,13 @@ class CallStore:
         *,
         overlay: Callable[[], AbstractContextManager[Overlay]] | None = None,
         read_only: bool = False,
-        before: bool = False,
+        allow_previous: bool = False,
     ) -> None:
         """Open or make the folder; ``overlay`` opens a recording, which takes precedence.
 
-        ``read_only`` changes nothing in the folder, which must exist, and may have the format
-        ``before``; otherwise it is upgraded. Raises UsageError for a folder that cannot be used.
+        ``read_only`` changes nothing in the folder, which must exist. A folder of the previous
+        format is upgraded, or read as it is if ``read_only`` and ``allow_previous``. Raises
+        UsageError for a folder that cannot be used.
         """
         self.folder = folder
         self.locks = ModelLocks(folder)
@@ -112,7 +113,7 @@ class CallStore:
         self.write = self._writer.write
         self.summed: object = None  # the ledger that knows its sums in the transaction under way
         try:
-            prepare(folder, read_only=read_only, before=before)
+            prepare(folder, read_only=read_only, allow_previous=allow_previous)
             self._opened = self._file
             self._one_query = Lock()
             with contextlib.ExitStack() as unless_opened:
@@ -133,7 +134,7 @@ class CallStore:
 
         Raises RecordingError where it is damaged or forged.
         """
-        return self.recording[0].get(key) or self._kept(key, request)
+        return self.recording[0].get(key) or self._entry(key, request)
 
     def in_recording(self, key: str) -> bool:
         """Return whether the recording holds an entry of a call key."""
@@ -154,13 +155,13 @@ class CallStore:
         texts = {name: row for name, *row in rows if name is not None}
         if key in texts:
             return verified(key, text_of(*texts[key]), request), ()
-        tried = _attempts(text_of(*texts[UNANSWERED + key])) if texts else ()
-        begun = sorted(row for row in rows if row[0] is None and row[1] > len(tried))
+        earlier = _attempts(text_of(*texts[UNANSWERED + key])) if texts else ()
+        begun = sorted(row for row in rows if row[0] is None and row[1] > len(earlier))
         unseen = (
             Attempt(number, "unknown", started_at=since, error=UNSEEN)
-            for number, (*_, since) in enumerate(begun, len(tried) + 1)
+            for number, (*_, since) in enumerate(begun, len(earlier) + 1)
         )
-        return None, (*tried, *unseen)
+        return None, (*earlier, *unseen)
 
     def run_now(self, operations: Sequence[Operation]) -> list[Any]:
         """Run operations in one durable transaction, in this thread."""
@@ -187,7 +188,7 @@ class CallStore:
             raise
         except (MergeRunnerError, *DAMAGED) as exc:
             alone = len(operations) == 1
-            return [exc] if alone else [self._run_each([each])[0] for each in operations]
+            return [exc] if alone else [self._run_each([operation])[0] for operation in operations]
 
     def read(self, name: str) -> str | None:
         """Return the text under a name, or None; raise RecordingError where it is damaged."""
@@ -224,7 +225,7 @@ class CallStore:
         key, text = entry.request.key, _behind_checksum(entry.to_json())
         if not execute(_ADD, (key, text)).rowcount:
             try:
-                return self._kept(key) or entry
+                return self._entry(key) or entry
             except RecordingError:
                 self._quarantine_row(key, execute)
                 execute(_ADD, (key, text))
@@ -243,11 +244,11 @@ class CallStore:
             renamed += f" {len(earlier) + 1}"
         execute("UPDATE Cache SET key = ? WHERE key = ? AND raw = 1", [renamed, name])
 
-    def _kept(self, key: str, request: ChatRequest | None = None) -> CachedCall | None:
+    def _entry(self, key: str, request: ChatRequest | None = None) -> CachedCall | None:
         text = self.read(key)
         return None if text is None else verified(key, text, request)
 
-    def _tried(self, key: str) -> Attempts:
+    def _unanswered(self, key: str) -> Attempts:
         return _attempts(self.read(UNANSWERED + key) or "[]")
 
     def rows(self, sql: str, *values: object) -> Rows:

@@ -18,7 +18,7 @@ from merge_runner.llm.store import CachedCall, text_of
 from merge_runner.records import DAMAGED, Attempt, ChatRequest, is_scripted, without_prompt
 
 BATCH = 1_000
-# As bytes, since a damaged text may be none.
+# As bytes, since a damaged value may be no text.
 NEWER = """
 SELECT rowid, mode, filename, CAST(value AS BLOB) FROM Cache WHERE rowid > ? AND raw = 1
 AND length(key) = 64 AND NOT instr(key, ' ') AND typeof(value) = 'text' ORDER BY rowid LIMIT ?
@@ -39,14 +39,14 @@ output_tokens = output_tokens + excluded.output_tokens, last = max(last, exclude
 
 
 class RequestTemplate(NamedTuple):
-    """A request without its prompt and slot; ``own``: no mock model answered in its name."""
+    """A request without its prompt and slot; ``genuine``: no mock model answered in its name."""
 
     provider: str
     endpoint: str
     model: str
     path: str
     body: str
-    own: bool
+    genuine: bool
 
 
 class AnswerCounts(NamedTuple):
@@ -69,14 +69,14 @@ def count_by_template(calls: Iterable[tuple[ChatRequest, Attempt]]) -> TemplateC
     """Count answered calls, given as requests and last attempts."""
     counts: TemplateCounts = {}
     for request, last in calls:
-        own = request.provider == "emulator" or not is_scripted(request, last)
+        genuine = request.provider == "emulator" or not is_scripted(request, last)
         template = RequestTemplate(
             request.provider,
             request.endpoint,
             request.model,
             request.path,
             without_prompt(request.body),
-            own,
+            genuine,
         )
         read, written = last.usage.input_tokens, last.usage.output_tokens
         answer = AnswerCounts(1)
@@ -119,10 +119,10 @@ def _count_newer(after: int, execute: Execute) -> int:
 def recorded_values(cache: ResponseCache, name: str, **fields: str) -> set[str]:
     """Return the values of ``name`` in templates with these ``fields``.
 
-    Those of the recording, else of the folder.
+    They are those of the recording, or else of the folder.
     """
     for counts in answer_counts(cache):
-        matching = [t for t in counts if all(getattr(t, f) == of for f, of in fields.items())]
+        matching = [t for t in counts if all(getattr(t, f) == value for f, value in fields.items())]
         if matching:
             return {getattr(template, name) for template in matching}
     return set()

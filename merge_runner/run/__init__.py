@@ -1,1 +1,1 @@
-"""A sweep under way: what is to be played, who plays it, and what is shown of it."""
+"""A sweep: its plan, the players of its trials, their storage, and the display."""

@@ -51,7 +51,7 @@ def live_clients(
 ) -> dict[str, LlmClient]:
     """Return clients with connections, closed with ``stack``, and a share of the rate limits.
 
-    ``earlier`` is as ``earlier_answers`` says. ``rounds`` are those of this run, which get the
+    ``earlier`` is a result of ``earlier_answers``. ``rounds`` are those of this run, which get the
     batch modes of its models. Variables in ``urls`` go before the environment. ``limiters`` by
     registered model go on from earlier clients, and get those that are made. Raises UsageError
     where a key is missing, or a cap could not be enforced.
@@ -125,7 +125,7 @@ def _connections(
 
 
 def _check_money(plan: Plan, ledger: Ledger) -> None:
-    """Raise UsageError where a price is unknown under a cap, or what is spent is damaged."""
+    """Raise UsageError where a price is unknown under a cap, or the ledger is damaged."""
     for name, entry in plan.entries.items():
         unknown = cost_usd(entry, Usage(input_tokens=1, output_tokens=1)) is None
         if ledger.cap is not None and unknown:
@@ -138,7 +138,7 @@ def _check_money(plan: Plan, ledger: Ledger) -> None:
 
 
 def _allow_files(number: int) -> None:
-    """Let this process open so many files, since a connection is one: by default it may 1,024."""
+    """Raise the limit of open files, 1,024 by default: each connection counts as one."""
     soft, hard = getrlimit(RLIMIT_NOFILE)
     try:
         if number > soft != RLIM_INFINITY:

@@ -2,9 +2,9 @@
 
 A chunk of trials has a share of the rate limits and of the cap. Its worker plays it with the
 ordinary runner and a reply folder of its own. The coordinator keeps its records and replies in one
-transaction before it counts the chunk as done, and gives the chunk of a lost worker out again.
+transaction before it counts the chunk as done, and gives the chunk of a lost worker to another.
 A worker announces each attempt, whose worst case the coordinator reserves durably before it is
-sent, and each cost: what is lost counts with what it may have cost, no more.
+sent, and each cost: a lost attempt counts with its worst case, no more.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ if TYPE_CHECKING:
     from distributed import Client
 
 COUNT_WORKERS_EVERY_S = 1.0  # they may come and go
-# A worker that dies loses so many times its trials in flight, and the longest trial of a chunk
-# holds the others up.
+# Trials of a chunk for each trial in flight. A worker that dies loses its chunk, and the longest
+# trial of a chunk delays the next one.
 TRIALS_PER_SLOT = 4
 MOST_LOSSES = 3
 
 
 class ClusterRunner:
-    """Plays trials on the workers of a cluster, each of which gets one chunk at a time."""
+    """Player of trials on the workers of a cluster, each of which gets one chunk at a time."""
 
     waits: Sequence[Wait] = ()
     waiting_for_money = 0
@@ -67,7 +67,7 @@ class ClusterRunner:
 
     @property
     def running(self) -> int:
-        """The number of trials that are given out."""
+        """The number of trials that workers have been given."""
         return sum(len(assignment.chunk.specs) for assignment in self._assigned.values())
 
     @property
@@ -100,7 +100,7 @@ class ClusterRunner:
             ) from exc
 
     async def drain(self) -> None:
-        """Stop the workers, and keep what their chunks have brought."""
+        """Stop the workers, and keep the results of their chunks."""
         addresses = [assignment.address for assignment in self._assigned.values()]
         with contextlib.suppress(OSError):
             await self._client.run(stop, self._setup.run, workers=addresses, on_error="ignore")
@@ -116,7 +116,7 @@ class ClusterRunner:
                 assignment.events.put_nowait(tuple(message))
 
     async def _give(self, address: str) -> None:
-        """Give a chunk to a worker, unless those under way still hold all shares."""
+        """Give a chunk to a worker, unless the chunks under way hold all shares."""
         setup, options = self._setup, self._setup.options
         slots = 1 if self._one_by_one else min(self.workers, options.in_flight)
         shares = sum(assignment.chunk.share for assignment in self._assigned.values())
@@ -152,7 +152,7 @@ class ClusterRunner:
         self._assigned[task] = assignment
 
     async def _collect(self) -> None:
-        """Wait a while for chunks, and keep what those that have ended return."""
+        """Wait briefly for chunks, and keep the results of those that have ended."""
         if not self._assigned:
             await asyncio.sleep(COUNT_WORKERS_EVERY_S)
             return
@@ -168,7 +168,7 @@ class ClusterRunner:
                 self._lose(assignment, played)
 
     def _keep(self, assignment: Assignment, played: Played) -> None:
-        """Keep what a chunk has brought and what it cost; what is ``booked`` is counted once."""
+        """Keep the results and the costs of a chunk; costs already ``booked`` count once."""
         chunk, plan = assignment.chunk, self._setup.plan
         booked = [(driver, -usd, -over_usd, 0.0) for driver, usd, over_usd in assignment.booked]
         spent = [*booked, *played.spent]
@@ -192,7 +192,7 @@ class ClusterRunner:
             raise type(error)(f"{error} (told by the Dask worker {assignment.address})")
 
     def _lose(self, assignment: Assignment, error: Exception) -> None:
-        """Give the trials of a lost chunk out again; its attempts without a cost stay reserved."""
+        """Put the trials of a lost chunk back; its attempts of unknown cost stay reserved."""
         specs = [*assignment.chunk.specs]
         self._losses[specs[0].order] += 1
         if self._losses[specs[0].order] == MOST_LOSSES:

@@ -71,7 +71,7 @@ class Assignment:
     async def _book(self, ledger: Ledger) -> dict[int, bool] | None:
         """Reserve the attempts and book the costs of the next events, in their order.
 
-        Returns by attempt to reserve whether there is money for it; None after the last event.
+        Returns, for each attempt to reserve, whether it is reserved; None after the last event.
         """
         events = [await self.events.get()]
         while not self.events.empty():
@@ -97,7 +97,7 @@ class Assignment:
 
 
 async def recorded_calls(plan: Plan, cache: ResponseCache, specs: Sequence[TrialSpec]) -> Recorded:
-    """Return what the cache holds of the calls of trials, up to the first that is missing."""
+    """Return the recorded calls of trials, of each one up to its first missing call."""
     replay = Replay(plan, cache)
     answered: dict[str, CachedCall] = {}
     unanswered: dict[str, tuple[Attempt, ...]] = {}

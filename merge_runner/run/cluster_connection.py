@@ -26,14 +26,14 @@ VALID = (
     "valid: local:N (N workers on this machine), a scheduler's tcp://HOST:PORT or tls://HOST:PORT, "
     "or its file PATH.json"
 )
-# Those with a level of their own: Dask logs tracebacks for what we report in a line, such as lost
-# workers, and so do the libraries below it.
+# Loggers with a level of their own. Dask and its libraries log tracebacks of errors that a run
+# reports in one line, such as lost workers.
 LOGGERS = ("distributed", "distributed.client", "tornado", "tornado.application")
 
 
 @contextmanager
 def _silenced(loggers: Iterable[logging.Logger]) -> Iterator[None]:
-    """Let loggers say nothing for a while."""
+    """Silence loggers within a ``with`` block."""
     levels = [(logger, logger.level) for logger in loggers]
     try:
         for logger, _ in levels:
@@ -46,7 +46,7 @@ def _silenced(loggers: Iterable[logging.Logger]) -> Iterator[None]:
 
 @contextmanager
 def _environment_restored() -> Iterator[None]:
-    """Undo what is set meanwhile: Dask sets variables of this process for those it starts."""
+    """Restore the environment after a ``with`` block: Dask sets variables for its children."""
     before = {**os.environ}
     try:
         yield
@@ -59,9 +59,9 @@ def _environment_restored() -> Iterator[None]:
 @asynccontextmanager
 async def connected(where: str) -> AsyncIterator[Client]:
     """Connect to the cluster that ``--dask`` names, or start a local one; raises UsageError."""
-    named = _WHERE.fullmatch(where)
+    match = _WHERE.fullmatch(where)
     is_file = Path(where).is_file()  # noqa: ASYNC240 # nothing else runs yet
-    if named is None or (named["file"] and not is_file):
+    if match is None or (match["file"] and not is_file):
         raise UsageError(f"--dask {where!r} names no cluster; {VALID}")
     try:
         import distributed
@@ -72,8 +72,8 @@ async def connected(where: str) -> AsyncIterator[Client]:
 
     async with AsyncExitStack() as stack:
         stack.enter_context(_silenced(map(logging.getLogger, LOGGERS)))
-        scheduler = {"scheduler_file" if named["file"] else "address": where}
-        if named["workers"]:
+        scheduler = {"scheduler_file" if match["file"] else "address": where}
+        if match["workers"]:
             stack.enter_context(_environment_restored())
             os.environ["PYTHONSAFEPATH"] = "1"  # workers import nothing of this folder
             # A terminal's Ctrl-C reaches this process alone, which stops them in order: children
@@ -82,7 +82,7 @@ async def connected(where: str) -> AsyncIterator[Client]:
             before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGHUP))
             try:
                 local = distributed.LocalCluster(
-                    n_workers=int(named["workers"]),
+                    n_workers=int(match["workers"]),
                     threads_per_worker=1,
                     dashboard_address=None,
                     # Its server of HTTP is started all the same: at any port that is free.
@@ -102,6 +102,6 @@ async def connected(where: str) -> AsyncIterator[Client]:
                 f"no Dask scheduler answers at {where} within {CONNECT_TIMEOUT_S} s; {VALID}"
             ) from exc
         stack.push_async_callback(client.close, timeout=CONNECT_TIMEOUT_S)
-        if named["workers"]:  # the first of them would get the share of all
-            await client.wait_for_workers(int(named["workers"]))
+        if match["workers"]:  # the first of them would get the share of all
+            await client.wait_for_workers(int(match["workers"]))
         yield client

@@ -56,7 +56,7 @@ class RunSetup:
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """Trials for one worker, what is recorded of their calls, and its ``share`` of the limits.
+    """Trials for one worker, their recorded calls, and its ``share`` of the rate limits.
 
     Its attempts are reserved under its ``name`` until it ends. The options of ``setup`` have its
     share of the trials in flight, and ``cap`` that of the money.
@@ -127,7 +127,7 @@ class RemoteLedger(Ledger):
                 self._waiting[number].set_result(is_paid)
 
     def report_cost(self, key: str, usd: float | None) -> None:
-        """Tell what an attempt that may be reserved has cost, where that is known."""
+        """Report the cost of an attempt that may be reserved, where it is known."""
         number, label = self._reserved.pop(key, (0, CallLabel()))
         if number and usd is not None:
             self._tell("cost", number, usd, label)
@@ -157,7 +157,7 @@ def answer(run: str, name: str, answers: Mapping[int, bool], *, dask_worker: Wor
 
 
 def stop(run: str, *, dask_worker: Worker) -> None:
-    """Let the calls of a run's chunk end, which then returns what there is."""
+    """Stop the chunk of a run: its calls end, and it returns its results so far."""
     _state(run, dask_worker).stopping.set()
 
 
@@ -201,7 +201,7 @@ async def play_chunk(program: str, pickled: bytes, *, dask_worker: Worker) -> Pl
 
 
 def _with_code(plan: Plan) -> Plan:
-    """Return the plan with its programs, and all that its study adds, made from their sources."""
+    """Return the plan with its programs and its study's parts, made from their sources."""
     study = plan.study
     catalogue = catalogue_of(study.file, study.text, study.plugins)
     return plan.model_copy(update={"parts": plan.parts.with_code(plan.arms, catalogue)})

@@ -26,23 +26,23 @@ from merge_runner.study.arms import Arm
 PROMPT_MARGIN = 1.25
 # Trials that turn out longer, and attempts that are charged but bring no answer.
 TRIAL_MARGIN = 1.5
-# Latencies are of the newest calls: of so many of each model, if they are among so many of all.
+# Latencies are those of the last ENOUGH calls of each model among the MOST_READ newest of all.
 ENOUGH, MOST_READ = 200, 10_000
 NONE_KNOWN: Mapping[str, float] = {}
 
 
 def earlier_answers(plan: Plan, cache: ResponseCache) -> dict[str, Usage | None]:
-    """Return the mean tokens of the models' own answers to requests like those of a plan.
+    """Return, by model, the mean tokens of its answers to requests like those of a plan.
 
-    None: the endpoint has answered, but no such request; a model whose endpoint has never answered
-    is missing. No mock model's answers count, and none that leaves its tokens out.
+    None: its endpoint has answered other requests only. A model whose endpoint has never answered
+    is left out. Answers of mock models, and those that report no tokens, do not count.
     """
     requests = _request_templates(plan)
     sums: dict[str, AnswerCounts] = {}
     for template, answers in chain.from_iterable(c.items() for c in answer_counts(cache)):
         asked = template.model, template.endpoint, template.path, template.body
         for name in (name for name, request in requests.items() if request[:2] == asked[:2]):
-            counts = template.own and requests[name] == asked
+            counts = template.genuine and requests[name] == asked
             sums[name] = sums.get(name, AnswerCounts()).plus(answers if counts else AnswerCounts())
     return {name: _mean(answers) for name, answers in sums.items()}
 
@@ -50,14 +50,14 @@ def earlier_answers(plan: Plan, cache: ResponseCache) -> dict[str, Usage | None]
 def usual_latencies_s(
     plan: Plan, cache: ResponseCache, facts: Mapping[str, Usage | None]
 ) -> dict[str, float]:
-    """Return the median latency of the answers that ``facts`` measured, of the newest of them."""
+    """Return, by model, the median latency of its newest answers, if ``facts`` has its tokens."""
     requests = _request_templates(plan)
     latencies: dict[str, list[float]] = {name: [] for name, usage in facts.items() if usage}
     for call in cache.newest(MOST_READ) if latencies else ():
         last = call.attempts[-1]
         (template,) = count_by_template([(call.request, last)])
         asked = template.model, template.endpoint, template.path, template.body
-        if template.own and last.latency_s is not None:
+        if template.genuine and last.latency_s is not None:
             for name in (name for name in latencies if requests[name] == asked):
                 latencies[name].append(last.latency_s)
         if all(len(latencies_s) >= ENOUGH for latencies_s in latencies.values()):
@@ -91,7 +91,7 @@ class Estimate:
     requests, calls cost ``singly_usd``; in batches they cost less, and take so many ``rounds`` in
     place of minutes.
     ``usd_by_model`` has the models of the registry. Of ``planned`` trials some are ``stored``.
-    A cap leaves ``left_usd`` of what it covers; without one that is None. ``output_caps`` are the
+    ``left_usd`` is left under the cap; None: there is no cap. ``output_caps`` are the
     most tokens that a reply of each model may have.
     """
 
@@ -183,8 +183,8 @@ def trial_costs(
 ) -> Callable[[int], float]:
     """Return a function from a trial's order to its expected cost in USD, perhaps in batches.
 
-    They are its usual calls, with a margin, and one worst case, which the last call must be able to
-    reserve. ``facts`` is as for ``estimate``.
+    It is the cost of the usual calls, with a margin, and one worst case, which the last call must
+    be able to reserve. ``facts`` is as for ``estimate``.
     """
     by_arm: defaultdict[str, float] = defaultdict(float)
     for arm in plan.arms:
@@ -213,7 +213,7 @@ def _price_factor(entry: ModelEntry, batch: bool) -> float:
 
 
 def _limited_s(options: Options, entry: ModelEntry, usage: Usage, latency_s: float) -> float:
-    """Return how long the limits stretch a call, in s.
+    """Return the shortest time in s from call to call that the rate limits allow.
 
     Within a minute's window it counts with its output cap until its reply is in, and with its
     actual tokens from then on.
@@ -226,12 +226,12 @@ def _limited_s(options: Options, entry: ModelEntry, usage: Usage, latency_s: flo
 
 
 def typical_prompt(plan: Plan, arm: Arm) -> str:
-    """Return an arm's prompt in the middle of an approach, the longest; empty of programs."""
+    """Return an arm's prompt in the middle of an approach, the longest; empty for programs."""
     return max(prompts_of(plan, arm).values(), key=len, default="")
 
 
 def prompts_of(plan: Plan, arm: Arm) -> dict[str, str]:
-    """Return what the language models of an arm read in the middle of an approach, by prompt.
+    """Return, by prompt, the text that language models of an arm read in the middle of an approach.
 
     The numbers are those of the left driver in the plan's first condition.
     """
@@ -247,5 +247,5 @@ def prompts_of(plan: Plan, arm: Arm) -> dict[str, str]:
 
 
 def usd_text(cost_usd: float | None) -> str:
-    """``about 1.20 USD``."""
+    """Return an amount as text, such as ``about 1.20 USD``."""
     return "an unknown price" if cost_usd is None else f"about {cost_usd:.2f} USD"

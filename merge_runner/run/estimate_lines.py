@@ -13,7 +13,7 @@ from merge_runner.text_safety import first_of
 
 
 def _output_caps(expected: Estimate) -> Iterator[str]:
-    """Yield the output cap, by which a longer reply is cut off."""
+    """Yield the output caps, beyond which replies are cut off."""
     caps = expected.output_caps
     if caps:
         same = len({*caps.values()}) == 1
@@ -41,7 +41,7 @@ def _by_cap(expected: Estimate) -> Iterator[str]:
 
 
 def prompt_lines(plan: Plan) -> Iterator[str]:
-    """Yield the blocks, in order, of each prompt that has words of the study's factors."""
+    """Yield the blocks, in order, of each prompt with a text of the study's factors."""
     for name, prompt in plan.parts.prompts.items():
         if decomposed(name)[1]:
             yield f"prompt  {name}: {', '.join(prompt.blocks)}"

@@ -12,7 +12,7 @@ from merge_runner.errors import NoValidDecision
 from merge_runner.records import Decision
 from merge_runner.text_safety import one_line
 
-# After so many without a valid one a live run stops, before much is paid for what is no result.
+# So many invalid decisions before any valid one stop a live run, before they cost much.
 MOST_INVALID = 20
 SHOWN = 300
 ADVICE = (
@@ -23,10 +23,10 @@ ADVICE = (
 
 
 class FirstDecisions:
-    """The decisions of each model until one is valid, of which so many may be invalid.
+    """Count of each model's invalid decisions before its first valid one.
 
-    They are ``one_by_one`` where trials can wait for each other. ``valid`` are the models that have
-    decided validly.
+    A run stops at ``most_invalid`` of them. ``one_by_one``: before a valid decision only one trial
+    at a time asks a model. ``valid`` are the models with a valid decision.
     """
 
     def __init__(self, most_invalid: float = math.inf, *, one_by_one: bool = False) -> None:
@@ -40,7 +40,7 @@ class FirstDecisions:
 
     @asynccontextmanager
     async def turn(self, models: Collection[str]) -> AsyncIterator[None]:
-        """Play a trial when its models have decided validly, or no other trial asks them."""
+        """Wait until all models of a trial have decided validly, or no other trial asks them."""
         self._check()
         alone = {*models} if self._one_by_one else set()
         while alone & self._asked - self.valid:
@@ -63,7 +63,7 @@ class FirstDecisions:
     def add(
         self, model: str, valid: int, invalid: int, failure: str | None, text: str | None
     ) -> None:
-        """Count so many decisions; ``failure`` and ``text`` are of an invalid one."""
+        """Count numbers of decisions; ``failure`` and ``text`` are those of an invalid one."""
         if valid:
             self.valid.add(model)
             self._changed.set()
@@ -74,7 +74,7 @@ class FirstDecisions:
             self._described.setdefault(model, f"The first reply is {reply}. To mend that {ADVICE}")
 
     def without_a_valid_one(self, least: float = 1) -> list[str]:
-        """Return a line for each model with at least so many decisions, none of them valid."""
+        """Return a line for each model with ``least`` or more decisions, none of them valid."""
         return [
             f"none of the first {number} decisions of {model} is valid. {self._described[model]}"
             for model, number in sorted(self._invalid.items())

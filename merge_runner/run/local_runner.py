@@ -28,9 +28,9 @@ A_FEW = 16
 
 @dataclass
 class LocalRunner:
-    """Plays at most ``in_flight`` trials at once, of which so many are ``running``.
+    """Player of at most ``in_flight`` trials at once in this process; ``running`` counts them.
 
-    What they ask in ``rounds`` is submitted when none of them can go on.
+    With ``rounds`` their calls are submitted in batches when no trial can go on.
     """
 
     plan: Plan
@@ -113,7 +113,7 @@ class LocalRunner:
                     client.budget.leave(spec.order)
 
     async def _play(self, trial: Trial, order: int) -> TrialRecord:
-        """Ask all that is pending side by side; where a driver raises, no other one goes on."""
+        """Ask all pending questions at once; an error of one driver cancels the others."""
         while questions := trial.pending():
             try:
                 async with asyncio.TaskGroup() as group:

@@ -13,12 +13,12 @@ from merge_runner.providers import ModelEntry
 class Options:
     """The options of a run; none of them changes a result.
 
-    ``rpm`` and ``tpm`` override the registry's. ``max_cost_usd`` is a cap over ``ledgers``, too,
-    those of other sweeps. ``dask`` names the cluster that plays the trials; None: this process. A
+    ``rpm`` and ``tpm`` override the registry's. ``max_cost_usd`` also covers ``ledgers``, those of
+    other sweeps. ``dask`` names the cluster that plays the trials; None: this process. A
     ``dry_run`` sends nothing, a ``quiet`` run shows no progress, and one that is to ``keep_going``
-    asks a model on that gives no valid decision. In a ``batch`` run all trials ask together, at a
-    lower price. ``typed`` are the command's words after the program's name, with which it goes on.
-    ``name`` is what its user calls the run.
+    goes on with a model that gives no valid decision. In a ``batch`` run all trials ask together,
+    at a lower price. ``typed`` are the command's arguments, which resume the run. ``name`` is the
+    user's name for the run.
     """
 
     db: Path

@@ -38,11 +38,11 @@ _PROMPTS_PER_DRIVER = 10.5
 class Plan(BaseModel):
     """A sweep before it runs: the arms of its study, each played in all conditions.
 
-    The column ``sweeps.config`` holds it as JSON, from which it is read again. ``model`` says who
-    drives but for opponents, as ids of sweeps do, with a comma between models. ``levels`` are those
-    of each factor of its file, a factor's reference first. ``entries`` are the language models of
-    all arms by what an arm's ``asked`` calls them, and ``endpoints`` the identities of their
-    endpoints (see ``config.Endpoint``). ``seat`` is ``first`` where only first decisions are asked,
+    The column ``sweeps.config`` holds it as JSON, from which it is read again. ``model`` names
+    the drivers except opponents, separated by commas, as ids of sweeps do. ``levels`` has the
+    levels of each factor of its file, the reference first. ``entries`` are the language models of
+    all arms by their names in an arm's ``asked``, and ``endpoints`` the identities of their
+    endpoints (``providers.Endpoint``). ``seat`` is ``first`` where only first decisions are asked,
     and empty in a sweep. ``parts`` are no part of the JSON: a plan that is read has none.
     """
 
@@ -82,7 +82,7 @@ class Plan(BaseModel):
     @computed_field  # type: ignore[prop-decorator] # https://github.com/python/mypy/issues/14461
     @property
     def repetitions(self) -> dict[str, int]:
-        """Prompt variant to repetitions."""
+        """Repetitions by prompt variant."""
         return {arm.variant: arm.repetitions for arm in self.arms}
 
     @property
@@ -107,7 +107,7 @@ class Plan(BaseModel):
 
     @property
     def driver(self) -> str:
-        """The drivers with their endpoints; see ``pair_name``."""
+        """The drivers with their endpoints, as text."""
         pairs = (pair_name(arm.names, self.endpoints) for arm in self.arms)
         return ", ".join(dict.fromkeys(pairs))
 
@@ -169,7 +169,7 @@ class Plan(BaseModel):
 
 
 def usual_prompts(arm: Arm) -> float:
-    """Return the usual number of prompts of a trial of an arm to a language model."""
+    """Return the usual number of prompts to a language model in a trial of an arm."""
     most = math.ceil(arm.scenario.timeout_steps / model_pace(arm.scenario).interval_steps)
     return min(_PROMPTS_PER_DRIVER, most)
 
@@ -189,13 +189,13 @@ def make_plan(
     first: bool = False,
     grid: str | None = None,
     trust: bool = False,
-    own: Catalogue | None = None,
+    registered: Catalogue | None = None,
 ) -> Plan:
-    """Return the plan of a study's file and a user's choices; None or nothing keeps the file's.
+    """Return the plan of a study's file and a user's choices; an empty choice keeps the file's.
 
-    ``first``: only the first situations, in the conditions or on a ``grid`` (``grid_conditions``).
-    ``own`` are parts beside those that the study itself adds (``study.parts.load_study``, which
-    ``trust`` is for); ``db`` has the human trials that are to be replayed. Raises UsageError.
+    ``first``: only the first decisions, in the conditions or on a ``grid`` (``grid_conditions``).
+    ``registered`` are parts beside those that the study itself adds; ``trust`` agrees to run its
+    code. ``db`` has the human trials that are to be replayed. Raises UsageError.
     """
     if grid is not None:
         if conditions is not None or not first:
@@ -204,7 +204,7 @@ def make_plan(
     if sample_set < 0:
         raise UsageError("--sample-set is a whole number from 0")
     asked = (models,) if isinstance(models, str) else tuple(models)
-    study, catalogue = load_study(sweep, asked, trust=trust, registered=own)
+    study, catalogue = load_study(sweep, asked, trust=trust, registered=registered)
     file = study.file
     drivers = chosen_models(file, asked)
     pairs = (dict.fromkeys(both_sides(name).values()) for name in drivers)
@@ -241,7 +241,7 @@ def make_plan(
 
 def _check_primary(measure: str) -> None:
     """Raise UsageError unless a study's primary measure can be tested."""
-    metrics = [item for each in Registry.made if each.kind == "metric" for item in each.items()]
+    metrics = [item for parts in Registry.made if parts.kind == "metric" for item in parts.items()]
     tested = [name for name, metric in metrics if metric.estimator != "median"]
     hint = "as the study's primary one; a median is not tested"
     require(dict.fromkeys([*MEASURES, *tested]), "measure", measure, hint)

@@ -23,7 +23,7 @@ SHOWN = 5  # trials that are stored otherwise
 
 @dataclass
 class Endings:
-    """Counts how trials end, as they end, and hands them to the writer."""
+    """Tally of trials as they end, which also go to the writer."""
 
     session: Session
     progress: Progress
@@ -46,7 +46,7 @@ class Endings:
         self.flusher.add(record)
 
     def note_suspended(self) -> None:
-        """Note that trials wait for money, where any do."""
+        """Note the trials that wait for money."""
         if not self.suspended:
             return
         waiting = dict.fromkeys(map(_played_as, self.session.todo), 0) | self.suspended
@@ -58,7 +58,7 @@ class Endings:
         )
 
     def note_failed(self) -> None:
-        """Note the trials that failed, by what they lack where that is known."""
+        """Note the calls without a recorded reply, or else the number of failed trials."""
         failed = self.progress.trials.outcome_counts["failed"]
         self.session.fail_by_misses(self.misses)
         if failed and not self.misses:
@@ -68,10 +68,10 @@ class Endings:
 async def play_and_store(
     session: Session, progress: Progress, flusher: Flusher, stopping: Stopping
 ) -> tuple[bool, bool]:
-    """Play what is missing, and store it; what goes wrong is noted in the session.
+    """Play and store the missing trials; problems are noted in the session.
 
-    Returns two truth values: all is stored (not where Ctrl-C ended the waiting for a database that
-    another program holds), and the task that runs it was cancelled.
+    Returns whether all are stored, and whether the task was cancelled. They are not all stored if
+    Ctrl-C ends the wait for a database that another program holds.
     """
     endings = Endings(session, progress, flusher)
     progress.trials.unstored = lambda: flusher.problem
@@ -125,7 +125,7 @@ async def _play(endings: Endings, stopping: Stopping) -> bool:
 
 
 async def _store_rest(session: Session, flusher: Flusher, stopping: Stopping) -> bool:
-    """Store what is not stored yet; False where Ctrl-C ended the waiting for that."""
+    """Store the remaining trials; False if Ctrl-C ends the wait for that."""
     closing = asyncio.create_task(_store_all(session, flusher))
     with stopping(None, closing.cancel):
         try:
@@ -149,7 +149,7 @@ async def _store_rest(session: Session, flusher: Flusher, stopping: Stopping) ->
 
 
 async def _store_all(session: Session, flusher: Flusher) -> None:
-    """Store the trials in memory, and play those again that were dropped: without a call."""
+    """Store the trials in memory, and replay the dropped ones, without a call."""
     await flusher.close()
     if flusher.dropped:
         session.say(
@@ -170,7 +170,7 @@ def _played_as(spec: TrialSpec) -> str:
 
 
 def _unbalanced(waiting: Mapping[str, int]) -> str:
-    """Return how many trials of each arm wait, where the numbers differ."""
+    """Return the numbers of waiting trials by arm, as text, where they differ."""
     if len({*waiting.values()}) <= 1:
         return ""
     parts = first_of(

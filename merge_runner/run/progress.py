@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 PULSE_S = 0.05
-# In pulses: how often the file and a terminal are written, and plain lines.
+# Pulses between writes of the file and of a terminal, and between plain lines.
 PUBLISHED_EVERY, PLAIN_EVERY = 20, 100
 REASONS_SHOWN = 3
 LONGEST_LINE, CENT_USD = 120, 0.005
@@ -41,11 +41,11 @@ CLOSE_IT = "you may close this: the same command goes on"
 
 @dataclass(slots=True)
 class TrialCounts:
-    """The trials of a run: those ``stored`` before it, and by arm those ``todo`` in it.
+    """Numbers of trials: ``stored`` before a run, and by arm those ``todo`` in it.
 
-    ``done`` has by arm those of them that have ended. ``outcome_counts`` counts how they ended:
-    with a Status, or ``suspended`` until there is more money. ``unstored`` returns the reason why
-    trials are not stored; empty: nothing is wrong.
+    ``done`` has by arm those of them that have ended, ``outcome_counts`` their outcomes: a Status,
+    or ``suspended`` until there is more money. ``unstored`` returns the reason why trials are not
+    stored; empty: nothing is wrong.
     """
 
     todo: Counter[str]
@@ -175,7 +175,7 @@ class Progress:
             yield problem
         for name, meter in self.runner.meters.items():
             yield from (f"another model answers: {pair}" for pair in sorted(meter.mismatches))
-            if meter.stand_ins:
+            if meter.mock_replies:
                 yield f"a scripted stand-in answers, not {name}"
             yield from (f"{name}: {underpriced(tier)}" for tier in sorted(meter.underpriced))
 
@@ -258,16 +258,16 @@ def terminal_text(progress: Progress) -> Text:
 
 @dataclass
 class Log:
-    """The progress as short lines, where no terminal shows it: only what is out of the ordinary.
+    """The progress as short lines, for an output that is no terminal: only unusual facts.
 
-    A warning, or what may be known once, is a line of its own.
+    A warning, or a hint that is shown once, is a line of its own.
     """
 
     last_line: str = ""
     shown_once: set[str] = field(default_factory=set)
 
     def show(self, progress: Progress) -> None:
-        """Print the state of the run; once the trials have ended, only what is new."""
+        """Print the state of the run; once the trials have ended, only changes."""
         snapshot = progress.snapshot("")
         for name, text in snapshot.rows:
             # Numbers of the same warning change.

@@ -24,8 +24,8 @@ class ProgressSnapshot(BaseModel):
     """Snapshot of a sweep, for its display and for other processes.
 
     ``ended`` trials have an outcome, those that were stored before this run among them. ``left_s``
-    is the estimated time left, None while there is no estimate. ``rows`` are what is shown, each
-    with its name: ``WARNING``, ``waiting`` (for what), ``trials``, ``cost`` and so on.
+    is the estimated time left, None while there is no estimate. ``rows`` are those of the display,
+    each with its name: ``WARNING``, ``waiting`` (for what), ``trials``, ``cost`` and so on.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -87,7 +87,7 @@ def running(db: Path) -> list[ProgressSnapshot]:
 
 
 def clear_dead(db: Path) -> None:
-    """Remove what killed sweeps left, and nothing else."""
+    """Remove the files of killed sweeps, and nothing else."""
     with suppress(OSError):
         for path, snapshot in _snapshots(db):
             if not snapshot.alive:

@@ -21,8 +21,8 @@ from merge_runner.text_safety import first_line, one_line
 def recorded_plans(file: Path, *, db: Path, trust: bool) -> Iterator[Plan]:
     """Yield the plans of the sweeps in a recording, equal ones once.
 
-    The user agrees to a study's code, as where its file is named; ``db`` has the human trials that
-    are to be replayed. Raises UsageError or RecordingError.
+    A study's code needs the user's agreement, as that of a study's file does. ``db`` has the human
+    trials that are to be replayed. Raises UsageError or RecordingError.
     """
     seen = set[str]()
     for row in sweep_rows(read_provenance(file)):

@@ -19,7 +19,7 @@ from merge_runner.trial_records import TrialRecord, TrialSpec
 
 @dataclass
 class Replay:
-    """Plays trials by recorded ``calls`` alone: no key, no connection, and nothing to wait for."""
+    """Player by recorded ``calls`` alone: no key, no connection, and nothing to wait for."""
 
     plan: Plan
     calls: RecordedCalls
@@ -49,9 +49,9 @@ class Replay:
         return played or play_trial(self._trials.make(spec), self._decide)
 
     async def look_ahead(self, specs: Sequence[TrialSpec]) -> list[TrialRecord]:
-        """Play trials until one has a recorded reply, and return them where none has.
+        """Play trials until one has a recorded reply; return all if none has, else no trial.
 
-        They are not played again. Where no model is asked, there is nothing to find out.
+        ``play`` does not repeat them. Without a language model no trial is played.
         """
         for spec in specs if self._models else ():
             await asyncio.sleep(0)
@@ -66,7 +66,7 @@ class Replay:
         ended: Callable[[TrialSpec, TrialRecord], None],
         capacity: Capacity | None = None,
     ) -> None:
-        """Play trials in order, and let what is stored and shown meanwhile go on between two."""
+        """Play trials in order; storing and the display go on between two of them."""
         for spec in specs:
             if capacity is not None:
                 await capacity()

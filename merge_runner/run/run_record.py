@@ -1,4 +1,4 @@
-"""The row of a run in the database: its begin, its end, and the check of what it stored."""
+"""The row of a run in the database: its start, its end, and the check of its trials."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ async def begin(session: Session, store: Store) -> str:
 
 
 def end(session: Session, store: Store, sweep_id: str) -> None:
-    """Note in its row that the run has ended, and how."""
+    """Store the end of a run and its exit code in its row."""
     try:
         store.end_sweep(sweep_id, datetime.now(UTC).replace(tzinfo=None), session.exit_code)
     except StoreError as exc:
@@ -59,7 +59,7 @@ def end(session: Session, store: Store, sweep_id: str) -> None:
 async def check(
     session: Session, store: Store, sweep_id: str, first: FirstDecisions
 ) -> tuple[dict[str, Any], Audit] | None:
-    """Read back what the database holds of the run, which has ended, and audit it."""
+    """Read the rows of an ended run back from the database, and audit them."""
     ended_with, checked = session.exit_code, None
     try:
         checked = await _read_back(session, store.path, sweep_id)

@@ -28,13 +28,13 @@ async def with_names(
     """
     entries, endpoints = dict(plan.entries), dict(plan.endpoints)
     for name, entry in entries.items():
-        named = model_id(entry)
-        if not named and options.sends_nothing:
+        served_id = model_id(entry)
+        if not served_id and options.sends_nothing:
             # A server of one's own serves one model, or the recorded replies do not tell which.
             models = recorded_values(cache, "model", provider=entry.provider)
-            named = models.pop() if len(models) == 1 else UNNAMED
+            served_id = models.pop() if len(models) == 1 else UNNAMED
         entries[name] = entry.model_copy(
-            update={"id": named or await _served_name(name, entry, say=say)}
+            update={"id": served_id or await _served_name(name, entry, say=say)}
         )
         recorded: set[str] = set()
         if options.replay:

@@ -1,4 +1,4 @@
-"""An open sweep: its plan, cache and ledger, the trials that are left, and what went wrong."""
+"""An open sweep: its plan, cache and ledger, its missing trials, and its problems."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from merge_runner.trial_records import TrialRecord, TrialSpec
 
 @dataclass
 class Session:
-    """A plan that is open to be run; ``stored`` trials have ended before, ``todo`` are left.
+    """An open plan; its trials are ``stored`` by earlier runs, or ``todo``.
 
     ``say`` shows a line to the user. ``exit_code`` is that of the first problem, ``messages`` are
     of all.
@@ -74,10 +74,10 @@ def misses_of(record: TrialRecord) -> list[Miss]:
 async def open_session(
     plan: Plan, options: Options, *, say: Callable[[str], None]
 ) -> AsyncIterator[Session]:
-    """Open the cache, and the database unless it is a replay, and find out what is missing.
+    """Open the cache, and the database unless it is a replay, and list the missing trials.
 
-    Asks a server of one's own what its model is called, and locks the models that a live run is to
-    ask. ``say`` shows a line to the user. Raises UsageError.
+    Asks a user's own server for the name of its model, and locks the models of a live run.
+    ``say`` shows a line to the user. Raises UsageError.
     """
     check_batches(plan, options)
     recorded = partial(spilled, options.recordings) if options.recordings else None
@@ -107,8 +107,8 @@ def _cap(
 ) -> Cap | None:
     """Return the cap of a run, by --max-cost or by its study's budget; None: there is none.
 
-    In a ``live`` run it is also over the ledgers of sweeps that share it, and over others of this
-    study: it was run before its file had a budget, or has none any more.
+    In a ``live`` run it also covers the ledgers of sweeps that share it, and other ledgers of this
+    study: from before its file had a budget, or since it has none.
     """
     ledger, study = plan.ledger, plan.study.name
     usd, source = options.max_cost_usd, "--max-cost"

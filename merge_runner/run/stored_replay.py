@@ -1,4 +1,4 @@
-"""The audit of a database: a replay, whose rows are compared with those that are stored.
+"""The audit of a database: a replay, whose rows are compared with the stored ones.
 
 The plan comes from the sweep's row, and the replies from the table ``calls`` or from a cache.
 """
@@ -78,7 +78,7 @@ ORDER BY started_at DESC, sweep_id DESC
 def audit_database(
     path: Path, sweep_ids: Sequence[str] | None = None, cache: Path | None = None
 ) -> list[Audit]:
-    """Audit every sweep, oldest first, and then what belongs to none; or some sweeps alone.
+    """Audit every sweep, oldest first, and then the orphan rows; or some sweeps alone.
 
     A trial that several sweeps have is audited with the newest of them. The replies are those of
     the folder ``cache``, if it is named, and are compared with the stored ones. Raises UsageError.
@@ -102,7 +102,7 @@ def audit_database(
 def refuse_changed_programs(path: Path, plan: Plan, stored: Sequence[TrialSpec]) -> None:
     """Raise UsageError where a program drives otherwise than in a stored trial of its revision.
 
-    Of each spec with a program one trial is played, by the stored replies.
+    One trial of each spec with a program is played, by the stored replies.
     """
     arms = plan.by_label()
     programs = {name: sorted({*arm.asked.values()} - {*arm.entries}) for name, arm in arms.items()}
@@ -255,7 +255,7 @@ class StoredReplies:
     rows: list[dict[str, Any]] = field(init=False)
 
     def in_recording(self, _: str) -> bool:
-        """Replies of a database are of none."""
+        """Return False: a database is no recording."""
         return False
 
     def get(self, key: str, _: ChatRequest | None = None) -> CachedCall | None:
@@ -307,7 +307,7 @@ def _attempt(number: int, row: Mapping[str, Any], form: WireFormat) -> Attempt:
         if isinstance(text := json.loads(body), str):
             body = text  # a body that is no JSON is stored as a JSON string
     names = ("outcome", "http_status", "model_served", "finish_reason", "error", "scripted")
-    usage = Usage(*(row[each.name] for each in fields(Usage)))
+    usage = Usage(*(row[count.name] for count in fields(Usage)))
     attempt = Attempt(number, **{name: row[name] for name in names}, usage=usage, reply=body)
     outcome = judge(RawReply(attempt.http_status or 0, {}, body or ""), form)
     if outcome.action != "accept" and attempt.outcome not in ANSWERS:

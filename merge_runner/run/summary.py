@@ -40,8 +40,8 @@ def as_dict(
 ) -> dict[str, Any]:
     """Return the summary as JSON values; ``expected`` is the estimate before the run, if any.
 
-    ``checked`` are the facts of the database and their audit. From ``decisions`` on, values are
-    there where anything is stored. ``ended_with`` goes into it as it is.
+    ``checked`` are the facts of the database and their audit; without them the values from
+    ``decisions`` on are left out. ``ended_with`` is added unchanged.
     """
     plan, spending, meter = progress.plan, progress.ledger.spending, progress.meter()
     playing_s = ((progress.ended_at or progress.began_at) - progress.began_at).total_seconds()
@@ -117,7 +117,7 @@ def as_lines(summary: dict[str, Any]) -> Iterator[str]:
 
 
 def _results(summary: dict[str, Any]) -> Iterator[str]:
-    """Yield how the trials ended, or the first decisions."""
+    """Yield the outcomes of the trials, or their first decisions."""
     if looks := summary["first_looks"]:
         yield as_table(looks)
     else:
@@ -132,7 +132,7 @@ def _results(summary: dict[str, Any]) -> Iterator[str]:
 
 
 def _outcomes(summary: dict[str, Any]) -> str:
-    """Return how the stored trials ended, in one line."""
+    """Return the outcomes of the stored trials, in one line."""
     rows = {(row["factor"], row["level"]): row for row in summary["outcomes_by_level"]}
     whole = dict(rows.get(("condition", "all"), {"trials": 0}))
     trials, planned = whole.pop("trials"), summary["trials"]["planned"]
@@ -149,9 +149,9 @@ def _outcomes(summary: dict[str, Any]) -> str:
 
 
 def calls_text(live: int, cached: int, shared: int, recorded: int) -> str:
-    """Return how many calls were asked, and how many had an answer.
+    """Return the numbers of calls that were sent, and that were answered without a request.
 
-    Of these ``shared`` ones got it in this run, and ``recorded`` ones from a recording that was
+    Of the latter ``shared`` were answered in this run, ``recorded`` by a recording that the user
     named.
     """
     parts = {

@@ -47,12 +47,12 @@ async def play(
     agree: Callable[[Estimate], None],
     stopping: Stopping = NEVER,
 ) -> dict[str, Any]:
-    """Play what is not stored yet of a plan, and return the summary (``summary.as_dict``).
+    """Play the trials of a plan that are not stored yet; return ``summary.as_dict``.
 
-    A replay without a recording, or replies of the models in the cache, is of the recording that
-    ships with the program; one that is not ``whole`` plays what its recordings hold. ``agree`` gets
-    an estimate before money is spent, and raises where it is not to be. ``stopping`` says who stops
-    it; a task that is cancelled saves what is paid for before it ends. Raises UsageError.
+    A replay uses the recording that ships with the program if no other is named and the cache has
+    no replies of the models; unless it is ``whole``, it plays only the trials of its recordings.
+    ``agree`` gets an estimate before money is spent, and raises to prevent that. ``stopping`` gives
+    the events that stop the run; a cancelled task saves paid replies first. Raises UsageError.
     """
     if options.replay:
         shipped = SHIPPED_RECORDINGS / f"{plan.model}-{plan.study.name}.parquet"
@@ -79,7 +79,7 @@ async def play(
 async def run(
     session: Session, expected: Estimate | None = None, stopping: Stopping = NEVER
 ) -> dict[str, Any]:
-    """Play what is missing and store it; what goes wrong is in the summary.
+    """Play and store the missing trials; return the summary, with all problems.
 
     ``expected`` is an estimate that the user has agreed to.
     """
@@ -131,9 +131,9 @@ def _progress(session: Session, player: Player, rounds: Rounds | None = None) ->
 
 
 async def estimate_rest(session: Session, *, whole: bool = False) -> Estimate:
-    """Return what a live run takes: play from recorded replies, and count what is missing.
+    """Return the estimate of a live run: replay recorded replies, and count the missing ones.
 
-    ``whole``: what all trials take, as if none were stored or recorded yet.
+    ``whole``: of all trials, as if none were stored or recorded yet.
     """
     plan, options, cache = session.plan, session.options, session.cache
     trials, arms = 0, plan.by_label()
@@ -169,7 +169,7 @@ async def estimate_rest(session: Session, *, whole: bool = False) -> Estimate:
 async def unsent(
     plan: Plan, options: Options, *, say: Callable[[str], None], whole: bool = False
 ) -> Estimate:
-    """Return what a run would still have to ask; make no database or cache that is not there.
+    """Return the estimate of a run, without creating a database or a cache.
 
     ``whole``: as if nothing were stored or recorded.
     """
@@ -184,7 +184,7 @@ async def unsent(
 
 
 def _has_replies(cache: ResponseCache, plan: Plan) -> bool:
-    """Return whether a model of a plan is recorded, or it has none; damaged replies may be its."""
+    """Return whether a plan's models are recorded; True for damaged replies, or without a model."""
     models = {entry.id or UNNAMED for entry in plan.entries.values()}
     _, counts = answer_counts(cache)
     are_damaged = cache.number > sum(answers.answers for answers in counts.values())
@@ -192,9 +192,9 @@ def _has_replies(cache: ResponseCache, plan: Plan) -> bool:
 
 
 def _recorded_part(plan: Plan, recordings: Sequence[Path]) -> Plan:
-    """Return the part of a plan that recordings of the same sweep hold; all if they do not say.
+    """Return the part of a plan that recordings hold; all of it if they do not name a sweep.
 
-    A sweep's recording holds its first situations, too.
+    A sweep's recording also holds its first decisions.
     """
     names = {plan.study.name, plan.name}
     recorded = recorded_part(recordings, names, plan.model, plan.sample_set)

@@ -1,4 +1,4 @@
-"""The trials of a plan, and the interface of whatever plays them."""
+"""The trials of a plan, and the interface of their players."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Capacity = Callable[[], Awaitable[None]]
 
 
 class Player(Protocol):
-    """Plays trials: from recorded replies, in this process, or on a cluster.
+    """Player of trials: from recorded replies, in this process, or on a cluster.
 
     ``meters`` are by model.
     """
@@ -62,7 +62,7 @@ class Player(Protocol):
 
 
 class TrialMaker:
-    """Makes the trials of a plan."""
+    """Factory of the trials of a plan."""
 
     def __init__(self, plan: Plan) -> None:
         self.arms = plan.by_label()

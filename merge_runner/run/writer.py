@@ -30,7 +30,7 @@ AGAIN = (
 
 
 class Flusher:
-    """Collects ended trials and stores them about once a second.
+    """Buffer of ended trials, which are stored about once a second.
 
     While storing fails, trials beyond a batch are dropped and others are played; where storing is
     merely slow, new trials wait for it. ``dropped`` trials can be played again from the recorded
@@ -84,7 +84,7 @@ class Flusher:
     async def close(self) -> None:
         """Store the trials in memory, and leave the database reachable.
 
-        Waits for a program that holds it as long as that does; raises StoreError for anything else.
+        Waits as long as another program holds it; raises StoreError for anything else.
         More trials may be added later, and stored by the next call.
         """
         self._closing = True

@@ -52,7 +52,7 @@ def pointed(prepare, emulator_url, tmp_path_factory):
     without = prepare(folder, *sweep)
     assert without.code == 2
     assert "_API_KEY" in without.err
-    assert "`merge-runner sweep baseline` runs" in without.err
+    assert "`--model emulator` rehearses the study" in without.err
     unasked = prepare(folder, *sweep, **pointed_at(emulator_url))
     assert (unasked.code, "--yes" in unasked.err) == (2, True)
     run = prepare(folder, *sweep, "--yes", **pointed_at(emulator_url))

@@ -24,8 +24,7 @@ from merge_runner.llm.http_outcome import AttemptOutcome, judge
 from merge_runner.records import ChatRequest
 
 SHORTEST_POLL_S, LONGEST_POLL_S, POLL_SHARE = 0.25, 60.0, 0.1
-# Gateways keep requests, so a creation without a reply may take effect only after 30 s: the pauses
-# between the attempts to find it.
+# Pauses between the attempts to find a batch: a gateway may keep its creation for up to 30 s.
 ARRIVAL_S = (1.0, 1.0, 2.0, 4.0, 8.0, 14.0)
 # How long a creation is retried.
 OUTAGE_S = 600.0
@@ -36,7 +35,7 @@ T = TypeVar("T")
 
 @dataclass
 class Lifecycle:
-    """Submits the batches of a run and follows them to their end.
+    """Submission of the batches of a run, and their course up to the end.
 
     ``services`` has the batch modes by model, ``batches`` all that calls wait in, by mark.
     ``max_calls`` is set for a model after its provider has rejected a batch as too large; such a
@@ -53,7 +52,7 @@ class Lifecycle:
     def start(self, batch: Batch, requests: Sequence[BatchRequest] = ()) -> asyncio.Task[None]:
         """Submit requests, or resume a batch that an earlier run has noted; return the task.
 
-        What it raises is raised for all who wait for the batch.
+        An error of the task is raised for each call that waits for the batch.
         """
 
         async def work() -> None:
@@ -77,7 +76,7 @@ class Lifecycle:
             batch
             for batch in self.batches.values()
             if (work := batch.work) and model in (None, batch.note.model)
-            # One whose work was cancelled goes on without this run.
+            # A batch whose task was cancelled goes on at its provider.
             if work.cancelled() or not work.done()
         ]
 
@@ -85,12 +84,12 @@ class Lifecycle:
         """Begin the reservations and note the batch with the requests that have money."""
         begun = []
 
-        async def begin(each: BatchRequest) -> None:
+        async def begin(attempt: BatchRequest) -> None:
             try:
-                await each.reservation.begin(each.number)
-                begun.append(each.request)
+                await attempt.reservation.begin(attempt.number)
+                begun.append(attempt.request)
             except TrialSuspended as exc:
-                batch.refused[each.request.key] = exc
+                batch.refused[attempt.request.key] = exc
 
         await asyncio.gather(*map(begin, requests))
         await self._note(batch, lines={r.key: batch.note.lines[r.key] for r in begun})
@@ -159,7 +158,7 @@ class Lifecycle:
             self.max_calls[note.model] = max(self.max_calls[note.model], 2 * len(note.lines))
 
     async def _read(self, batch: Batch) -> None:
-        """Read the results of a batch; raise BatchFailed where there should be others."""
+        """Read the results of a batch; raise BatchFailed where results are missing."""
         note, service, broken = batch.note, self.services[batch.note.model], 0
         status = await service.status(note.batch_id)  # which may name more files than before
         async for key, raw in service.results(status.paths or []):
@@ -167,11 +166,11 @@ class Lifecycle:
             if raw:  # a rate limit would be that of batches: it pauses no normal request
                 outcome = replace(judge(raw, service.wire), pause=False, delay_s=None)
             broken += not key
-            if key in note.lines:  # others are of other batches; of two the first counts
+            if key in note.lines:  # others are of other batches; the first of two counts
                 batch.results.setdefault(key, outcome)
-        there = len(batch.results) + broken
-        if status.paths is None or there < min(status.results, len(note.lines)):
-            raise BatchFailed("again", f"{there} of the {status.results} results are there")
+        number = len(batch.results) + broken
+        if status.paths is None or number < min(status.results, len(note.lines)):
+            raise BatchFailed("again", f"{number} of the {status.results} results are there")
 
     async def _on_rejected(self, batch: Batch, exc: BatchFailed, outcome: str) -> None:
         """End a batch that was not processed, or let its requests go in smaller ones."""

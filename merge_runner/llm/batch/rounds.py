@@ -25,11 +25,11 @@ from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.http_outcome import AttemptOutcome
 from merge_runner.records import ChatRequest
 
-# Poll interval of the idle check: what it sees decides, not the time.
+# Poll interval of the idle check: only idleness closes a round, never the time.
 IDLE_POLL_S = 0.05
 # Turns of the event loop in each check, so that runnable tasks can submit first.
 IDLE_TURNS = 5
-# Fewer than any provider takes: one batch that is lost or late concerns no more calls.
+# Below the limit of every provider, so that a lost or late batch concerns few calls.
 MAX_CALLS = 5_000
 
 
@@ -110,7 +110,7 @@ class Rounds:
         ]
 
     async def close(self) -> None:
-        """Cancel the waiting; batches that are being created get their ids noted first."""
+        """Cancel all waiting; the ids of batches that are being created are noted first."""
         work = [batch.work for batch in self.batches.values() if batch.work]
         for task in work:
             task.cancel()
@@ -131,11 +131,11 @@ class Rounds:
         return await batch
 
     def _close_round(self) -> None:
-        """Submit what has gathered, in batches of a model."""
+        """Submit the gathered requests in batches, each of one model."""
         by_model: defaultdict[str, list[BatchRequest]] = defaultdict(list)
-        for each in self._forming:
-            if not each.batch.done():  # its call is not given up
-                by_model[each.model].append(each)
+        for attempt in self._forming:
+            if not attempt.batch.done():  # its call is not given up
+                by_model[attempt.model].append(attempt)
         self._forming = []
         max_calls = self._lifecycle.max_calls
         for model, requests in by_model.items():
@@ -153,9 +153,9 @@ class Rounds:
             model=model,
             number=next(self._numbers),
             submitted_at=datetime.now(UTC),
-            lines={each.request.key: each.number for each in requests},
+            lines={attempt.request.key: attempt.number for attempt in requests},
         )
         batch = self.batches[note.mark] = Batch(note)
         self._lifecycle.start(batch, requests)
-        for each in requests:
-            each.batch.set_result(batch)
+        for attempt in requests:
+            attempt.batch.set_result(batch)

@@ -12,7 +12,7 @@ from merge_runner.llm.sender import Sent
 
 @dataclass(slots=True)
 class BatchSender:
-    """Sends attempts of a model, by its name in the registry, in the rounds of a run."""
+    """Sender of attempts of a model, by its name in the registry, in the rounds of a run."""
 
     rounds: Rounds
     model: str
@@ -31,7 +31,7 @@ class BatchSender:
             call.earlier = len(call.attempts)
 
     async def send(self, call: Call, reservation: Reservation) -> Sent:
-        """Wait for the outcome of a call in its batch or in the next round; see ``Sender``."""
+        """Wait for the outcome of a call in its batch or in the next round."""
         call.wait = Wait(f"for batches of {self.model}", blocked=True, charged=True)
         number = len(call.attempts) + 1
         outcome, batch = await self.rounds.outcome_of(

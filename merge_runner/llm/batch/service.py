@@ -75,8 +75,8 @@ class BatchService(ABC):
     A mark is our name of a batch at its provider. Without one (``takes_mark``) a batch whose id was
     lost cannot be found. Batches are listed at ``path``, in pages by the query ``pages``, and
     ``cursor`` for the next one. A page has its batches in ``list_member``, each with its mark in
-    ``mark_member`` of its metadata, and the cursor of the next page in ``next_member``. A line is
-    made by ``template``, with the key of its request: 64 hexadecimal digits, Anthropic's maximum.
+    ``mark_member`` of its metadata, and the cursor of the next page in ``next_member``. A request
+    is a line by ``template``, with its key: 64 hexadecimal digits, Anthropic's maximum.
     """
 
     template: ClassVar[str]
@@ -104,7 +104,7 @@ class BatchService(ABC):
         return line.encode()
 
     async def _upload(self, content: bytes, mark: str) -> str:
-        return ""  # the creation contains the lines, or else the file that this names
+        return ""  # the creation contains the requests; else this is the id of their file
 
     @abstractmethod
     def _creation(self, requests: Sequence[ChatRequest], file: str, mark: str) -> tuple[str, bytes]:

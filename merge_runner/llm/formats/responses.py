@@ -51,10 +51,10 @@ class OpenAIResponses(WireFormat):
         items = as_dicts(payload.get("output"))
         messages = [item for item in items if item.get("type") == "message"]
         final = [item for item in messages if item.get("phase") != "commentary"]
-        beside = [item for item in messages if item.get("phase") == "commentary"] if final else []
+        comments = [item for item in messages if item.get("phase") == "commentary"] if final else []
         parts = [part for item in final or messages for part in as_dicts(item.get("content"))]
         text = joined(part for part in parts if part.get("type") == "output_text")
-        reasoned = [item for item in items if item.get("type") == "reasoning"] + beside
+        reasoned = [item for item in items if item.get("type") == "reasoning"] + comments
         members = (item.get(name) for item in reasoned for name in ("summary", "content"))
         thoughts = [joined(as_dicts(member)) for member in members]
         refusal = joined((part for part in parts if part.get("type") == "refusal"), "refusal")

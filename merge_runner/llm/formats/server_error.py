@@ -75,9 +75,9 @@ def is_per_day(error: ServerError) -> bool:
 
 
 def known_meaning(error: ServerError) -> str | None:
-    """Return the meaning of an error of one of the four services; see ``WireFormat.meaning``.
+    """Return the meaning of an error of one of the four services, as ``WireFormat.meaning`` does.
 
-    An added format has its own: it must not change how the replies of others are read.
+    The format of a plug-in defines its meanings itself, and so changes no other format's replies.
     """
     names, words = error.names, error.message
     violations = [v for detail in error.details for v in as_dicts(detail.get("violations"))]
@@ -91,10 +91,10 @@ def known_meaning(error: ServerError) -> str | None:
         # OpenRouter's lack of credit while other requests run: transient.
         (402, in_flight, "rate_limited"),
         (error.status, bool(names & QUOTA), "quota_exhausted"),
-        *((each, SPENT.search(words), "quota_exhausted") for each in (400, 403, 429)),
+        *((code, SPENT.search(words), "quota_exhausted") for code in (400, 403, 429)),
         # Gemini's daily quota has the message of one per minute, but is not transient.
         (429, per_day or is_per_day(error), "quota_exhausted"),
-        *((each, "model_not_found" in names, "unknown_model") for each in (400, 401, 403, 404)),
+        *((code, "model_not_found" in names, "unknown_model") for code in (400, 401, 403, 404)),
         (429, words.startswith("Request too large"), "request_too_large"),
         (400, "API_KEY_INVALID" in names, "not_allowed"),
     )

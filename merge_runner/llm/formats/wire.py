@@ -65,8 +65,8 @@ class Reading:
 class WireFormat(ABC):
     """A format of requests and replies.
 
-    ``meaning`` and ``delay_s`` return None for what is the same for all formats: gateways pass on
-    the errors of others, whatever format they speak themselves.
+    ``meaning`` and ``delay_s`` return None for errors that are read alike for all formats: gateways
+    pass on the errors of others, whatever format they speak themselves.
     """
 
     parameters: ClassVar[Mapping[str, tuple[str, ...]]] = {}
@@ -76,7 +76,7 @@ class WireFormat(ABC):
     headers: ClassVar[Mapping[str, str]] = {}
     """Headers of all requests to a batch mode that change their meaning."""
     retries_empty: ClassVar[bool] = False
-    """Whether an empty answer is a known transient fault of the service."""
+    """True if an empty answer is a known transient fault of the service."""
 
     @abstractmethod
     def request(self, entry: ModelEntry, prompt: str) -> WireRequest:

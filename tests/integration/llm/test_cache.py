@@ -543,7 +543,7 @@ def test_an_overlay_answers_before_the_folder_is_read_once_where_needed_and_neve
 def test_calls_are_counted_by_kind_once_whichever_process_kept_them(cache, other, monkeypatch):
     tokens = Usage(input_tokens=100, output_tokens=7)
     first = [entry(n, endpoint=server, usage=tokens) for n in (1, 2) for server in "ab"]
-    cache.put_now(first, tried=[(entry(9).request.key, (Attempt(1, "timeout"),))])
+    cache.put_now(first, unanswered=[(entry(9).request.key, (Attempt(1, "timeout"),))])
     assert templates.answer_counts(other) == templates.answer_counts(cache) == ({}, counted(first))
     # A reply takes the place of what was tried last, which no longer has a row.
     later = [entry(9), entry(3, usage=tokens), entry(4, scripted=True)]
@@ -554,7 +554,7 @@ def test_calls_are_counted_by_kind_once_whichever_process_kept_them(cache, other
         == templates.answer_counts(other)
         == ({}, counted([*first, *later]))
     )
-    assert [template.own for template in counted(later)] == [True, True, False]
+    assert [template.genuine for template in counted(later)] == [True, True, False]
     monkeypatch.setattr(CachedCall, "from_json", lambda text: pytest.fail("it is read again"))
     assert templates.answer_counts(cache) == ({}, counted([*first, *later]))
 
