@@ -1,6 +1,6 @@
 """Results as data frames: single queries, and all that a study reads, in one opening of its file.
 
-A query that a single table, page or statistic needs stands beside it.
+A query that a single table, page or statistic needs is beside it.
 """
 
 from __future__ import annotations
@@ -175,12 +175,12 @@ class Studies(NamedTuple):
     def holds(self, study: str, frame: pd.DataFrame) -> pd.Series:
         """Return which rows of a frame are of trials that were played for a study."""
         members = self.trials.loc[self.trials["study"] == study, KEYS]
-        held = pd.MultiIndex.from_frame(frame[KEYS]).isin(pd.MultiIndex.from_frame(members))
-        return pd.Series(held, index=frame.index)
+        is_member = pd.MultiIndex.from_frame(frame[KEYS]).isin(pd.MultiIndex.from_frame(members))
+        return pd.Series(is_member, index=frame.index)
 
 
 class Frames(NamedTuple):
-    """What a study reads of its database: nobody writes there until all of it is read."""
+    """Rows that a study reads of its database, while nobody writes there."""
 
     trials: pd.DataFrame
     """TRIALS and TRACES with a column for each metric, and whether they collided."""
@@ -190,7 +190,7 @@ class Frames(NamedTuple):
     """By their hashes."""
     studies: Studies
     calls: pd.DataFrame
-    """CALLS: what became of the calls, by trial."""
+    """CALLS: outcomes of the calls, by trial."""
     decisions: pd.DataFrame
     """ASKED_DECISIONS: how many are invalid, by trial and model."""
     levels: pd.DataFrame

@@ -1,4 +1,4 @@
-"""Where the results come from: sweeps, specs, what the calls came to, and what they cost."""
+"""Origin of the results: sweeps, specs, outcomes and costs of the calls."""
 
 from __future__ import annotations
 
@@ -76,10 +76,10 @@ WHERE source <> 'human' GROUP BY ALL ORDER BY ALL
 
 
 class Provenance(NamedTuple):
-    """What the report says about the origin of its numbers: rows of the queries here.
+    """Origin of the report's numbers: rows of the queries here.
 
     By driver, variant and spec_hash ``settings`` are the collision rule, what else of the driving
-    task differs from the defaults, and what was sent to the models beside the prompt.
+    task differs from the defaults, and the request parameters of the models.
     """
 
     sweeps: pd.DataFrame
@@ -132,7 +132,7 @@ def tally(study: Study, group: Group) -> Counter[str]:
 
 
 def _settings(spec: Mapping[str, Any]) -> Iterator[str]:
-    """The settings of a driving task, and the parameters of the models on each side of it.
+    """Yield the settings of a driving task, and the parameters of the models on each side of it.
 
     A spec is made with an empty prompt, by which that is known in any format.
     """

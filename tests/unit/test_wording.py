@@ -26,6 +26,14 @@ CHECKED = (
             *("trial", "trial_records"),
         )
     ),
+    *(
+        f"analysis/merge_runner_analysis/{name}"
+        for name in ("figures", "humans", "published", "stats", "tables")
+    ),
+    *(
+        f"analysis/merge_runner_analysis/{path.name}"
+        for path in (PROJECT / "analysis/merge_runner_analysis").glob("*.py")
+    ),
 )
 # Everyday words in place of terms, and relative clauses in place of nouns.
 PHRASES = re.compile(

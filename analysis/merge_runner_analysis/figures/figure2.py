@@ -134,7 +134,7 @@ COLUMNS: dict[Summary, str] = {left_first: "merged_first", gap: "gap_m", deviati
 
 
 def points(group: Group, velocity_mps: float, summary: Summary) -> Points:
-    """A summary of the finished trials of each condition with this velocity, by headway in m."""
+    """Return a summary by headway in m of the finished trials with this velocity."""
     return _points(group, summary).get(velocity_mps, [])
 
 
@@ -155,7 +155,7 @@ def _points(group: Group, summary: Summary) -> dict[float, Points]:
 
 @remembered
 def _played(study: Study, group: Group) -> Group:
-    """The group in the conditions of the study: humans drove in others, too."""
+    """Return the group in the conditions of the study: humans drove in others, too."""
     return group.part(lambda trials: trials["condition"].isin(study.conditions))
 
 
@@ -177,11 +177,11 @@ def left_traces(study: Study, group: Group, first: str) -> dict[float, list[Arra
 
 
 def published_gap_line(velocity_mps: float) -> tuple[Array, Array]:
-    """The human regression of the gap as the paper prints it: headways and gaps in m.
+    """Return the human regression of the gap as the paper prints it: headways and gaps in m.
 
     The line spans the headways of the humans' conditions, whatever other conditions were driven.
     """
-    farthest_m = max(abs(one.projected_headway_m) for one in HUMAN_CONDITIONS.values())
+    farthest_m = max(abs(condition.projected_headway_m) for condition in HUMAN_CONDITIONS.values())
     headway = np.linspace(-farthest_m, farthest_m, 81)
     terms = published("paper_gap").query("driver == 'human'")["b"].to_numpy(float)
     return headway, gap_design(headway, np.full_like(headway, velocity_mps)) @ terms
@@ -209,12 +209,12 @@ def _draw_traces(axis: Axes, study: Study, group: Group, first: str, styles: Sty
 
 
 def _draw_estimates(axis: Axes, group: Group, summary: Summary, styles: Styles) -> None:
-    found = [points(group, velocity, summary) for velocity in styles]
-    for index, (part, look) in enumerate(zip(found, styles.values(), strict=True)):
+    series = [points(group, velocity, summary) for velocity in styles]
+    for index, (part, look) in enumerate(zip(series, styles.values(), strict=True)):
         draw_points(axis, part, 0.3 * (index - (len(styles) - 1) / 2), look)
     if summary is gap and not group.measured:
         _draw_humans(axis, group, summary, styles, "--")
-    elif not any(found):
+    elif not any(series):
         _say(axis, "no such trial" if group.measured else MISSING)
 
 
@@ -224,13 +224,13 @@ def _say(axis: Axes, text: str) -> None:
 
 
 def _draw_humans(axis: Axes, human: Group, summary: Summary, styles: Styles, dashes: str) -> None:
-    """The humans as lines, of gaps before an import as the paper's regression has them."""
+    """Draw the humans as lines; before an import gaps follow the paper's regression."""
     for velocity in {*styles} & {*HUMAN_VELOCITIES_MPS}:
         if summary is gap and not human.measured:
             x, y = published_gap_line(velocity)
         else:
-            found = [(x, one.value) for x, one in points(human, velocity, summary)]
-            x, y = np.array(found, dtype=float).reshape(-1, 2).T
+            means = [(x, estimate.value) for x, estimate in points(human, velocity, summary)]
+            x, y = np.array(means, dtype=float).reshape(-1, 2).T
         axis.plot(x, y, color=styles[velocity]["color"], ls=dashes, lw=0.8)
 
 
@@ -242,10 +242,13 @@ def _scale(axes: NDArray[np.object_], groups: list[Group], study: Study) -> None
     axes[0, 2].set(ylim=(-0.08, 1.08), yticks=[0, 0.5, 1])
     velocities = {velocity for _, velocity in study.conditions.values()}
     for axis, summary in zip(axes[0, 3:], (gap, deviation), strict=True):
-        found = [one for g in groups for v in velocities for _, one in points(g, v, summary)]
-        if not found:
+        estimates = [
+            estimate for g in groups for v in velocities for _, estimate in points(g, v, summary)
+        ]
+        if not estimates:
             continue
-        frame = pd.DataFrame([(one.value, one.low, one.high) for one in found], dtype=float)
+        ends_of = [(estimate.value, estimate.low, estimate.high) for estimate in estimates]
+        frame = pd.DataFrame(ends_of, dtype=float)
         single = pd.concat([g.finished[COLUMNS[summary]] for g in groups if g.measured])
         ends = frame[1].quantile(1 - SHOWN), frame[2].quantile(SHOWN)
         values = [*frame[0], max(ends[0], single.min()), min(ends[1], single.max())]

@@ -53,14 +53,14 @@ TESTED = {
 
 
 class Judgement(NamedTuple):
-    """Whether an indicator holds; None where the data cannot tell, for the reason ``why``."""
+    """Verdict on an indicator: ``passed`` is None where the data cannot tell, for ``why``."""
 
     passed: bool | None
     why: Fact | None = None
 
 
 def disagree(first: Judgement, second: Judgement) -> bool:
-    """Whether one says that an indicator holds and the other that it does not."""
+    """Return whether one judgement passed and the other did not."""
     return None not in {first.passed, second.passed} and first.passed != second.passed
 
 
@@ -113,7 +113,7 @@ def mean_gain(study: Study, group: Group) -> Estimate:
 
 
 def less_humans(study: Study, group: Group) -> Estimate | None:
-    """The mean gain less that of humans in the same conditions, in human standard deviations.
+    """Return the mean gain less that of humans in equal conditions, in human standard deviations.
 
     None for the humans, and without a spread of human trials in every condition.
     """
@@ -123,7 +123,7 @@ def less_humans(study: Study, group: Group) -> Estimate | None:
 
 
 def likeness(driver: pd.DataFrame, human: pd.DataFrame) -> Estimate:
-    """The difference between rows of ``gains``, with Welch's interval over trials and pairs.
+    """Return the difference between rows of ``gains``, with Welch's interval over trials and pairs.
 
     The standard deviation is that of human trials within conditions.
     """
@@ -213,7 +213,7 @@ def ceiling(sizes: tuple[int, ...]) -> dict[str, dict[str, float]]:
 
 
 def total(judged: dict[str, Judgement]) -> str | None:
-    """How many indicators hold by one rule, ``3 of 4``; None where none can be judged."""
+    """Return how many indicators hold, ``3 of 4``; None where none can be judged."""
     known = [verdict.passed for verdict in judged.values() if verdict.passed is not None]
     return f"{sum(known)} of {len(known)}" if known else None
 

@@ -124,7 +124,7 @@ class Counts:
         return likelihood, p, weights, information
 
     def penalised(self, b: Array) -> Penalised:
-        """Return what is known of the penalised log-likelihoods at ``b``, (starts, terms).
+        """Return the penalised log-likelihoods at ``b``, (starts, terms), with their derivatives.
 
         Firth's score adds to each residual the leverage times (1/2 - p): as if each trial were
         split, and half of its leverage had gone either way (Heinze and Schemper 2002).
@@ -237,11 +237,11 @@ class Fit:
         of such coefficients, and of all, those nearest to the fit by its information. The latter
         are also scaled, down to 0, where the likelihood is always known.
         """
-        held = np.eye(len(self.b))[[] if term is None else [term]]
+        fixed = np.eye(len(self.b))[[] if term is None else [term]]
         pairs = self.counts.design[[*combinations(range(len(self.counts.design)), 2)]]
-        even = np.concatenate([np.broadcast_to(held, (len(pairs), *held.shape)), pairs], axis=1)
-        values = np.array([value] * len(held) + [0.0, 0.0])
-        nearest = self._nearest(held[None], values[: len(held)])
+        even = np.concatenate([np.broadcast_to(fixed, (len(pairs), *fixed.shape)), pairs], axis=1)
+        values = np.array([value] * len(fixed) + [0.0, 0.0])
+        nearest = self._nearest(fixed[None], values[: len(fixed)])
         starts = np.vstack([np.outer(SCALES, nearest), self._nearest(even, values)])
         if term is not None:
             starts[:, term] = value
@@ -383,13 +383,13 @@ def gap_data(trials: pd.DataFrame, measure: str = "gap_m") -> tuple[Array, Array
 
 
 def gap_design(headway_m: Array, velocity_mps: Array) -> Array:
-    """The regressors of the gap: intercept, |h|, |dv| and the signed product h*dv."""
+    """Return the regressors of the gap: intercept, |h|, |dv| and the signed product h*dv."""
     columns = (np.ones(len(headway_m)), np.abs(headway_m), np.abs(velocity_mps))
     return np.column_stack([*columns, headway_m * velocity_mps])
 
 
 def equivalence_p(b: float, se: float, freedom: float) -> float:
-    """The p-value of |difference| < GAP_MARGIN_M, by two one-sided t tests (Schuirmann 1987).
+    """Return the p of |difference| < GAP_MARGIN_M by two one-sided t tests (Schuirmann 1987).
 
     It is the larger of the two, that against the nearer margin. A difference without an error, as
     of a driver without spread, is sure: it lies within the margin or it does not.
@@ -413,7 +413,7 @@ def who_first_logit(trials: pd.DataFrame) -> Regression:
 
 
 def who_first_firth(trials: pd.DataFrame, less: pd.DataFrame | None = None) -> Regression:
-    """The same by Firth's penalised likelihood (1993), which is finite under separation.
+    """Return the same by Firth's penalised likelihood (1993), which is finite under separation.
 
     Its tests are penalised likelihood ratios (Heinze and Schemper 2002). With other trials its
     terms are the coefficients ``less`` theirs, of one model of both in which every term may differ.
@@ -472,7 +472,7 @@ def gap_ols(trials: pd.DataFrame, measure: str = "gap_m", *, robust: bool = Fals
 def by_pairs(
     fit: Callable[[pd.DataFrame], Regression], trials: pd.DataFrame, measure: str
 ) -> Regression:
-    """A fit to those trials that have the measure, with errors clustered by human pair.
+    """Return a fit to those trials that have the measure, with errors clustered by human pair.
 
     Errors are a jackknife over the pairs (CV3 of MacKinnon, Nielsen and Webb 2023), whose
     correction holds for as few clusters as there are; tests are t on pairs - 1 degrees of freedom.

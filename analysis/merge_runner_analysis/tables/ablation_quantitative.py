@@ -33,7 +33,7 @@ def ablation_quantitative(study: Study) -> Table:
 
 
 def metric_table(name: str, groups: list[Group], place: str, *notes: str) -> Table:
-    """A row for each group, with the metrics that a place of ``metrics.SHOWN`` has."""
+    """Return a row for each group, with the metrics that a place of ``metrics.SHOWN`` has."""
     metrics = shown_in(place)
     columns = [*GROUP_COLUMNS, Column("n", "n", "count", "trials that ended")]
     for metric in metrics:

@@ -1,4 +1,4 @@
-"""What became of the calls: retried, lost, unusable, or replaced by an older plan."""
+"""Outcomes of the calls: retried, lost, unusable, or replaced by an older plan."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SHARES = {"retried", "lost", *FAILURES, "invalid", NO_DECISION, "fallback"}
 
 
 def attempts(study: Study) -> Table:
-    """A row per driver and variant: trials, calls, attempts, and what went wrong with them."""
+    """Return a row per driver and variant: trials, calls, attempts, and failures."""
     tallies = {group: tally(study, group.stored) for group in study.played}
     known = {"answers", "decisions", *MEANINGS, *FAILURES.values()}
     reasons = dict.fromkeys(name for of in tallies.values() for name in sorted({*of} - known))

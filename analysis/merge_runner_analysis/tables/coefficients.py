@@ -1,4 +1,4 @@
-"""What the tables of regressions have in common: a row for each term, driver and fit."""
+"""Rows of the regression tables: one for each term, driver and fit."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ BY_PAIR = ", errors by pair"
 
 
 def row_of_term(group: Group, term: str, fit: Fit, rests_on: str, note: object = "") -> Row:
-    """The row of a term by one of a group's fits, of the trials with a value in this column."""
+    """Return a term's row by one of a group's fits to the trials with a value in this column."""
     item, label, regressions = fit
     values: dict[str, Value] = {
         "term": TERM_NAMES[term],
@@ -62,7 +62,7 @@ def row_of_term(group: Group, term: str, fit: Fit, rests_on: str, note: object =
 
 
 def mixed_note(study: Study, table: str, model: str) -> Iterator[str]:
-    """A note with the published mixed model, for comparison with the human rows."""
+    """Yield a note with the published mixed model, for comparison with the human rows."""
     if study.human in study.groups:
         values = "; ".join(
             f"{TERM_NAMES[row.term]} {row.estimate:g} (SE {row.std_error:g})"
