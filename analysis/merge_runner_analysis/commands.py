@@ -135,12 +135,12 @@ def tables(
     else:
         from merge_runner_analysis.study import Study
         from merge_runner_analysis.tables.against import PAPER
-        from merge_runner_analysis.tables.against import against as beside
+        from merge_runner_analysis.tables.against import against as with_paper
 
         if against != PAPER:
             raise UsageError(f"--against {against}: valid is {PAPER}")
         study = Study(db, selection)
-        made = [beside(table, study) for table in finished_tables(db, names or (), study)]
+        made = [with_paper(table, study) for table in finished_tables(db, names or (), study)]
     width = None if wide else terminal_width()
     print_out(render(made, TableFormat.JSON if as_json else output, width))
 

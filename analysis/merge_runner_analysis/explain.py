@@ -182,7 +182,6 @@ def _specs(group: Group) -> list[str]:
 
 
 def _query(group: Group, trials: Sequence[str]) -> str:
-    """Return the query that lists trials of a group; empty for none."""
     specs = _specs(group)
     named = QUERY.format(specs=", ".join(map(quoted, specs)), trials=", ".join(map(quoted, trials)))
     return named if trials else ""

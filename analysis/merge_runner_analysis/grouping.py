@@ -177,7 +177,7 @@ def of_trials(frame: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
 
 @cache
 def _published_humans() -> Group:
-    """One object for all studies: what is computed from it is computed once."""
+    """Return one object for all studies, so that results are computed once."""
     outcomes = outcomes_with_metrics()
     return Group(
         name=HUMAN, driver=HUMAN, label=HUMAN, models=(HUMAN,), trials=outcomes,
@@ -349,7 +349,7 @@ def _distinct(group: Group, *, programs: bool, scripted: bool) -> Group:
 
 
 def _marks(keyed: pd.DataFrame, within: list[str], what: str) -> pd.Series:
-    """`` [mark]`` for all but the most frequent value of ``what`` within equal names."""
+    """Return `` [mark]`` for all but the most frequent value of ``what`` within equal names."""
     sizes = keyed.groupby([*within, what])[what].transform("size")
     ordered = keyed.assign(rarity=-sizes).sort_values(["rarity", what])
     usual = ordered.groupby(within)[what].transform("first").reindex(keyed.index)

@@ -380,7 +380,6 @@ def _part(values: Values) -> str:
 
 
 def _more(values: Values) -> str:
-    """Return in which direction a driver differs from people: ``more`` or ``less``."""
     apart = values.get("difference")
     apart = values.get("estimate") if apart is None else apart
     return "more" if (apart or 0.0) > 0 else "less"
@@ -409,7 +408,6 @@ def crashes(values: Values) -> str:
 
 
 def _percent(collisions: Values, count: int) -> float:
-    """Return a count of trials in percent of all that ended, with the undecided ones."""
     ended = _ended(collisions)
     return 100 * count / ended if ended else 0.0
 
@@ -575,7 +573,6 @@ def _ended(collisions: Values) -> int:
 
 
 def _finished(verdicts: Mapping[str, Values]) -> int:
-    """Return the number of trials that finished: each of them has a gap."""
     return verdicts["gap"]["n"] or 0
 
 
@@ -630,7 +627,7 @@ def difference_sentence(values: Values, it: str) -> str:
 
 
 def with_interval(value: float | None, ci: Sequence[float] | None) -> str:
-    """``68.18 [47.32, 83.64]``; an en dash where there is no value."""
+    """Return ``68.18 [47.32, 83.64]``, or an en dash without a value."""
     return number(value) if value is None else f"{number(value)} {brackets(ci)}".rstrip()
 
 
@@ -640,7 +637,7 @@ def number(value: float | None, decimals: int = DECIMALS, unit: str = "") -> str
 
 
 def brackets(ci: Sequence[float] | None, form: Callable[[float], str] = number) -> str:
-    """``[47.32, 83.64]``, or nothing."""
+    """Return ``[47.32, 83.64]``, or nothing."""
     return "" if ci is None else f"[{', '.join(map(form, ci))}]"
 
 
@@ -657,7 +654,7 @@ def p_value(p: float | None) -> str:
 
 
 def equal_p(p: float) -> str:
-    """``= 0.012``, or that it is smaller."""
+    """Return ``= 0.012``, or ``< 0.001``."""
     text = p_value(p)
     return f"< {text[1:]}" if text.startswith("<") else f"= {text}"
 

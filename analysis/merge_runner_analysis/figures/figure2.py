@@ -113,18 +113,18 @@ def figure2(study: Study, chosen: list[Group]) -> Figure:
 
 
 def left_first(merged_first: pd.Series) -> Estimate:
-    """Panel C: how often the left vehicle merges first."""
+    """Return how often the left vehicle merges first (panel C)."""
     known = merged_first.dropna()
     return proportion(int((known == "left").sum()), len(known))
 
 
 def gap(gaps_m: pd.Series) -> Estimate:
-    """Panel D: mean gap in m."""
+    """Return the mean gap in m (panel D)."""
     return mean(gaps_m.to_numpy(float))
 
 
 def deviation(rmse_mps: pd.Series) -> Estimate:
-    """Panel E: mean RMSE of the speed in m/s, of a trial that of both vehicles; never below 0."""
+    """Return the mean RMSE of both vehicles' speeds in m/s, never below 0 (panel E)."""
     rmse = mean(rmse_mps.to_numpy(float))
     return rmse if rmse.low is None else replace(rmse, low=max(0.0, rmse.low))
 
@@ -161,7 +161,7 @@ def _played(study: Study, group: Group) -> Group:
 
 @remembered
 def left_traces(study: Study, group: Group, first: str) -> dict[float, list[Array]]:
-    """Panels A and B: times in s and left speeds in m/s, (n, 2), where ``first`` merged first.
+    """Return times in s and left speeds in m/s, (n, 2), where ``first`` merged first (A, B).
 
     By relative velocity. Of two different drivers the left one is the ego, as everywhere here.
     """
@@ -235,7 +235,7 @@ def _draw_humans(axis: Axes, human: Group, summary: Summary, styles: Styles, das
 
 
 def _scale(axes: NDArray[np.object_], groups: list[Group], study: Study) -> None:
-    """One scale per quantity: all values and lines, and intervals as far as single trials reach."""
+    """Set one scale per quantity: all values and lines, intervals as far as single trials reach."""
     speeds = [limit for axis in axes[0, :2] for limit in axis.get_ylim()]
     for axis in axes[0, :2]:
         axis.set_ylim(min(speeds), max(speeds))

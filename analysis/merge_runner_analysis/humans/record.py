@@ -196,7 +196,7 @@ def _arrival(positions_m: list[float]) -> float:
 
 
 def _states(trace: Trace) -> Iterator[StateRow]:
-    """Every sample; time 0 is the first with both vehicles out of their tunnels."""
+    """Yield every sample; time 0 is the first with both vehicles out of their tunnels."""
     places = zip(*trace.positions_m.values(), strict=True)
     out = (sample for sample, both in enumerate(places) if min(both) > TRACK.tunnel_exit_m)
     if (start := next(out, None)) is None:
@@ -220,7 +220,7 @@ def condition_of(name: str) -> str | None:
 
 
 def trials_of(page: bytes, condition: str) -> Iterator[tuple[int, int, Lines]]:
-    """Experiment, iteration and both lines of each trial; raises Unreadable for a whole page."""
+    """Yield each trial's experiment, iteration and lines; raises Unreadable for a whole page."""
     trials: dict[tuple[int, int], Lines] = {}
     try:
         # The page holds all of Plotly before the last plot, whose lines are its first list.

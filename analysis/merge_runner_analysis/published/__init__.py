@@ -59,7 +59,7 @@ def _rows(name: str) -> list[dict[str, str]]:
 
 @cache
 def published(name: str) -> pd.DataFrame:
-    """One shipped file, by its name without ``.csv``; texts stay texts, gaps become NaN."""
+    """Return a shipped file, by its name without ``.csv``; texts stay texts, gaps become NaN."""
     import pandas as pd
 
     return pd.read_csv(DATA / f"{name}.csv", keep_default_na=False, na_values={})

@@ -168,8 +168,6 @@ def contrast_rates(cells: Cells) -> Estimate:
 
 
 def _detectable(cells: Cells, sign: int) -> float | None:
-    """Return the smallest difference in this direction that is found with the power."""
-
     def missing(size: float) -> float:
         return Z_WITH_POWER * sqrt(cells.variance(sign * size)) - size
 
@@ -235,7 +233,7 @@ def rejected(n: int, m: int) -> NDArray[np.bool_]:
 
 
 def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Estimate | None:
-    """Two means, compared within the conditions that both have by Welch's test.
+    """Compare two means within the conditions that both have, by Welch's test.
 
     The difference is that of a linear model with a level for each condition, so that another mix of
     conditions, as when one group collides more in some, makes no difference. Its error holds where

@@ -96,7 +96,7 @@ def _criterion(left: Array, coefficients: int, n: int) -> Array:
 
 
 def residuals(velocity_mps: Array) -> tuple[Array, Array]:
-    """Least sums of squares of 1, 2, ... lines, and of cubics, (pieces, vehicles); or inf."""
+    """Return (pieces, vehicles) least sums of squares of 1, 2, ... lines, and of cubics; or inf."""
     y = (velocity_mps - velocity_mps[:, :1]).T
     n, vehicles = y.shape
     i = np.arange(n)[:, None]

@@ -60,7 +60,7 @@ class Judgement(NamedTuple):
 
 
 def disagree(first: Judgement, second: Judgement) -> bool:
-    """Return whether one judgement passed and the other did not."""
+    """Return whether one judgement passed and the other failed."""
     return None not in {first.passed, second.passed} and first.passed != second.passed
 
 
@@ -87,7 +87,7 @@ def _judged(fit: Regression, name: str, *, robust: bool) -> Judgement:
 
 
 def profiles(study: Study, group: Group) -> pd.DataFrame:
-    """One row a vehicle of a group: whether it acted, and how far its acceleration is held."""
+    """Return a row a vehicle: whether it acted, and how far its acceleration is held."""
     return of_trials(_all_profiles(study), group.trials)
 
 
@@ -100,7 +100,7 @@ def _all_profiles(study: Study) -> pd.DataFrame:
 
 @remembered
 def gains(study: Study, group: Group) -> pd.DataFrame:
-    """One row a finished trial: condition, pair, ``steady`` (nobody acted), and ``gain`` or NaN."""
+    """Return a row a finished trial: condition, pair, ``steady`` (nobody acted), ``gain``."""
     by_trial = profiles(study, group).groupby(KEYS, as_index=False)
     gain = by_trial.agg(steady=("steady", "all"), gain=("gain", "mean"))
     return group.finished[[*KEYS, "condition", "pair"]].merge(gain, on=KEYS)
@@ -143,14 +143,14 @@ def likeness(driver: pd.DataFrame, human: pd.DataFrame) -> Estimate:
 
 
 def _independent(trials: pd.DataFrame, column: str) -> pd.Series:
-    """Values of trials, or means of human pairs, whose trials hang together."""
+    """Return values of trials, or means of human pairs, whose trials are correlated."""
     paired = trials["pair"].notna()
     means = trials[paired].groupby("pair")[column].mean()
     return pd.concat([trials.loc[~paired, column], means])
 
 
 def piecewise_constant(study: Study, group: Group) -> Judgement:
-    """I5: whether the accelerations of a group are held and jump, rather than move."""
+    """Judge I5: whether the accelerations of a group are piecewise constant."""
     gain = mean_gain(study, group)
     if gain.low is not None:
         return Judgement(gain.low > 0)

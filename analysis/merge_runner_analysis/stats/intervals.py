@@ -136,7 +136,7 @@ def tested(value: float, se: float, freedom: float) -> Estimate:
 
 
 def difference(first: Estimate, second: Estimate) -> Estimate | None:
-    """One independent estimate less another.
+    """Return one independent estimate less another.
 
     It is tested as Welch (1947) does, so that the 5 % hold also where the groups differ in size and
     in variance, with the degrees of freedom of a sum of variances (Satterthwaite 1946). None where

@@ -166,7 +166,7 @@ def estimate_or_reference(group: Group, metric: Metric) -> Estimate | None:
 
 
 def no_human_value(metric: Metric) -> Fact:
-    """Why the humans have no value of a metric before their recordings are imported."""
+    """Return why the humans have no value of a metric before an import."""
     why = Why.OTHER_RULE if metric.value in JUDGED else Why.NOT_PUBLISHED
     return Fact(why, (metric.heading,))
 

@@ -369,14 +369,14 @@ class Moved:
 
 
 def who_first_data(trials: pd.DataFrame) -> tuple[Array, Array]:
-    """Design (n, 3) of intercept, h in m, dv in m/s; and left-first as 0 or 1, shape (n,)."""
+    """Return the design (n, 3) of intercept, h in m, dv in m/s; and left-first as 0 or 1, (n,)."""
     chosen = trials[(trials["status"] == "finished") & trials["merged_first"].notna()]
     design = np.column_stack([np.ones(len(chosen)), chosen[CONDITION].to_numpy(float)])
     return design, (chosen["merged_first"] == "left").to_numpy(float)
 
 
 def gap_data(trials: pd.DataFrame, measure: str = "gap_m") -> tuple[Array, Array, pd.DataFrame]:
-    """Design (n, 4) of intercept, |h|, |dv|, h*dv; gaps in m, shape (n,); and their trials."""
+    """Return the design (n, 4) of intercept, |h|, |dv|, h*dv; gaps in m, (n,); and their trials."""
     chosen = trials[(trials["status"] == "finished") & trials[measure].notna()]
     design = gap_design(*chosen[CONDITION].to_numpy(float).T)
     return design, chosen[measure].to_numpy(float), chosen
@@ -399,7 +399,7 @@ def equivalence_p(b: float, se: float, freedom: float) -> float:
 
 
 def who_first_logit(trials: pd.DataFrame) -> Regression:
-    """Logit of left-first on h and dv by maximum likelihood, with Wald tests (eq. 1)."""
+    """Fit a logit of left-first on h and dv by maximum likelihood, with Wald tests (eq. 1)."""
     from statsmodels.discrete.discrete_model import Logit
 
     design, left = who_first_data(trials)
@@ -437,7 +437,7 @@ def who_first_firth(trials: pd.DataFrame, less: pd.DataFrame | None = None) -> R
 
 
 def gap_ols(trials: pd.DataFrame, measure: str = "gap_m", *, robust: bool = False) -> Regression:
-    """OLS of a gap on |h|, |dv| and h*dv (eq. 2); ``robust`` takes HC3 standard errors.
+    """Fit a gap on |h|, |dv| and h*dv by OLS (eq. 2); ``robust`` takes HC3 standard errors.
 
     HC3 holds under unequal variances (MacKinnon and White 1985).
     """
@@ -504,7 +504,7 @@ def _terms(names: Sequence[str], b: Array, se: Array, freedom: float = inf) -> d
 
 
 def unfit_for_logit(design: Array, left: Array) -> Fact | None:
-    """Why a logit has no finite maximum likelihood estimate, None where it has."""
+    """Return why a logit has no finite maximum likelihood estimate, None where it has."""
     problem = _unidentified(design, left)
     if problem or not any(infinite := _cells(design, left).infinite()):
         return problem

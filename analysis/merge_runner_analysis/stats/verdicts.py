@@ -400,7 +400,6 @@ def _moved(fit: Regression, group: Group) -> Estimate:
 
 
 def _collided(group: Group) -> Estimate:
-    """Return the share of ended trials with a collision by the humans' rule, in percent."""
     (k, n), cut_off = measures.counts(group, BOXES), measures.undecided(group, BOXES)
     if not n + cut_off:
         return Estimate(problem=Fact(Why.NONE_ENDED, (group.left_out,)))

@@ -26,7 +26,7 @@ from merge_runner_analysis.tables.model import (
 
 
 def ablation_quantitative(study: Study) -> Table:
-    """Table VII: collisions, gap, RMSE and joint rate of every driver and prompt."""
+    """Return Table VII: collisions, gap, RMSE and joint rate of every driver and prompt."""
     ended = ", ".join(metric.heading for metric in shown_in("tables") if metric.trials == "ended")
     trials = f"{ended}: of all trials that ended; the rest: of the finished ones"
     return metric_table("ablation-quantitative", study.groups, "tables", trials, RULES_NOTE)

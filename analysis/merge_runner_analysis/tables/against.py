@@ -55,7 +55,6 @@ def against(table: Table, study: Study) -> Table:
 
 
 def _printed(table: str) -> Iterator[tuple[Key, str, Value]]:
-    """Yield the values that the paper prints of a table: row, our column, value."""
     if table in {"who-first", "gap"}:
         for row in published(*FILES[table]).to_dict(orient="records"):
             for name in ("n", "b", "se", {"who-first": "z", "gap": "t"}[table], "p"):

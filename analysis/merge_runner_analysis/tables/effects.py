@@ -146,7 +146,7 @@ def _row(study: Study, effect: Effect, others: dict[str, Value] | None = None) -
 
 
 def _crossed(*levels: Level) -> Iterator[tuple[str, str]]:
-    """Each level with that of the other factor at which it is."""
+    """Return each level's name with that of its level of the other factor."""
     return ((level.name, level.at.partition("=")[2]) for level in levels)
 
 
@@ -157,13 +157,13 @@ def _is_copied(study: Study, effect: Effect) -> bool:
 
 
 def _place(level: Level, across: tuple[Level, Level] | None) -> str:
-    """Return where a level stands that is shown by another factor, and of an interaction both."""
+    """Return the other factor's level of a simple effect, and both of an interaction."""
     at = level.at.partition("=")[2]
     return f"{at} - {across[0].at.partition('=')[2]}" if across else at
 
 
 def problem(study: Study, effect: Effect) -> str:
-    """Why an effect has no test, or which cells its test leaves out."""
+    """Return why an effect has no test, or which cells its test leaves out."""
     copies, shared = copied_of_shared(study, *effect.levels)
     metric, difference = effect.metric, effect.difference
     remarks = [note_of(undecided_note(level.pooled, metric)) for level in effect.levels]

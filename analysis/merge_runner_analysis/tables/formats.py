@@ -162,7 +162,7 @@ def value_names(column: Column) -> tuple[str, ...]:
 
 
 def value_rows(table: Table) -> list[dict[str, Value]]:
-    """Each row's id, values and note; an interval becomes two values."""
+    """Return each row's id, values and note; an interval becomes two values."""
     rows = []
     for row in table.rows:
         cells: dict[str, Value] = {"row": row.id}
@@ -249,7 +249,7 @@ def shown_rows(table: Table) -> list[Row]:
 
 
 def shown_value(column: Column, row: Row) -> str:
-    """One value of a row as a reader sees it."""
+    """Return a value of a row as a reader sees it."""
     value = row.values.get(column.name)
     if value is None:
         return "" if column.kind == "text" else MISSING

@@ -44,7 +44,7 @@ NOTES = (
 
 
 def indicators(study: Study) -> Table:
-    """Table V: I1 to I5 and the quantitative measures, each with a row per driver."""
+    """Return Table V: I1 to I5 and the quantitative measures, each with a row per driver."""
     groups = study.baselines
     return Table(
         "indicators",

@@ -68,7 +68,7 @@ def varied(study: Study) -> tuple[str, ...]:
 
 
 def _every(study: Study) -> Iterator[tuple[str, Level]]:
-    """Each level of all drivers, then of each driver, then each crossing of each driver."""
+    """Yield each level of all drivers, then of each driver, then each crossing of each driver."""
     levels = [group.levels for group in study.models]
     drivers = [*dict.fromkeys(named[MODEL] for named in levels if MODEL in named)]
     for of_factor in levels_by_factor(study):

@@ -77,7 +77,7 @@ VERDICT_COLUMNS = (
 
 
 def verdicts(study: Study) -> Table:
-    """Every driver and prompt that is judged, and the humans first, by every measure."""
+    """Return every judged driver and prompt by every measure, the humans first."""
     rows = [] if study.human not in study.groups else [*_human_rows(study)]
     for group in (*(group for group in study.models if not group.caution), *study.unjudged):
         rows += _driver_rows(study, group)
