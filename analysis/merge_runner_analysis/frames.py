@@ -83,8 +83,8 @@ LEFT JOIN images ON turned AND headway_m = 0 - projected_headway_m
     AND images.mean_mps IS NOT DISTINCT FROM placed.mean_mps
 ORDER BY trial_id, spec_hash
 """  # noqa: S608 # constants
-# Of each driven trial that ended hashes of its states, as its ego sees them and as they are, and
-# of what its outcome and its gap depend on beside these: equal ones went the same way.
+# Hashes of each driven trial that ended: its states as its ego sees them and as they are, with the
+# other determinants of its outcome and its gap. Equal ones went the same way.
 TRACES = """
 SELECT trial_id, spec_hash, concat_ws(' ', seen, beside) AS trace, concat_ws(' ', driven, beside)
     AS drive

@@ -285,8 +285,7 @@ def groups_of(
         reasons = filter(None, (not_judged(*count) for count in counts.itertuples()))
         group = _model_group(trials.loc[rows.index], rows.iloc[0], Reason("; ".join(reasons)))
         stored = [specs.get(name, {}) for name in rows["spec_hash"].unique()]
-        # Of a first decision that was only asked, what follows is not known: draws that differ
-        # later may be equal until then.
+        # The rest of a trial is unknown after a first-decision probe: draws may differ later.
         is_first = rows["source"].iloc[0] == "first_decision"
         only_asked = is_first and any(map(has_chance, stored))
         programs = all(map(programs_alone, stored)) and not only_asked

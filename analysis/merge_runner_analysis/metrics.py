@@ -18,11 +18,11 @@ Estimator = Literal["proportion", "mean", "median"]
 SHOWN = {"tables": ("proportion", "mean"), "criticality": ("median",)}
 # The trials that a metric may be of, in SQL.
 STATUS = {"finished": "status = 'finished'", "ended": "status <> 'failed'"}
-# Of every measure, its interval and its differences, wherever they are printed.
+# Decimals of every printed measure, its interval and its differences.
 DECIMALS = 2
 INTERVALS = "Wilson for rates, Student's t for means, order statistics for medians"
-# What the analysis finds out of each trial that no column of the database has: whether it collided
-# by the rule of its scenario, and by that of the human experiment.
+# Values that the analysis adds to each trial, as no column of the database has them: whether it
+# collided by the rule of its scenario, and by that of the human experiment.
 JUDGED = ("collided", "collided_boxes")
 
 

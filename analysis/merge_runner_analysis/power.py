@@ -281,7 +281,7 @@ class Case:
 class Played:
     """The trials of an arm as its ego sees them, and how they are assumed to go.
 
-    Of two ``equal`` drivers who are given the same either may be asked about.
+    Either of two ``equal`` drivers with the same prompt may be the focal one.
     """
 
     cell: str
@@ -553,7 +553,7 @@ def _place(plan: Plan, factor: str, level: str) -> int:
 def _rehearses(plan: Plan) -> bool:
     """Return whether a study has nothing but parameters that plant an effect in the emulator.
 
-    What its words plant, or what is planted beside an [effect], is no assumption.
+    Effects that its words plant, or that are planted beside an [effect], are no assumption.
     """
     file = plan.study.file
     words = (word for levels in file.texts.values() for word in levels.values())

@@ -25,7 +25,7 @@ SELECT sweep_id, name, started_at, ended_at, git_commit, git_dirty, versions,
 FROM sweeps LEFT JOIN sweep_trials USING (sweep_id)
 GROUP BY ALL ORDER BY started_at, sweep_id
 """
-# Of each call the last attempt is the answer; those before it are retries.
+# The last attempt of each call is the answer; those before it are retries.
 CALLS = """
 SELECT provider, model_requested, model_served,
     count(DISTINCT call_key) AS calls,

@@ -239,7 +239,7 @@ def _chosen(db: Path, studies: Studies, source: StudySource | None) -> tuple[str
 def _pooled_order(studies: Studies) -> Order:
     """Return the levels of each factor in the order of the study that lists the most of them.
 
-    Of equal ones it is the newest; one level alone says no order.
+    The newest of equal ones counts; one level alone gives no order.
     """
     pooled: dict[str, list[str]] = {}
     for factor in dict.fromkeys(name for order in studies.orders.values() for name in order):

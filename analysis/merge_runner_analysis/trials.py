@@ -105,7 +105,7 @@ def judged(
     overlapped = {tuple(key) for *key, samples in near if _overlap(tasks[key[1]], samples)}
     keys = pd.MultiIndex.from_frame(trials[["trial_id", "spec_hash"]])
     boxes = pd.Series(keys.isin(overlapped), trials.index, dtype="boolean")
-    # What a trace does not show of a trial that another rule ended is open.
+    # A trial that another rule ended stays undecided where its trace shows no overlap.
     boxes = boxes.mask(recorded & ~boxes).where(ended).mask(human, recorded)
     return trials.assign(collided=recorded.mask(human), collided_boxes=boxes)
 
@@ -113,7 +113,7 @@ def judged(
 def _near(tasks: Mapping[str, ScenarioConfig]) -> str:
     configs = [ScenarioConfig(), *tasks.values()]
     step_s = max(task.step_s for task in configs)
-    # What accelerations against each other, and a resistance, add to the way within a step.
+    # Distance that opposed accelerations, and a resistance, add within a step.
     added_m = 2 * (max(task.max_acceleration_mps2 for task in configs) + 2) * step_s**2
     reach_m = max(hypot(task.vehicle_length_m, task.vehicle_width_m) for task in configs)
     names = ", ".join(map(quoted, tasks)) or "NULL"

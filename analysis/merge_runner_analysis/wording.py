@@ -55,7 +55,7 @@ VERDICT_RULE = (
     "shown, with a p below .05 that is corrected for the number of the driver's measures (Holm). "
     "Cannot tell yet: neither of the two; that is not “alike”"
 )
-# What metrics are called in sentences and pages; others keep the label of the table.
+# Names of metrics in sentences and pages; others keep the label of the table.
 METRIC_NAMES = {
     LEFT_FIRST.name: "goes first",
     COLLISIONS.name: "crashes",
@@ -101,7 +101,7 @@ UNCORRECTED = (
     "corrected p allows for all of them."
 )
 UNREADABLE = "the stored study cannot be read by this version"
-# Of levels that nobody reads.
+# Note on levels that no driver reads.
 SAME_TRIALS = "not tested: the same trials at both levels, as the drivers do not read what differs"
 MISSING, MINUS = "–", "−"
 TIMES = " × "  # between the factors of an interaction
@@ -320,9 +320,9 @@ MEASURES = {
         ),
     )
 }
-# Who went first where a state of who goes first is counted.
+# The vehicle whose first mergers are counted, by measure.
 FIRST = {"headway": "the one ahead", "velocity": "side by side, the slower one"}
-# What a person sees at once comes first in a headline, what is fitted last.
+# Measures that a person sees at once come first in a headline, fitted ones last.
 SEEN_FIRST = ("collisions", "headway", "velocity", "gap", "gap-headway", "gap-velocity", "held")
 
 
@@ -434,7 +434,7 @@ def apart(driver: str, other: str, rows: Mapping[str, Values]) -> tuple[str, str
         also = UNCORRECTED if ci and ci[0] * ci[1] > 0 else ""
         claim = f"{claim}: {result}; corrected p {equal_p(p)}."
         return claim, " ".join(filter(None, (also, _others(driver, rows))))
-    # Of fewer, the ends change their signs and their places.
+    # Where trials are fewer, the ends change their signs and their places.
     ends = ci and sorted(end if difference > 0 else -end for end in ci)
     more = "more" if difference > 0 else "fewer"
     result = f"{number(abs(difference))} points {more} {brackets(ends)}".rstrip()
@@ -496,7 +496,7 @@ def headline(
     """Return the answer of language models in two parts: the claim, and what else is seen at once.
 
     ``drivers`` are those that are judged, by name: no mock model and no program; ``kinds`` are
-    those of all drivers. Of those with too few outcomes it says the counts alone.
+    those of all drivers. Drivers with too few outcomes have their counts alone.
     """
     if not drivers:
         return _without_models({*kinds}), ""

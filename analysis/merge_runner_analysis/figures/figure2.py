@@ -163,7 +163,7 @@ def _played(study: Study, group: Group) -> Group:
 def left_traces(study: Study, group: Group, first: str) -> dict[float, list[Array]]:
     """Return times in s and left speeds in m/s, (n, 2), where ``first`` merged first (A, B).
 
-    By relative velocity. Of two different drivers the left one is the ego, as everywhere here.
+    They are by relative velocity. The left one of two different drivers is the ego.
     """
     if not group.measured:
         return {}

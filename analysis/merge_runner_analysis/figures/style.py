@@ -54,7 +54,7 @@ def wrapped(text: str, width: int) -> str:
 def place(figure: Figure, grid: NDArray[Any] = NO_GRID) -> None:
     """Lay a figure out once: matplotlib would do so at each drawing, and draw it once more.
 
-    Of a ``grid`` of panels with shared scales those inside are placed by the others.
+    The inner panels of a ``grid`` with shared scales are aligned with the outer ones.
     """
     inner = grid[1:-1, 1:]
     for panel in inner.flat:

@@ -62,7 +62,7 @@ _READ = {
 }
 SPEC = canonical_json(_READ)
 SPEC_HASH = spec_hash(SPEC)
-# Of the velocity pages, which show no positions.
+# The spec of the velocity pages, which show no positions.
 PAGE_SPEC = canonical_json(
     _READ
     | {

@@ -40,8 +40,8 @@ class Effect:
 
     ``at_level`` and ``at_reference`` are the estimates within the shared cells, in which the trials
     count without ``left_out``; their ``difference`` has its interval, p and detectable. Values are
-    None where nothing is compared. Of an interaction the first two have no value but their trials.
-    Of an interaction ``across`` are the same two levels at the reference of the other factor.
+    None where nothing is compared. The first two of an interaction have no value but their trials;
+    its ``across`` are the same two levels at the reference of the other factor.
     ``p_corrected`` is by Holm's method, in the family that ``primary`` tells.
     """
 

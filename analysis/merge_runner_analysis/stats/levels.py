@@ -62,7 +62,7 @@ def copied_cells(study: Study, groups: tuple[Group, ...]) -> set[Cell]:
     """Return the cells of programs that ignore the groups' difference.
 
     With the same other levels, all trials of one of two groups are copies of the other's there, in
-    every condition that both have. What they differ by is how often each was drawn, so that nothing
+    every condition that both have. They differ only by how often each was drawn, so that nothing
     can be tested. Conditions are never left out one by one: which of them stay would depend on
     what happened there.
     """
@@ -180,8 +180,8 @@ def _distinct(study: Study, levels: list[Level]) -> list[Level]:
 def _with_copies(study: Study, group: Group) -> Iterator[Iterable[Cell]]:
     """Yield cells that have copies of each other's trials.
 
-    Of programs those of a condition in which any trials are equal. A mock model plays with chance:
-    its trials of two levels that it reads may be equal here and there, which makes them no copies.
+    Cells of programs have them in a condition with any equal trials. A mock model plays with
+    chance: a few equal trials of two levels that it reads are no copies.
     """
     if not group.scripted:
         yield from (cells for _, cells in group.trials.groupby(["condition", "way"])["cell"])

@@ -253,10 +253,10 @@ class Fit:
     def _nearest(self, rows: Array, linear: Array) -> Array:
         """Return the coefficients nearest to the fit at which rows have these linear predictors.
 
-        ``rows`` are (sets, rows, terms), and what is returned (sets, terms).
+        ``rows`` are (sets, rows, terms), and the result (sets, terms).
         """
         spread = rows @ np.linalg.inv(self.information)
-        # Of dependent rows the solution is far off, and unlikely.
+        # The solution of dependent rows is far off, and unlikely.
         square = spread @ rows.transpose(0, 2, 1) + FLAT * np.eye(len(linear))
         weights = np.linalg.solve(square, (linear - rows @ self.b)[:, :, None])
         return np.asarray(self.b + (weights.transpose(0, 2, 1) @ spread)[:, 0])
@@ -277,12 +277,11 @@ class Regression:
     """A fit to ``n`` trials; ``problem`` says why there are no terms.
 
     ``freedom`` is the residual degrees of freedom of a linear fit, infinite where tests are normal;
-    ``remark`` is what to know of a fit that has terms. Of a gap alone: the ``covariance`` of its
-    terms, (terms, terms); ``equivalence_p``, that
-    relative velocity alone moves it by less than GAP_MARGIN_M, and ``velocity_p``, that no term
-    with relative velocity has an effect (an F test of all of them). These are None where no two
-    played conditions differ in relative velocity alone, and where the errors of the terms are not
-    two, as without residuals.
+    ``remark`` is a caution on a fit that has terms. Fits of a gap alone have the ``covariance`` of
+    their terms, (terms, terms); ``equivalence_p``, that relative velocity alone moves it by less
+    than GAP_MARGIN_M, and ``velocity_p``, that no term with relative velocity has an effect (an F
+    test of all of them). These are None where no two played conditions differ in relative velocity
+    alone, and where the errors of the terms are not two, as without residuals.
     """
 
     n: int

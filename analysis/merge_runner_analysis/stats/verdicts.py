@@ -147,7 +147,7 @@ def of_humans(study: Study) -> dict[str, Estimate]:
 def counted(both: Both) -> dict[str, Counted]:
     """Return what a person counts, by measure; nothing where no trial could go so.
 
-    Who goes first: the one ahead, and where neither is, the slower one.
+    First mergers are counted for the vehicle ahead or, side by side, for the slower one.
     """
     played = both.human.outcomes["condition"].isin(both.group.ended["condition"])
     humans = both.human.outcomes[played]

@@ -136,7 +136,7 @@ def table(study: Study | Path | str, name: str, selection: Selection | None = No
         read = study if isinstance(study, Study) else Study(study, selection or Selection())
         (made,) = make_tables(read, [name])
         frame = pd.DataFrame(value_rows(made), columns=names_of(made)).set_index("row")
-    # Of a column without a value pandas cannot tell the type.
+    # pandas cannot infer the type of a column without a value.
     missing = [name for name in frame if frame[name].isna().all()]
     return frame.astype(dict.fromkeys(missing, "float64"))
 

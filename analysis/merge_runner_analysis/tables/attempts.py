@@ -12,8 +12,8 @@ from merge_runner_analysis.tables.model import GROUP_COLUMNS, STORED, Column, Ta
 # Failures with a share of the answers beside their number; the others are malformed answers, and
 # have a column where they occur.
 FAILURES = {"refused": "refusal", "truncated": "truncated", "empty": "empty"}
-# What each share is of: a call may take several attempts, and a lost call has no answer that could
-# be invalid.
+# Denominator of each share: a call may take several attempts, and a lost call has no answer that
+# could be invalid.
 OF = {"retried": "attempts", "lost": "calls", "fallback": "decisions"}
 MEANINGS = {
     "trials": "all trials, also those that failed",

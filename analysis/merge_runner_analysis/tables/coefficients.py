@@ -31,8 +31,8 @@ KEYS = (
     Column("se", "SE", "number", "standard error", digits=3),
 )
 P = Column("p", "p", "p", "Wald test")
-# Of the same trials: how its rows differ in name and label from the first ones, and the fit and a
-# robust one by the prefix of their values' names.
+# A prefix of row names, a suffix of labels, and a fit and a robust one to the same trials, by the
+# prefix of their values' names.
 Fit = tuple[str, str, dict[str, Regression]]
 BY_PAIR = ", errors by pair"
 

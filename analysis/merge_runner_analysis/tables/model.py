@@ -23,7 +23,7 @@ Kind = Literal["text", "count", "number", "percent", "p", "verdict", "interval"]
 Value = str | int | float | bool | tuple[float, float] | None
 # The trials of a group that a row may rest on, beside those with a value in some column of theirs.
 STORED, ENDED, FINISHED = "stored", "ended", "finished"
-# What a verdict counts: as its measure has it.
+# The trials that a verdict counts, as its measure has it.
 COUNTED = "counted"
 
 

@@ -181,7 +181,7 @@ def _compared(
 def _human_rows(study: Study) -> Iterator[Row]:
     for name, estimate in of_humans(study).items():
         values = _driver(study.human, HUMANS) | {"measure": name, **_known(estimate)}
-        # What is published rests on no trials here.
+        # Published values rest on no trials here.
         published = estimate.source or not study.human.measured
         rests_on = "" if published else MEASURES[name].rests_on
         note = note_of(estimate.problem, estimate.source)
