@@ -1,4 +1,4 @@
-"""What is computed once: of a study in memory, tables and figures in a file beside the database.
+"""Cache of results: a study's in memory, tables and figures in a file beside the database.
 
 The file keeps a table as JSON, a figure as SVG in Base64, and the digest, until the results change.
 Where it cannot be written, as on a read-only disk, nothing is kept, and the next run computes all
@@ -51,7 +51,7 @@ def stamp_of(db: Path) -> tuple[int, ...]:
 
 
 def present_state(db: Path) -> str:
-    """Return what the tables of a database depend on: its stamp, the program, a study's parts.
+    """Return the state that tables depend on: the database's stamp, the program, a study's parts.
 
     Raises UsageError where there is no database.
     """
@@ -90,7 +90,7 @@ def keep_finished(db: Path, made_of: str, options: str, contents: Mapping[str, s
 
 
 def kept(db: Path, made_of: str, options: str, name: str, make: Callable[[], str]) -> str:
-    """Return what is kept of this state under a name; else it is made, and kept."""
+    """Return the cached text of this state under a name; make and cache it if there is none."""
     contents = finished(db, made_of, options, [name])
     if not contents:
         contents = {name: make()}

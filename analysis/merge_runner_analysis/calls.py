@@ -1,4 +1,4 @@
-"""What became of the calls and decisions of each trial: tables, pages and the report count here."""
+"""Outcomes of the calls and decisions of each trial, for tables, pages and the report."""
 
 from merge_runner.records import ANSWERS, NO_DECISION
 

@@ -135,12 +135,12 @@ def tables(
     else:
         from merge_runner_analysis.study import Study
         from merge_runner_analysis.tables.against import PAPER
-        from merge_runner_analysis.tables.against import against as beside
+        from merge_runner_analysis.tables.against import against as with_paper
 
         if against != PAPER:
             raise UsageError(f"--against {against}: valid is {PAPER}")
         study = Study(db, selection)
-        made = [beside(table, study) for table in finished_tables(db, names or (), study)]
+        made = [with_paper(table, study) for table in finished_tables(db, names or (), study)]
     width = None if wide else terminal_width()
     print_out(render(made, TableFormat.JSON if as_json else output, width))
 
@@ -366,7 +366,7 @@ def _study(db: Path, selection: Selection, *, trust: bool) -> Study:
 
 
 def drivers(text: str | None) -> list[str] | None:
-    """The drivers that an option names; a comma within brackets stands between a driver's levels.
+    """Return the drivers that an option names; commas within brackets separate a driver's levels.
 
     >>> drivers("human, o3 [reasoning_effort=low, temperature=0.2]")
     ['human', 'o3 [reasoning_effort=low, temperature=0.2]']
@@ -406,7 +406,7 @@ def view(
     Example: merge-runner view --study my-study/study.toml
     """
     use_study(study_file, trust=trust)
-    wanted = listed(trials) or []
+    patterns = listed(trials) or []
     if trials is not None and export is None and single is None:
         raise UsageError("--trials goes with --export DIR or --single FILE.html")
     if trials is None and single is not None:
@@ -425,8 +425,8 @@ def view(
             say(f"{pages} pages so far")
 
     if export is not None:
-        say(f"open {export_folder(db, export, wanted, progress)}, or send the folder {export}")
+        say(f"open {export_folder(db, export, patterns, progress)}, or send the folder {export}")
     if single is not None:
-        say(f"wrote {export_page(db, single, wanted)}")
+        say(f"wrote {export_page(db, single, patterns)}")
     if export is None and single is None:
         serve(db, port, announce, reader_of(reader), study_file or "")

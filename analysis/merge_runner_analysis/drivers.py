@@ -1,4 +1,4 @@
-"""What the spec of a trial says of its drivers: who is a language model, and who cannot react."""
+"""Kinds of drivers in a trial's spec: language models, programs, and those that cannot react."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from merge_runner.records import SIDES, Side
 
 
 def language_models(names: Mapping[Side, str], spec: Mapping[str, Any]) -> dict[Side, str]:
-    """Of the drivers' names those of language models, as the spec of their trials tells them.
+    """Return the drivers that are language models by the spec of their trials.
 
     It knows the programs of a study, too, which may not be registered here.
     """
@@ -45,7 +45,7 @@ def unresponsive(spec: Mapping[str, Any]) -> str:
 
 
 def stand_in(models: Mapping[Side, str], sides: Collection[Side] = SIDES) -> str:
-    """What is said of trials of these language models in which a stand-in answered on these sides.
+    """Return the label of these language models' trials, which a mock model answered on some sides.
 
     A side that a program drives has no model.
     """

@@ -1,4 +1,4 @@
-"""Where a row of a table comes from: the query, and the trials behind it."""
+"""Origin of a table's row: the query, and the trials behind it."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Explanation(NamedTuple):
     command: str
 
     def lines(self, *, whole: bool = False) -> list[str]:
-        """The explanation for a reader: the trials that a value counts, ``whole`` all."""
+        """Return the explanation for a reader: the trials that a value counts, ``whole`` all."""
         lines = [f"{self.cell} = {self.value}", self.meaning]
         if self.note:
             lines.append(f"note: {self.note}")
@@ -90,14 +90,14 @@ def explain(study: Study, table: Table, cell: str) -> Explanation:
 
 
 def sql_command(study: Study) -> str:
-    """How a query is run on a study's database."""
+    """Return the command that runs a query on a study's database."""
     return command_at("merge-runner sql", "--db", study.db, DEFAULT_DB)
 
 
 def sources_of(
     study: Study, table: Table, row: Row, column: Column | None = None
 ) -> tuple[Source, ...]:
-    """The trials of each group behind a row, and those of them that a share of it counts."""
+    """Return the trials of each group behind a row, and those of them that a share of it counts."""
     if column is not None and column.name.startswith("ceiling"):
         resampled = "data sets resampled from the published counts and regression, not trials"
         return (Source(HUMAN, resampled),)
@@ -154,7 +154,7 @@ def _source(
     outcomes = group.published_outcomes
     parts = (
         f"{len(trials)} of {len(group.trials)} trials; not finished: {group.left_out}",
-        group.said,
+        group.remark,
         f"collisions and who merged first are those of {len(outcomes)} published outcomes: "
         f"{citation('human_outcomes')}"
         if outcomes is not None
@@ -182,7 +182,6 @@ def _specs(group: Group) -> list[str]:
 
 
 def _query(group: Group, trials: Sequence[str]) -> str:
-    """The query that lists trials of a group; empty for none."""
     specs = _specs(group)
     named = QUERY.format(specs=", ".join(map(quoted, specs)), trials=", ".join(map(quoted, trials)))
     return named if trials else ""

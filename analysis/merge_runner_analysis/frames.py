@@ -1,6 +1,6 @@
 """Results as data frames: single queries, and all that a study reads, in one opening of its file.
 
-A query that a single table, page or statistic needs stands beside it.
+A query that a single table, page or statistic needs is beside it.
 """
 
 from __future__ import annotations
@@ -83,8 +83,8 @@ LEFT JOIN images ON turned AND headway_m = 0 - projected_headway_m
     AND images.mean_mps IS NOT DISTINCT FROM placed.mean_mps
 ORDER BY trial_id, spec_hash
 """  # noqa: S608 # constants
-# Of each driven trial that ended hashes of its states, as its ego sees them and as they are, and
-# of what its outcome and its gap depend on beside these: equal ones went the same way.
+# Hashes of each driven trial that ended: its states as its ego sees them and as they are, with the
+# other determinants of its outcome and its gap. Equal ones went the same way.
 TRACES = """
 SELECT trial_id, spec_hash, concat_ws(' ', seen, beside) AS trace, concat_ws(' ', driven, beside)
     AS drive
@@ -175,12 +175,12 @@ class Studies(NamedTuple):
     def holds(self, study: str, frame: pd.DataFrame) -> pd.Series:
         """Return which rows of a frame are of trials that were played for a study."""
         members = self.trials.loc[self.trials["study"] == study, KEYS]
-        held = pd.MultiIndex.from_frame(frame[KEYS]).isin(pd.MultiIndex.from_frame(members))
-        return pd.Series(held, index=frame.index)
+        is_member = pd.MultiIndex.from_frame(frame[KEYS]).isin(pd.MultiIndex.from_frame(members))
+        return pd.Series(is_member, index=frame.index)
 
 
 class Frames(NamedTuple):
-    """What a study reads of its database: nobody writes there until all of it is read."""
+    """Rows that a study reads of its database, while nobody writes there."""
 
     trials: pd.DataFrame
     """TRIALS and TRACES with a column for each metric, and whether they collided."""
@@ -190,7 +190,7 @@ class Frames(NamedTuple):
     """By their hashes."""
     studies: Studies
     calls: pd.DataFrame
-    """CALLS: what became of the calls, by trial."""
+    """CALLS: outcomes of the calls, by trial."""
     decisions: pd.DataFrame
     """ASKED_DECISIONS: how many are invalid, by trial and model."""
     levels: pd.DataFrame

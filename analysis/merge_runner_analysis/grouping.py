@@ -47,9 +47,9 @@ class Group:
     name: str
     """The driver: a model's, or both of a mixed pair."""
     driver: str
-    """The name with the mark, and ``[scripted]`` where a stand-in answered only some trials."""
+    """The name with the mark, and ``[scripted]`` where a mock model answered only some trials."""
     label: str
-    """The driver as tables name it, with what is said of it."""
+    """The driver as tables name it, with its remark."""
     mark: str = ""
     """``[1a2b3c4d]`` tells a driver from itself under other settings of the task."""
     models: tuple[str, ...]
@@ -57,26 +57,26 @@ class Group:
     setting: str = ""
     """The prompt variant; empty for humans."""
     spec_hash: str = ""
-    """That of its trials, or of those at the usual mean speed where a condition has another."""
+    """Hash of its spec, at the usual mean speed if conditions have several."""
     levels: Mapping[str, str] = field(default_factory=dict)
     """By factor the level of its study; model and prompt are the first ones."""
     trials: pd.DataFrame
     """Rows of a study's trials, of programs the distinct ones.
 
-    ``way`` is equal in trials of programs and of stand-ins that went alike, whichever of two equal
-    drivers is the ego: copies, where the groups differ only in words that nobody reads.
+    ``way`` is equal in trials of programs and of mock models that went alike, whichever of two
+    equal drivers is the ego: copies, where the groups differ only in words that nobody reads.
 
     Humans before an import have the published outcomes alone."""
     whole: Group | None = None
     """The group with its copies, where it has some."""
     equal: int = 0
-    """How many trials of a language model went as an earlier one."""
+    """Number of a language model's trials that went as an earlier one."""
     published_outcomes: pd.DataFrame | None = None
-    """Those of humans, which imported trials do not replace."""
+    """Outcomes of humans, which imported trials do not replace."""
     posing: Sentence = Sentence("")
-    """What to say of a scripted stand-in that answered."""
+    """Label of a mock model that answered; empty without one."""
     caution: Sentence = Sentence("")
-    """What to say of a human who is replayed, whose trials are not judged."""
+    """Remark on a replayed human, whose trials are not judged."""
     unjudged: Reason = Reason("")
     """Why nothing is concluded from its trials; empty where something is."""
 
@@ -86,29 +86,29 @@ class Group:
         return f"{self.driver}/{self.setting}" if self.setting else self.driver
 
     @property
-    def said(self) -> str:
-        """What is said of a scripted stand-in and of a human who is replayed."""
+    def remark(self) -> str:
+        """Remarks on a mock model and on a replayed human."""
         return "; ".join(filter(None, (self.posing, self.caution)))
 
     @property
     def measured(self) -> bool:
-        """Whether the speeds behind its trials are known: not of humans before an import."""
+        """True if the speeds behind its trials are known: not of humans before an import."""
         return "trial_id" in self.trials
 
     @property
     def seats(self) -> tuple[int, int]:
-        """How many of the stored trials have the ego on the left and on the right."""
+        """Numbers of stored trials with the ego on the left and on the right."""
         left, right = (int((self.stored.trials["ego"] == side).sum()) for side in SIDES)
         return left, right
 
     @property
     def scripted(self) -> bool:
-        """Whether a scripted stand-in answered."""
+        """True if a mock model answered."""
         return bool(self.posing)
 
     @property
     def repeated(self) -> int:
-        """How many trials of programs are left out as copies of an earlier one."""
+        """Number of a program's trials that are left out as copies of an earlier one."""
         return len(self.stored.trials) - len(self.trials)
 
     @property
@@ -123,16 +123,16 @@ class Group:
 
     @property
     def traced(self) -> bool:
-        """Whether the speeds behind all outcomes are known."""
+        """True if the speeds behind all outcomes are known."""
         return self.measured and len(self.trials) >= len(self.outcomes)
 
-    def part(self, wanted: Callable[[pd.DataFrame], pd.Series]) -> Group:
-        """The group with only those trials, and outcomes, of which ``wanted`` holds."""
+    def part(self, is_kept: Callable[[pd.DataFrame], pd.Series]) -> Group:
+        """Return the group with only those trials, and outcomes, that ``is_kept`` selects."""
         outcomes = self.published_outcomes
         return replace(
             self,
-            trials=self.trials[wanted(self.trials)],
-            published_outcomes=None if outcomes is None else outcomes[wanted(outcomes)],
+            trials=self.trials[is_kept(self.trials)],
+            published_outcomes=None if outcomes is None else outcomes[is_kept(outcomes)],
         )
 
     @cached_property
@@ -152,24 +152,24 @@ class Group:
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """How many outcomes there are in each condition of humans, in their order."""
+        """Numbers of outcomes in the conditions of humans, in their order."""
         return in_human_conditions(self.ended_outcomes)
 
     @cached_property
     def left_out(self) -> str:
-        """Which trials are not among the finished ones, in words."""
+        """Trials that did not finish, counted by status: ``2 collided, 1 failed``."""
         counts = self.trials["status"].value_counts()
         statuses = [name for name in ("collided", "timeout", "failed") if name in counts]
         return ", ".join(f"{counts[name]} {name}" for name in statuses) or "none"
 
 
 def in_human_conditions(trials: pd.DataFrame) -> tuple[int, ...]:
-    """How many trials there are in each condition of humans, in their order."""
+    """Return the numbers of trials in the conditions of humans, in their order."""
     return tuple(trials["condition"].value_counts().reindex(HUMAN_CONDITIONS, fill_value=0))
 
 
 def of_trials(frame: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
-    """The rows of a per-trial frame that belong to these trials."""
+    """Return the rows of a per-trial frame that belong to these trials."""
     # To join all rows takes longer than to leave out those of other groups first.
     near = frame["spec_hash"].isin(trials["spec_hash"].unique())
     return frame[near].merge(trials[KEYS], on=KEYS)
@@ -177,7 +177,7 @@ def of_trials(frame: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
 
 @cache
 def _published_humans() -> Group:
-    """One object for all studies: what is computed from it is computed once."""
+    """Return one object for all studies, so that results are computed once."""
     outcomes = outcomes_with_metrics()
     return Group(
         name=HUMAN, driver=HUMAN, label=HUMAN, models=(HUMAN,), trials=outcomes,
@@ -186,7 +186,7 @@ def _published_humans() -> Group:
 
 
 def humans_of(trials: pd.DataFrame) -> Group:
-    """The humans, with the trials that are imported."""
+    """Return the humans, with the trials that are imported."""
     if trials.empty:
         return _published_humans()
     n = len(trials)
@@ -195,14 +195,14 @@ def humans_of(trials: pd.DataFrame) -> Group:
 
 
 def levels_of_group(levels: pd.DataFrame, group: Group) -> dict[str, str]:
-    """The levels of a group, model and prompt first."""
+    """Return the levels of a group, model and prompt first."""
     rows = of_trials(levels, group.trials).drop_duplicates("factor")
     named = rows.set_index("factor")["value"].to_dict()
     return {name: named[name] for name in sorted(named, key=lambda n: (n not in FIRST, n))}
 
 
 def levels_of(groups: Iterable[Group], order: Order) -> dict[str, list[str]]:
-    """The levels of each factor that these groups have, those in ``order`` first.
+    """Return the levels of each factor that these groups have, those in ``order`` first.
 
     Then come usual ones, then numbers by size, then the rest by name.
     """
@@ -223,7 +223,7 @@ def _place(level: str, listed: Sequence[str]) -> tuple[int, bool, float, str]:
 
 
 def _as_seen(stored: Mapping[str, Any] | None, name: str, ego: str) -> dict[str, Any]:
-    """A spec as the ego sees it: with the ego's driver on the left.
+    """Return a spec as the ego sees it: with the ego's driver on the left.
 
     ``image`` is its hash, ``usual`` its hash at the usual mean speed. ``task`` is a hash of what
     it covers beside the prompt, the mean speed and what is planted in the emulator: equal for all
@@ -248,7 +248,7 @@ def _as_seen(stored: Mapping[str, Any] | None, name: str, ego: str) -> dict[str,
 
 
 def _turned(block: str) -> str:
-    """The name of a prompt's block, of which one that a single driver is told names its side."""
+    """Return a prompt block's name with the other side, if a side's driver alone reads it."""
     name, _, side = block.partition("@")
     return f"{name}@{'left' if side == 'right' else 'right'}" if side else block
 
@@ -260,11 +260,11 @@ def groups_of(
     levels: pd.DataFrame,
     order: Order,
 ) -> list[Group]:
-    """Return groups by driver and levels, scripted stand-ins last; the frames are a study's.
+    """Return groups by driver and levels, mock models last; the frames are a study's.
 
     Where a driver was run under several settings of the task, all but the most frequent carry a
     mark, the same for a baseline and its variants; likewise where a prompt was changed, and where
-    a stand-in answered some of its trials.
+    a mock model answered some of its trials.
     """
     if trials.empty:
         return []
@@ -285,8 +285,7 @@ def groups_of(
         reasons = filter(None, (not_judged(*count) for count in counts.itertuples()))
         group = _model_group(trials.loc[rows.index], rows.iloc[0], Reason("; ".join(reasons)))
         stored = [specs.get(name, {}) for name in rows["spec_hash"].unique()]
-        # Of a first decision that was only asked, what follows is not known: draws that differ
-        # later may be equal until then.
+        # The rest of a trial is unknown after a first-decision probe: draws may differ later.
         is_first = rows["source"].iloc[0] == "first_decision"
         only_asked = is_first and any(map(has_chance, stored))
         programs = all(map(programs_alone, stored)) and not only_asked
@@ -319,13 +318,13 @@ def _model_group(rows: pd.DataFrame, first: pd.Series, unjudged: Reason) -> Grou
         caution=Sentence(unresponsive(first["spec"])),
         unjudged=unjudged,
     )
-    return replace(group, label=f"{driver} ({group.said})") if group.said else group
+    return replace(group, label=f"{driver} ({group.remark})") if group.remark else group
 
 
 def _distinct(group: Group, *, programs: bool, scripted: bool) -> Group:
-    """The group without copies, if only programs drive; of a language model they are counted.
+    """Return the group without copies if only programs drive; count those of a language model.
 
-    A stand-in reads no words: its trials of several prompts are copies where they went alike, the
+    A mock model reads no words: its trials of several prompts are copies where they went alike, the
     first of those that did with the first of another's, and so on.
     """
     rows = group.trials
@@ -349,7 +348,7 @@ def _distinct(group: Group, *, programs: bool, scripted: bool) -> Group:
 
 
 def _marks(keyed: pd.DataFrame, within: list[str], what: str) -> pd.Series:
-    """`` [mark]`` for all but the most frequent value of ``what`` within equal names."""
+    """Return `` [mark]`` for all but the most frequent value of ``what`` within equal names."""
     sizes = keyed.groupby([*within, what])[what].transform("size")
     ordered = keyed.assign(rarity=-sizes).sort_values(["rarity", what])
     usual = ordered.groupby(within)[what].transform("first").reindex(keyed.index)

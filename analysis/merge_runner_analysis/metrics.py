@@ -18,17 +18,17 @@ Estimator = Literal["proportion", "mean", "median"]
 SHOWN = {"tables": ("proportion", "mean"), "criticality": ("median",)}
 # The trials that a metric may be of, in SQL.
 STATUS = {"finished": "status = 'finished'", "ended": "status <> 'failed'"}
-# Of every measure, its interval and its differences, wherever they are printed.
+# Decimals of every printed measure, its interval and its differences.
 DECIMALS = 2
 INTERVALS = "Wilson for rates, Student's t for means, order statistics for medians"
-# What the analysis finds out of each trial that no column of the database has: whether it collided
-# by the rule of its scenario, and by that of the human experiment.
+# Values that the analysis adds to each trial, as no column of the database has them: whether it
+# collided by the rule of its scenario, and by that of the human experiment.
 JUDGED = ("collided", "collided_boxes")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Metric:
-    """A number of each trial, and what is made of it.
+    """A number of each trial, and how it is summarised.
 
     ``name`` is that of its columns and rows, and ends with the unit. ``value`` is SQL over the
     columns of ``trials`` and ``trial_metrics``, or one of JUDGED; a subquery over another table
@@ -36,8 +36,8 @@ class Metric:
     and printed in percent. ``trials`` are those that count, unless their value is NULL. ``weight``
     is SQL of how much a trial counts in a mean: of a share of its replies, how many these are.
 
-    ``label`` and ``unit`` head a column, ``meaning`` says what the number of one trial is, or of
-    what a proportion is the share. Raises UsageError where these do not fit together.
+    ``label`` and ``unit`` head a column, ``meaning`` describes one trial's number, or the
+    whole of a proportion. Raises UsageError where these do not fit together.
 
     ``least`` is the smallest value that there can be, which intervals and axes do not pass.
 
@@ -70,7 +70,7 @@ class Metric:
 
     @property
     def rate(self) -> bool:
-        """Whether it is a share, in percent."""
+        """True if it is a share, in percent."""
         return self.estimator == "proportion"
 
     @property
@@ -104,7 +104,7 @@ def register(metric: Metric) -> Metric:
 
 
 def shown_in(place: str) -> list[Metric]:
-    """The metrics that a place of SHOWN has, in the order of the list."""
+    """Return the metrics that a place of SHOWN has, in the order of the list."""
     return [
         metric for metric in METRICS.values() if metric.shown and metric.estimator in SHOWN[place]
     ]

@@ -96,7 +96,7 @@ COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """How a driver is assumed to drive: coefficients of Tables III and IV, and the rest.
+    """Assumed behaviour of a driver: coefficients of Tables III and IV, and the rest.
 
     ``gap_sd_m`` and ``noise`` are the standard deviations of the gaps and of the trials' logits,
     ``collided`` is the share of trials that end in a collision.
@@ -183,8 +183,8 @@ def played(group: Group) -> Truth | None:
 def _trials_of(truth: Truth, conditions: Sequence[str], repetitions: int = 1) -> pd.DataFrame:
     signs = np.array([-1 if name.endswith(MIRRORED) else 1 for name in conditions])
     known = [CONDITIONS[name.removesuffix(MIRRORED)] for name in conditions]
-    headway_m = signs * np.array([one.projected_headway_m for one in known])
-    velocity_mps = signs * np.array([one.relative_velocity_mps for one in known])
+    headway_m = signs * np.array([condition.projected_headway_m for condition in known])
+    velocity_mps = signs * np.array([condition.relative_velocity_mps for condition in known])
     logit = np.column_stack([np.ones(len(known)), headway_m, velocity_mps]) @ truth.logit
     trials = pd.DataFrame(
         {
@@ -221,14 +221,14 @@ def simulate(
     )
 
 
-def significant(own: pd.DataFrame, other: pd.DataFrame | None) -> dict[str, bool]:
+def significant(trials: pd.DataFrame, other: pd.DataFrame | None) -> dict[str, bool]:
     """Return by question what a driver's trials show at p < .05, alone or beside the humans."""
     if other is None:
-        gap = regressions.gap_ols(own, robust=True)
-        judged = judge(regressions.who_first_firth(own), gap, robust=True)
+        gap = regressions.gap_ols(trials, robust=True)
+        judged = judge(regressions.who_first_firth(trials), gap, robust=True)
         return {name: judgement.passed is True for name, judgement in judged.items()}
-    slopes = regressions.who_first_firth(own, less=other).terms
-    cells = shared_cells(own, other, "collided")
+    slopes = regressions.who_first_firth(trials, less=other).terms
+    cells = shared_cells(trials, other, "collided")
     p = {name.replace("_", " "): slope.p for name, slope in slopes.items()}
     p["collisions"] = cells.p if cells else 1.0
     return {question: value < ALPHA for question, value in p.items()}
@@ -247,19 +247,19 @@ class Assumed(NamedTuple):
 class Case:
     """A driver of this truth and size: by itself, or beside the humans."""
 
-    own: Truth
+    driver: Truth
     conditions: tuple[str, ...]
     repetitions: int
     against: str = ""
 
     @property
     def truth(self) -> str:
-        """How the driver is assumed to drive."""
-        return self.own.name
+        """Name of the driver's assumed behaviour."""
+        return self.driver.name
 
     @property
     def trials(self) -> int:
-        """How many trials its driver plays."""
+        """Number of trials that its driver plays."""
         return self.repetitions * len(self.conditions)
 
     def effects(self) -> dict[str, Assumed]:
@@ -268,20 +268,20 @@ class Case:
         for question, (table, number, unit) in QUESTIONS.items():
             if (question in TESTED) is not bool(self.against):
                 reference = getattr(human(), number) if self.against else 0.0
-                sizes[question] = Assumed(table, getattr(self.own, number) - reference, unit)
+                sizes[question] = Assumed(table, getattr(self.driver, number) - reference, unit)
         return {question: size for question, size in sizes.items() if size.effect}
 
-    def found(self, multiple: float, rng: np.random.Generator) -> dict[str, bool]:
+    def detected(self, multiple: float, rng: np.random.Generator) -> dict[str, bool]:
         """Return by question what one simulated study of so many times this size shows."""
-        own = simulate(self.own, self.conditions, round(multiple * self.repetitions), rng)
-        return significant(own, human_sample() if self.against else None)
+        trials = simulate(self.driver, self.conditions, round(multiple * self.repetitions), rng)
+        return significant(trials, human_sample() if self.against else None)
 
 
 @dataclass(frozen=True, slots=True)
 class Played:
     """The trials of an arm as its ego sees them, and how they are assumed to go.
 
-    Of two ``equal`` drivers who are given the same either may be asked about.
+    Either of two ``equal`` drivers with the same prompt may be the focal one.
     """
 
     cell: str
@@ -316,26 +316,26 @@ class Contrast:
     It is ``assumed`` to differ by what the study names, by default, or as it is planted or played.
     """
 
-    own: tuple[Played, ...]
-    other: tuple[Played, ...]
+    level: tuple[Played, ...]
+    reference: tuple[Played, ...]
     measure: str
     assumed: str
     one_sided: bool = False
 
     @property
     def truth(self) -> str:
-        """How the level's driver is assumed to drive."""
-        return self.own[0].truth.name
+        """Name of the assumed behaviour of the level's driver."""
+        return self.level[0].truth.name
 
     @property
     def trials(self) -> int:
-        """How many trials the level has."""
-        return sum(part.repetitions * len(part.conditions) for part in self.own)
+        """Number of trials of the level."""
+        return sum(part.repetitions * len(part.conditions) for part in self.level)
 
     def _levels(self, multiple: float) -> list[pd.DataFrame]:
         """Return both levels; cells of who goes first have sides if one driver has a level."""
         sides = self.one_sided and self.measure == "goes first"
-        return [_level(level, multiple, sides=sides) for level in (self.own, self.other)]
+        return [_level(level, multiple, sides=sides) for level in (self.level, self.reference)]
 
     @property
     def size(self) -> float:
@@ -344,24 +344,26 @@ class Contrast:
         for trials in self._levels(1):
             expected = trials.assign(left_first=_chance(trials["logit"], trials["noise"]))
             means.append(_by_cell(expected, column).groupby("condition")["value"])
-        (one, n), (two, m) = ((values.mean(), values.size()) for values in means)
+        (level, n), (reference, m) = ((values.mean(), values.size()) for values in means)
         weights = (n * m / (n + m)).dropna()
         unit = 1 if self.measure == "gap" else 100
-        return unit * float((one - two).dropna() @ weights / weights.sum())
+        return unit * float((level - reference).dropna() @ weights / weights.sum())
 
     def effects(self) -> dict[str, Assumed]:
         """Return the effect that there is to find."""
         unit = ENDPOINTS[self.measure].unit
         return {self.measure: Assumed(EFFECTS, self.size, unit, self.assumed)}
 
-    def found(self, multiple: float, rng: np.random.Generator) -> dict[str, bool]:
+    def detected(self, multiple: float, rng: np.random.Generator) -> dict[str, bool]:
         """Return whether one simulated study of so many times this size shows a difference."""
         column = ENDPOINTS[self.measure].column
-        own, other = (_by_cell(_drawn(trials, rng), column) for trials in self._levels(multiple))
+        level, reference = (
+            _by_cell(_drawn(trials, rng), column) for trials in self._levels(multiple)
+        )
         if self.measure == "gap":
-            estimate = contrast_means(own, other, "value")
+            estimate = contrast_means(level, reference, "value")
         else:
-            cells = shared_cells(own, other, "value")
+            cells = shared_cells(level, reference, "value")
             estimate = contrast_rates(cells) if cells else None
         p = estimate.p if estimate else None
         return {self.measure: p is not None and p < ALPHA}
@@ -376,7 +378,7 @@ def power(case: Case | Contrast, multiple: float, simulations: int) -> dict[str,
     """Return by question the share of simulated studies of so many times this size that find it."""
     rng, counts = np.random.default_rng(SEED), Counter[str]()
     for _ in range(simulations):
-        counts.update(name for name, shown in case.found(multiple, rng).items() if shown)
+        counts.update(name for name, shown in case.detected(multiple, rng).items() if shown)
     return {question: counts[question] / simulations for question in case.effects()}
 
 
@@ -386,15 +388,15 @@ def chances(
     """Simulate a plan that costs so much; ``groups`` are played ones. Raises UsageError.
 
     Where factors vary, each level but a factor's reference has a row in the study's primary
-    measure. Where none does, or levels change how drivers heed their situation, the drivers by
-    themselves have rows.
+    measure. Where none does, or levels change how drivers react to their situation, the drivers
+    by themselves have rows.
     """
     labels: dict[Case | Contrast, list[tuple[str, str]]] = {}  # equal ones share rows
     for label, against, case in _cases(plan, groups):
         labels.setdefault(case, []).append((label, against))
     for case, names in labels.items():
         at = {m: power(case, m, simulations) for m in MULTIPLES}
-        levels, against = (", ".join(dict.fromkeys(each)) for each in zip(*names, strict=True))
+        levels, against = (", ".join(dict.fromkeys(column)) for column in zip(*names, strict=True))
         for question, (table, effect, unit, by) in case.effects().items():
             enough = next((m for m in MULTIPLES if at[m][question] >= POWER), None)
             key = [table, question, levels, against, case.truth]
@@ -430,16 +432,16 @@ def _cases(plan: Plan, groups: Sequence[Group]) -> Iterator[tuple[str, str, Case
     contrasts = list(_contrasts(plan, truths))
     yield from contrasts
     drivers: dict[frozenset[tuple[str, str]], tuple[Arm, int]] = {}
-    for arm in plan.arms:  # tables pool a pair both ways round
+    for arm in plan.arms:  # tables pool the counterbalanced positions of a pair
         first, repetitions = drivers.get(key := frozenset(_levels(arm).items()), (arm, 0))
         drivers[key] = first, repetitions + arm.repetitions
-    every = [(arm.label, own, n) for arm, n in drivers.values() for own in truths[arm.label]]
-    slopes = {(own.projected_headway, own.relative_velocity) for _, own, _ in every}
+    every = [(arm.label, truth, n) for arm, n in drivers.values() for truth in truths[arm.label]]
+    slopes = {(truth.projected_headway, truth.relative_velocity) for _, truth, _ in every}
     if contrasts and len(slopes) < 2:
         return
-    for label, own, repetitions in every:
+    for label, truth, repetitions in every:
         for against in ("", HUMANS):
-            yield label, against, Case(own, tuple(plan.conditions), repetitions, against)
+            yield label, against, Case(truth, tuple(plan.conditions), repetitions, against)
 
 
 def _contrasts(
@@ -460,13 +462,13 @@ def _contrasts(
             reference, *others = sorted(named, key=partial(_place, plan, factor))
             for level in others:
                 pairs = []
-                for key, own in at.items():
+                for key, level_arms in at.items():
                     cell = key - {(factor, level)}
                     twins = at.get(cell | {(factor, reference)}, [])
-                    reads = factor != PROMPT or own[0].entries
+                    reads = factor != PROMPT or level_arms[0].entries
                     if (factor, level) in key and twins and reads:
                         name = "".join(f" {n}={x}" for n, x in sorted(cell))
-                        pairs.append((name, own, twins))
+                        pairs.append((name, level_arms, twins))
                 for contrast in _assumed(plan, truths, factor, pairs):
                     yield f"{factor}={level}", f"{factor}={reference}", contrast
 
@@ -482,12 +484,12 @@ def _assumed(
     levels = [[(cell, arm) for cell, *both in pairs for arm in both[place]] for place in range(2)]
     ways = min((len(truths[arm.label]) for level in levels for _, arm in level), default=0)
     for way in range(ways):
-        own, other = (
+        of_level, of_reference = (
             tuple(_played(plan, arm, cell, truths[arm.label][way]) for cell, arm in level)
             for level in levels
         )
         yield _with_assumption(
-            plan, factor, Contrast(own, other, _primary(plan), PLAYED, one_sided)
+            plan, factor, Contrast(of_level, of_reference, _primary(plan), PLAYED, one_sided)
         )
 
 
@@ -500,11 +502,11 @@ def _with_assumption(plan: Plan, factor: str, contrast: Contrast) -> Contrast:
         return replace(contrast, assumed=NAMED)
     if contrast.truth != human().name and abs(contrast.size) > NEGLIGIBLE:
         return contrast
-    own = tuple(
+    parts = tuple(
         replace(part, truth=part.truth.plus(_by_default(contrast.measure, part), part.conditions))
-        for part in contrast.own
+        for part in contrast.level
     )
-    return replace(contrast, assumed=DEFAULTS, own=own)
+    return replace(contrast, assumed=DEFAULTS, level=parts)
 
 
 def _by_default(measure: str, level: Played) -> Effect:
@@ -524,8 +526,8 @@ def _image(condition: str, conditions: Sequence[str]) -> str:
     """Return a condition as the driver on the right sees it, named as one of these if it can be."""
     if condition.endswith(MIRRORED):
         return condition.removesuffix(MIRRORED)
-    own = CONDITIONS[condition]
-    mirrored = (-own.projected_headway_m, -own.relative_velocity_mps)
+    driven = CONDITIONS[condition]
+    mirrored = (-driven.projected_headway_m, -driven.relative_velocity_mps)
     for name in conditions:
         known = CONDITIONS.get(name)
         if known and (known.projected_headway_m, known.relative_velocity_mps) == mirrored:
@@ -551,7 +553,7 @@ def _place(plan: Plan, factor: str, level: str) -> int:
 def _rehearses(plan: Plan) -> bool:
     """Return whether a study has nothing but parameters that plant an effect in the emulator.
 
-    What its words plant, or what is planted beside an [effect], is no assumption.
+    Effects that its words plant, or that are planted beside an [effect], are no assumption.
     """
     file = plan.study.file
     words = (word for levels in file.texts.values() for word in levels.values())

@@ -1,4 +1,4 @@
-"""Where the results come from: sweeps, specs, what the calls came to, and what they cost."""
+"""Origin of the results: sweeps, specs, outcomes and costs of the calls."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SELECT sweep_id, name, started_at, ended_at, git_commit, git_dirty, versions,
 FROM sweeps LEFT JOIN sweep_trials USING (sweep_id)
 GROUP BY ALL ORDER BY started_at, sweep_id
 """
-# Of each call the last attempt is the answer; those before it are retries.
+# The last attempt of each call is the answer; those before it are retries.
 CALLS = """
 SELECT provider, model_requested, model_served,
     count(DISTINCT call_key) AS calls,
@@ -76,10 +76,10 @@ WHERE source <> 'human' GROUP BY ALL ORDER BY ALL
 
 
 class Provenance(NamedTuple):
-    """What the report says about the origin of its numbers: rows of the queries here.
+    """Origin of the report's numbers: rows of the queries here.
 
     By driver, variant and spec_hash ``settings`` are the collision rule, what else of the driving
-    task differs from the defaults, and what was sent to the models beside the prompt.
+    task differs from the defaults, and the request parameters of the models.
     """
 
     sweeps: pd.DataFrame
@@ -132,7 +132,7 @@ def tally(study: Study, group: Group) -> Counter[str]:
 
 
 def _settings(spec: Mapping[str, Any]) -> Iterator[str]:
-    """The settings of a driving task, and the parameters of the models on each side of it.
+    """Yield the settings of a driving task, and the parameters of the models on each side of it.
 
     A spec is made with an empty prompt, by which that is known in any format.
     """

@@ -1,4 +1,4 @@
-"""Which trials of a database are looked at: the options of tables, figures and the report."""
+"""Selection of a database's trials: the options of tables, figures and the report."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """What a study keeps of its database: all, where nothing is said."""
+    """Part of a database that a study reads: everything by default."""
 
     models: Sequence[str] | None = None
     """These drivers alone; ``human`` is one."""

@@ -1,4 +1,4 @@
-"""What a study holds: one group of trials per driver and prompt variant, and the humans."""
+"""Trials of a study: one group per driver and prompt variant, and the humans."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ ENOUGH_PER_CONDITION = 5
 
 
 class Study:
-    """The groups of a database, humans first, and what is computed of them once.
+    """The groups of a database, humans first, and results that are computed once.
 
     ``played`` are those of drivers, and ``models`` the ones of them that something is concluded
     from, as ``unjudged`` are the others; ``asked`` and ``unjudged_asked`` are the same of drivers
@@ -62,9 +62,9 @@ class Study:
             self.human = self.human.part(lambda rows: rows["condition"] == condition)
         played = self._groups(self._driven(trials[~is_human]))
         only_asked = self._groups(asked.assign(driver=asked["driver"] + ONLY_ASKED))
-        wanted = self._wanted([*played, *only_asked])
+        chosen = self._selected([*played, *only_asked])
         self.empty = not played
-        self.played = [group for group in played if group in wanted]
+        self.played = [group for group in played if group in chosen]
         self.models = [group for group in self.played if not group.unjudged]
         self.unjudged = [group for group in self.played if group.unjudged]
         if selection.models:  # the one that is named first is what others are compared with
@@ -72,7 +72,7 @@ class Study:
             named = sorted(self.models, key=lambda group: place(without_endpoint(group.driver)))
             levels = [group.levels[MODEL] for group in named if MODEL in group.levels]
             self.order = {**self.order, MODEL: list(dict.fromkeys(levels))}
-        only_asked = [group for group in only_asked if group in wanted]
+        only_asked = [group for group in only_asked if group in chosen]
         self.asked = [group for group in only_asked if not group.unjudged]
         self.unjudged_asked = [group for group in only_asked if group.unjudged]
         with_human = selection.models is None or HUMAN in selection.models
@@ -109,7 +109,7 @@ class Study:
             for group, part in zip(groups, parts, strict=True)
         ]
 
-    def _wanted(self, groups: list[Group]) -> list[Group]:
+    def _selected(self, groups: list[Group]) -> list[Group]:
         """Return the groups of the chosen drivers, at the chosen levels of factors.
 
         Those that were only asked are chosen by the names of their models.
@@ -121,27 +121,27 @@ class Study:
             for group in groups
         }
         valid = dict.fromkeys([HUMAN, *names.values()])
-        wanted = [*valid] if self.selection.models is None else self.selection.models
+        named = [*valid] if self.selection.models is None else self.selection.models
         # Where one driver alone is so called without its endpoint, that is enough.
         short = [*map(without_endpoint, valid)]
         full = {
             name: long for name, long in zip(short, valid, strict=True) if short.count(name) < 2
         }
-        wanted = [name if name in valid else full.get(name, name) for name in wanted]
-        for name in wanted or [""]:
+        named = [name if name in valid else full.get(name, name) for name in named]
+        for name in named or [""]:
             require(valid, "driver", name, f"in {self.db}")
-        kept = [group for group, name in names.items() if name in wanted]
+        kept = [group for group, name in names.items() if name in named]
         where = self.selection.where
         return _at(where, kept, self.db, self.order) if where else kept
 
     @property
     def options(self) -> str:
-        """What its tables depend on besides the results."""
+        """Key of the options that its tables depend on besides the results."""
         return self.selection.key(self.db)
 
     @cached_property
     def findings(self) -> list[str]:
-        """What to know of imported humans."""
+        """Remarks on imported humans."""
         trials, specs = self.frames.trials, self.frames.specs
         recorded = trials[trials["source"] == HUMAN]
         origins = recorded["spec_hash"].map(lambda name: specs.get(name, {}).get("origin"))
@@ -155,17 +155,17 @@ class Study:
 
     @cached_property
     def _human_traces(self) -> int:
-        """So many human traces there are in each condition, or more."""
+        """Smallest number of human traces in a condition."""
         return min(in_human_conditions(self.human.ended)) if self.human.measured else 0
 
     @property
     def calibrated(self) -> bool:
-        """Whether there are human traces enough of every condition to compare others with."""
+        """True if every condition has enough human traces to compare others with."""
         return self._human_traces >= ENOUGH_PER_CONDITION
 
     @property
     def complete(self) -> bool:
-        """Whether the human traces are all there, so that whole trials can be drawn from them."""
+        """True if no human trace is missing, so that whole trials can be drawn from them."""
         return self._human_traces >= HUMAN_TRIALS / len(HUMAN_CONDITIONS)
 
     @cached_property
@@ -204,13 +204,13 @@ class Study:
 
 
 def _keys(trials: pd.DataFrame) -> pd.MultiIndex:
-    """The key of each trial: one id may stand under several specs."""
+    """Return the key of each trial: one id may stand under several specs."""
     return pd.MultiIndex.from_frame(trials[KEYS])
 
 
 @remembered
 def in_one_study(study: Study, *groups: Group) -> bool:
-    """Whether one study was played with all trials of these groups of drivers."""
+    """Return whether one study was played with all trials of these groups of drivers."""
     known = study.frames.studies
     return len(known.orders) < 2 or any(
         all(known.holds(name, group.trials).all() for group in groups) for name in known.orders
@@ -227,8 +227,8 @@ def _chosen(db: Path, studies: Studies, source: StudySource | None) -> tuple[str
     order = listed_levels(source.file, source.file.models)
     study = study_name(source.name, order)
     if study not in studies.orders:
-        held = ", ".join(studies.orders) or "none"
-        raise UsageError(f"{db} holds no trial of the study {study}; it holds those of: {held}")
+        stored = ", ".join(studies.orders) or "none"
+        raise UsageError(f"{db} holds no trial of the study {study}; it holds those of: {stored}")
     recorded = studies.orders[study]
     return study, {
         factor: list(dict.fromkeys([*order.get(factor, ()), *recorded.get(factor, ())]))
@@ -239,7 +239,7 @@ def _chosen(db: Path, studies: Studies, source: StudySource | None) -> tuple[str
 def _pooled_order(studies: Studies) -> Order:
     """Return the levels of each factor in the order of the study that lists the most of them.
 
-    Of equal ones it is the newest; one level alone says no order.
+    The newest of equal ones counts; one level alone gives no order.
     """
     pooled: dict[str, list[str]] = {}
     for factor in dict.fromkeys(name for order in studies.orders.values() for name in order):
@@ -253,7 +253,7 @@ def _pooled_order(studies: Studies) -> Order:
 def _at(
     where: Mapping[str, Sequence[str]], groups: list[Group], db: Path, order: Order
 ) -> list[Group]:
-    """The groups that have one of these levels of each factor.
+    """Return the groups that have one of these levels of each factor.
 
     Raises UsageError where there is none, or no such level.
     """

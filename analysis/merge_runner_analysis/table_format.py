@@ -14,5 +14,5 @@ class TableFormat(StrEnum):
 
     @property
     def suffix(self) -> str:
-        """That of its files."""
+        """Suffix of its files."""
         return {"text": "txt", "latex": "tex"}.get(self, self.value)

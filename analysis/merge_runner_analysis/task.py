@@ -11,7 +11,7 @@ RULE = "collision_rule"
 
 
 def task_settings(scenario: Mapping[str, Any]) -> Iterator[str]:
-    """The collision rule of a driving task, and what else of it differs from the defaults."""
+    """Return the collision rule of a driving task, and settings other than the defaults."""
     defaults = ScenarioConfig().model_dump()
     unusual = {name: value for name, value in scenario.items() if defaults.get(name) != value}
     return leaves({RULE: scenario.get(RULE, defaults[RULE]), **unusual})

@@ -79,7 +79,7 @@ def _selected(
 
 
 def outcomes_with_metrics() -> pd.DataFrame:
-    """The published human outcomes with a column for each metric that they determine."""
+    """Return the published human outcomes with a column for each metric that they determine."""
     outcomes = human_outcomes()
     left = outcomes["merged_first"].eq("left").astype("boolean")
     return outcomes.assign(**{LEFT_FIRST.column: left.where(outcomes["status"] == "finished")})
@@ -105,7 +105,7 @@ def judged(
     overlapped = {tuple(key) for *key, samples in near if _overlap(tasks[key[1]], samples)}
     keys = pd.MultiIndex.from_frame(trials[["trial_id", "spec_hash"]])
     boxes = pd.Series(keys.isin(overlapped), trials.index, dtype="boolean")
-    # What a trace does not show of a trial that another rule ended is open.
+    # A trial that another rule ended stays undecided where its trace shows no overlap.
     boxes = boxes.mask(recorded & ~boxes).where(ended).mask(human, recorded)
     return trials.assign(collided=recorded.mask(human), collided_boxes=boxes)
 
@@ -113,7 +113,7 @@ def judged(
 def _near(tasks: Mapping[str, ScenarioConfig]) -> str:
     configs = [ScenarioConfig(), *tasks.values()]
     step_s = max(task.step_s for task in configs)
-    # What accelerations against each other, and a resistance, add to the way within a step.
+    # Distance that opposed accelerations, and a resistance, add within a step.
     added_m = 2 * (max(task.max_acceleration_mps2 for task in configs) + 2) * step_s**2
     reach_m = max(hypot(task.vehicle_length_m, task.vehicle_width_m) for task in configs)
     names = ", ".join(map(quoted, tasks)) or "NULL"
@@ -121,7 +121,7 @@ def _near(tasks: Mapping[str, ScenarioConfig]) -> str:
 
 
 def _overlap(config: ScenarioConfig, samples: Sequence[Sample]) -> bool:
-    """Whether boxes overlap at any look: at the samples, and at 20 Hz between those of a step."""
+    """Return whether boxes overlap at any sample, or at 20 Hz between those of a step."""
     size = (config.vehicle_length_m, config.vehicle_width_m)
     looks = [(left_m, right_m) for _, _, left_m, _, right_m, _ in samples]
     for before, now in pairwise(samples):
@@ -134,7 +134,7 @@ def _overlap(config: ScenarioConfig, samples: Sequence[Sample]) -> bool:
 def _looks_between(
     before: tuple[float, ...], now: tuple[float, ...], step_s: float
 ) -> Iterator[float]:
-    """A vehicle's positions at the looks within a step, in which its acceleration is constant."""
+    """Yield a vehicle's positions at 20 Hz within a step of constant acceleration."""
     (before_m, before_mps), (now_m, now_mps) = before, now
     acceleration = (now_mps - before_mps) / step_s
     if now_mps <= 0 and now_m > before_m:  # it stopped the vehicle before the end of the step

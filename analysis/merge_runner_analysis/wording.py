@@ -1,4 +1,4 @@
-"""What is judged of a driver beside the humans, and the sentences that verdicts are told in.
+"""Measures that compare a driver with the humans, and the sentences of verdicts.
 
 Nothing here computes: sentences read the finished rows of the table ``verdicts``, so that a page, a
 report and a terminal say the same. pandas is not needed to read them.
@@ -55,7 +55,7 @@ VERDICT_RULE = (
     "p below .05 that is corrected for the number of the driver's measures (Holm). Cannot tell "
     f"yet: neither of the two; that is not “alike”. Of fewer than {ENOUGH} trials nothing is said"
 )
-# What metrics are called in sentences and pages; others keep the label of the table.
+# Names of metrics in sentences and pages; others keep the label of the table.
 METRIC_NAMES = {
     LEFT_FIRST.name: "goes first",
     COLLISIONS.name: "crashes",
@@ -76,7 +76,7 @@ CHANGED = {
     VALID.name: "how many replies are valid",
     COST.name: "the cost of a trial",
 }
-# What is said of a driver that has more or less than another, and what no difference is shown in.
+# Sentence parts: a driver has more than another, has less, or no difference is shown in it.
 COMPARED = {
     LEFT_FIRST.name: ("goes first more often", "goes first less often", "who goes first"),
     GAP.name: ("leaves a larger gap", "leaves a smaller gap", "the gap"),
@@ -101,7 +101,7 @@ UNCORRECTED = (
     "corrected p allows for all of them."
 )
 UNREADABLE = "the stored study cannot be read by this version"
-# Of levels that nobody reads.
+# Note on levels that no driver reads.
 SAME_TRIALS = "not tested: the same trials at both levels, as the drivers do not read what differs"
 MISSING, MINUS = "–", "−"
 TIMES = " × "  # between the factors of an interaction
@@ -170,18 +170,18 @@ class Why(Enum):
 
 
 class Fact(NamedTuple):
-    """What statistics have to say, as a code with its values; as a text it is the sentence."""
+    """Remark of the statistics as a code with its values; as a text it is the sentence."""
 
     why: Why
     values: tuple[object, ...] = ()
 
     def __str__(self) -> str:
-        told = (number(v) if isinstance(v, float) else v for v in self.values)
-        return self.why.value.format(*told, s="" if self.values[:1] == (1,) else "s")
+        texts = (number(v) if isinstance(v, float) else v for v in self.values)
+        return self.why.value.format(*texts, s="" if self.values[:1] == (1,) else "s")
 
 
 def note_of(*remarks: object) -> str:
-    """The note of these remarks, without those that are empty."""
+    """Return the note of these remarks, without those that are empty."""
     return "; ".join(map(str, filter(None, remarks)))
 
 
@@ -200,7 +200,7 @@ class Measure:
 
     ``trait`` names what humans do, ``label`` and ``unit`` head a column, ``rests_on`` is the column
     in which its trials have a value, or "finished", and ``rule`` says how its state is set.
-    ``told`` is a difference in a headline, with the fields ``it`` (the driver), ``own`` and
+    ``difference`` is that of a headline, with the fields ``it`` (its name), ``driver`` and
     ``people``: counts of trials, or values with their intervals. ``says`` has by state the driver's
     part of a sentence, with ``of``, ``humans`` and ``more`` or less. ``ends`` are those of its
     axis. ``margin``: so far from 0, where the humans are, it still is alike.
@@ -212,7 +212,7 @@ class Measure:
     unit: str
     rests_on: str
     rule: str
-    told: str
+    difference: str
     ends: tuple[float, float]
     says: Mapping[str, str] = field(default_factory=dict)
     margin: float | None = None
@@ -228,7 +228,7 @@ MEASURES = {
             "log-odds per m",
             LEFT_FIRST.column,
             "Firth's fit: above 0, likelihood-ratio test at 5 %",
-            "with {it} the one ahead went first in {own} trials, with people in {people}",
+            "with {it} the one ahead went first in {driver} trials, with people in {people}",
             (-0.25, 2.5),
             {
                 SHOWN: "the one ahead goes first, as with people",
@@ -244,7 +244,7 @@ MEASURES = {
             "log-odds per m/s",
             LEFT_FIRST.column,
             "Firth's fit: below 0, likelihood-ratio test at 5 %",
-            "with {it} the slower one went first in {own} trials side by side, with people in "
+            "with {it} the slower one went first in {driver} trials side by side, with people in "
             "{people}",
             (-6.5, 3.0),
             {
@@ -261,7 +261,7 @@ MEASURES = {
             "% of trials",
             BOXES.column,
             "difference within 5 points by its interval; else corrected p below .05",
-            "{it} crashed in {own} trials, people in {people}",
+            "{it} crashed in {driver} trials, people in {people}",
             (0.0, 30.0),
         ),
         Measure(
@@ -271,7 +271,7 @@ MEASURES = {
             "m",
             GAP.column,
             "difference within 1 m by its interval; else corrected p below .05",
-            "{it} left {own} m at the merge point, people {people} m",
+            "{it} left {driver} m at the merge point, people {people} m",
             (0.0, 8.0),
             {
                 SHOWN: "leaves {of} m at the merge point, like people ({humans} m)",
@@ -286,7 +286,7 @@ MEASURES = {
             "m per m",
             GAP.column,
             "HC3 errors: above 0 at 5 %",
-            "with {it} each metre of headway adds {own} m to the gap, with people {people} m",
+            "with {it} each metre of headway adds {driver} m to the gap, with people {people} m",
             (-0.6, 1.0),
             {
                 WEAKER: "each metre of headway adds less to its gap than to people's",
@@ -302,7 +302,7 @@ MEASURES = {
             GAP.column,
             "HC3 errors: largest difference of predicted gaps within 1 m, two one-sided tests at "
             "5 %; not as with people: corrected p of being within below .05",
-            "with {it} who is faster moves the gap by up to {own} m, with people by {people} m",
+            "with {it} who is faster moves the gap by up to {driver} m, with people by {people} m",
             (0.0, 3.0),
             {UNLIKE: "who is faster moves its gap by {of} m"},
             margin=1.0,
@@ -315,21 +315,21 @@ MEASURES = {
             "finished",
             "within 0.5 SD, two one-sided tests at 5 %; not as with people: corrected p of being "
             "within below .05",
-            "{it} holds its accelerations otherwise than people do, by {own} of their SD",
+            "{it} holds its accelerations otherwise than people do, by {driver} of their SD",
             (-2.0, 3.0),
             {UNLIKE: "holds accelerations {more} than people"},
             margin=0.5,
         ),
     )
 }
-# Who went first where a state of who goes first is counted.
+# The vehicle whose first mergers are counted, by measure.
 FIRST = {"headway": "the one ahead", "velocity": "side by side, the slower one"}
-# What a person sees at once comes first in a headline, what is fitted last.
+# Measures that a person sees at once come first in a headline, fitted ones last.
 SEEN_FIRST = ("collisions", "headway", "velocity", "gap", "gap-headway", "gap-velocity", "held")
 
 
 def by_group(rows: Iterable[Any]) -> dict[str, dict[str, Values]]:
-    """The values of a table's rows by the id of their driver and prompt, and by measure.
+    """Return the values of a table's rows by the id of their driver and prompt, and by measure.
 
     ``row`` and ``note`` are added. A group that is not judged has one entry, without a measure.
     """
@@ -341,7 +341,7 @@ def by_group(rows: Iterable[Any]) -> dict[str, dict[str, Values]]:
 
 
 def sentences(rows: Iterable[Any]) -> list[str]:
-    """The headline of a table's rows, then a sentence on each driver and prompt."""
+    """Return the headline of a table's rows, then a sentence on each driver and prompt."""
     groups = by_group(rows)
     kinds = {name: next(iter(of.values()))["kind"] for name, of in groups.items()}
     judged = {n: of for n, of in groups.items() if kinds[n] == LANGUAGE_MODEL and "" not in of}
@@ -355,7 +355,7 @@ def sentences(rows: Iterable[Any]) -> list[str]:
 
 
 def sentence(verdicts: Mapping[str, Values]) -> str:
-    """One driver beside people in a few sentences: its crashes, then the states of its measures."""
+    """Return a few sentences that compare a driver with people: crashes, then measures."""
     if "" in verdicts:
         return f"{capital(verdicts['']['note'])}."
     parts = [crashes(verdicts["collisions"]), *map(_part, verdicts.values())]
@@ -371,7 +371,7 @@ def sentence(verdicts: Mapping[str, Values]) -> str:
 
 
 def _part(values: Values) -> str:
-    """What the state of a measure says; empty where it says nothing."""
+    """Return the sentence part on a measure's state; empty where there is none."""
     says = MEASURES[str(values["measure"])].says.get(shown_state(values), "")
     of, humans = (number(values.get(name)) for name in ("estimate", "human"))
     counted, people = values.get("counted"), values.get("human_counted")
@@ -382,17 +382,16 @@ def _part(values: Values) -> str:
 
 
 def _more(values: Values) -> str:
-    """In which direction a driver differs from people."""
     apart = values.get("difference")
     apart = values.get("estimate") if apart is None else apart
     return "more" if (apart or 0.0) > 0 else "less"
 
 
 def crashes(values: Values) -> str:
-    """The crashes by the rule that was played, then by the humans' where that says otherwise.
+    """Return the crashes by the rule that was played, then by the humans' where they differ.
 
-    ``crashed in 15 of 22 trials by the paper's rule; by people's rule 3 are certain, 12 cannot be
-    told; people in 28 of 990``; empty where no trial ended.
+    ``crashed in 15 of 22 trials; people in 28 of 990``, or empty where no trial ended. Undecided
+    trials are counted apart.
     """
     k, undecided = values.get("k") or 0, values.get("undecided") or 0
     ended = (values["n"] or 0) + undecided
@@ -411,13 +410,12 @@ def crashes(values: Values) -> str:
 
 
 def _percent(collisions: Values, count: int) -> float:
-    """So many trials in percent of all that ended, with the undecided ones."""
     ended = _ended(collisions)
     return 100 * count / ended if ended else 0.0
 
 
-def apart(one: str, other: str, rows: Mapping[str, Values]) -> tuple[str, str]:
-    """The headline of one driver less another, and what else is shown, of rows by their metric.
+def apart(driver: str, other: str, rows: Mapping[str, Values]) -> tuple[str, str]:
+    """Return the headline of a driver less another, and other differences, of rows by their metric.
 
     ``A crashed in 12 of 110 trials, B in 33 of 110: 19.09 points fewer [8.41, 29.78]; corrected
     p = 0.004``.
@@ -425,28 +423,28 @@ def apart(one: str, other: str, rows: Mapping[str, Values]) -> tuple[str, str]:
     crashed = rows.get(COLLISIONS.name, {})
     counts = [crashed.get(f"{name}{of}") for of in ("", "_reference") for name in ("k", "n")]
     if any(count is None for count in counts):
-        return f"{one} against {other}.", _others(one, rows)
+        return f"{driver} against {other}.", _others(driver, rows)
     k, n, k_other, n_other = counts
-    claim = f"{one} crashed in {k} of {n} trials, {other} in {k_other} of {n_other}"
+    claim = f"{driver} crashed in {k} of {n} trials, {other} in {k_other} of {n_other}"
     difference, p, ci = (crashed.get(name) for name in ("difference", "p_corrected", "ci"))
     if min(n or 0, n_other or 0) < ENOUGH:
         return f"{claim}: too few to say more.", ""
     if difference is None or p is None:
-        return f"{claim}.", _others(one, rows)
+        return f"{claim}.", _others(driver, rows)
     if p >= ALPHA:
-        said = f"no difference is shown, {number(difference)} points {brackets(ci)}"
+        result = f"no difference is shown, {number(difference)} points {brackets(ci)}"
         also = UNCORRECTED if ci and ci[0] * ci[1] > 0 else ""
-        claim = f"{claim}: {said}; corrected p {equal_p(p)}."
-        return claim, " ".join(filter(None, (also, _others(one, rows))))
-    # Of fewer, the ends change their signs and their places.
+        claim = f"{claim}: {result}; corrected p {equal_p(p)}."
+        return claim, " ".join(filter(None, (also, _others(driver, rows))))
+    # Where trials are fewer, the ends change their signs and their places.
     ends = ci and sorted(end if difference > 0 else -end for end in ci)
     more = "more" if difference > 0 else "fewer"
-    said = f"{number(abs(difference))} points {more} {brackets(ends)}".rstrip()
-    return f"{claim}: {said}; corrected p {equal_p(p)}.", _others(one, rows)
+    result = f"{number(abs(difference))} points {more} {brackets(ends)}".rstrip()
+    return f"{claim}: {result}; corrected p {equal_p(p)}.", _others(driver, rows)
 
 
-def _others(one: str, rows: Mapping[str, Values]) -> str:
-    """Of all measures but crashes, in which a driver is shown to differ and in which not."""
+def _others(driver: str, rows: Mapping[str, Values]) -> str:
+    """Return the measures besides crashes in which a driver is shown to differ, and the others."""
     shown, unshown = [], []
     for name, (more, less, what) in COMPARED.items():
         values = rows.get(name, {})
@@ -456,20 +454,20 @@ def _others(one: str, rows: Mapping[str, Values]) -> str:
             shown.append(more if values["difference"] > 0 else less)
         else:
             unshown.append(what)
-    said = [f"{one} {joined(shown)}."] if shown else []
-    said += [f"No difference is shown in {joined(unshown)}."] if unshown else []
-    return " ".join(said)
+    parts = [f"{driver} {joined(shown)}."] if shown else []
+    parts += [f"No difference is shown in {joined(unshown)}."] if unshown else []
+    return " ".join(parts)
 
 
 def share(collisions: Values) -> str:
-    """A rate in percent, or ``13.64 to 68.18`` where trials are undecided."""
+    """Return a rate in percent, or ``13.64 to 68.18`` where trials are undecided."""
     k, undecided = collisions.get("k") or 0, collisions.get("undecided") or 0
     least = number(_percent(collisions, k))
     return f"{least} to {number(_percent(collisions, k + undecided))}" if undecided else least
 
 
 def shown_state(values: Values) -> str:
-    """A state as sentences and marks show it: of fewer than ENOUGH trials it cannot be told.
+    """Return a state as sentences and marks show it: fewer than ENOUGH trials are inconclusive.
 
     One of MARGINS within which a difference surely lies is like people's, else it has a direction.
     """
@@ -484,23 +482,23 @@ def shown_state(values: Values) -> str:
 
 
 def _is_within(values: Values) -> bool:
-    """Whether crashes or a gap differ from people's by no more than MARGINS, by the interval."""
+    """Return whether the interval of crashes or of a gap is within MARGINS of people's."""
     margin, ci = MARGINS.get(str(values.get("measure"))), values.get("difference_ci")
     return margin is not None and ci is not None and max(-ci[0], ci[1]) <= margin
 
 
 def differs(values: Values) -> bool:
-    """Whether the driver is shown to differ from the humans in a measure, beyond its margin."""
+    """Return whether the driver is shown to differ from humans in a measure, beyond its margin."""
     return values.get("state") in DIFFERS and not _is_within(values)
 
 
 def headline(
     drivers: Mapping[str, Mapping[str, Values]], kinds: Iterable[Any] = ()
 ) -> tuple[str, str]:
-    """The answer of language models in two parts: the claim, and what else is seen at once.
+    """Return the answer of language models in two parts: the claim, and what else is seen at once.
 
     ``drivers`` are those that are judged, by name: no mock model and no program; ``kinds`` are
-    those of all drivers. Of those with too few outcomes it says the counts alone.
+    those of all drivers. Drivers with too few outcomes have their counts alone.
     """
     if not drivers:
         return _without_models({*kinds}), ""
@@ -520,7 +518,7 @@ def headline(
 
 
 def _without_models(kinds: set[str]) -> str:
-    """Who drove where no language model did."""
+    """Return who drove, in trials without a language model."""
     if LANGUAGE_MODEL in kinds:
         return "No language model is judged here."
     names = {PROGRAM: "programs", MOCK: "scripted stand-ins"}
@@ -530,8 +528,8 @@ def _without_models(kinds: set[str]) -> str:
 
 
 def _likeness(drivers: Mapping[str, Mapping[str, Values]], *, every: bool) -> tuple[str, str]:
-    """The two parts of a headline on drivers with trials enough; ``every``: there are no others."""
-    unlike = {name: found for name, of in drivers.items() if (found := _differing(of))}
+    """Return both parts of a headline on drivers with enough trials; ``every``: on all drivers."""
+    unlike = {name: differences for name, of in drivers.items() if (differences := _differing(of))}
     untold = [
         f"{name} {crashes(of['collisions'])}."
         for name, of in drivers.items()
@@ -545,44 +543,43 @@ def _likeness(drivers: Mapping[str, Mapping[str, Values]], *, every: bool) -> tu
     name = min(unlike, key=lambda name: _seen_first(unlike[name][0]))
     worst = unlike[name][0]
     if len(drivers) == 1 or alike:
-        claim = f"{name} does not drive like people: {told(worst, 'it')}."
+        claim = f"{name} does not drive like people: {difference_sentence(worst, 'it')}."
     else:
         who = "No language model here drives" if every else f"{joined([*drivers])} do not drive"
-        claim = f"{who} like people: {told(worst, name)}."
+        claim = f"{who} like people: {difference_sentence(worst, name)}."
     if alike:
         untold.insert(0, f"No difference from people is shown for {joined(alike)}.")
     return claim, " ".join(untold)
 
 
 def _seen_first(values: Values) -> tuple[int, float]:
-    """The place of a difference among others: what is seen at once, then what is surest."""
+    """Return the place of a difference among others: what is seen at once, then what is surest."""
     return SEEN_FIRST.index(str(values["measure"])), values["p_holm"]
 
 
 def _differing(verdicts: Mapping[str, Values]) -> list[Values]:
-    """The measures in which a driver differs, of most of its trials, what is seen at once first."""
+    """Return the differing measures that rest on most trials, what is seen at once first."""
     unlike = [values for values in verdicts.values() if differs(values) and _most(values, verdicts)]
     return sorted(unlike, key=_seen_first)
 
 
 def _most(values: Values, verdicts: Mapping[str, Values]) -> bool:
-    """Whether a measure rests on trials enough, and on half of those that ended at least."""
+    """Return whether a measure rests on trials enough, and on half of those that ended at least."""
     n = values["n"] or 0
     return n >= ENOUGH and 2 * n >= _ended(verdicts["collisions"])
 
 
 def _ended(collisions: Values) -> int:
-    """How many trials ended, with those that are not known to collide by the humans' rule."""
+    """Return the number of trials that ended, also undecided ones."""
     return (collisions["n"] or 0) + (collisions.get("undecided") or 0)
 
 
 def _finished(verdicts: Mapping[str, Values]) -> int:
-    """How many trials finished: each of them has a gap."""
     return verdicts["gap"]["n"] or 0
 
 
 def _enough(verdicts: Mapping[str, Values]) -> bool:
-    """Whether so many trials finished, or collided by the humans' rule, that a headline may be.
+    """Return whether enough trials finished, or collided by the humans' rule, for a headline.
 
     A driver that differs in measures of too few trials alone is not said to be alike.
     """
@@ -593,7 +590,7 @@ def _enough(verdicts: Mapping[str, Values]) -> bool:
 
 
 def _too_few(drivers: Mapping[str, Mapping[str, Values]], *, alone: bool) -> str:
-    """How many trials of each driver finished, of those that ended."""
+    """Return how many trials of each driver finished, of those that ended."""
     counts = [
         f"{'' if alone else name} {_finished(of)} of {_ended(of['collisions'])}".strip()
         for name, of in drivers.items()
@@ -602,7 +599,7 @@ def _too_few(drivers: Mapping[str, Mapping[str, Values]], *, alone: bool) -> str
 
 
 def _count(drivers: Mapping[str, Mapping[str, Values]]) -> str:
-    """How many comparisons a headline rests on, and how they are corrected."""
+    """Return how many comparisons a headline rests on, and how they are corrected."""
     every = [values for of in drivers.values() for values in of.values()]
     tested = sum(values.get("p_holm") is not None for values in every)
     return (
@@ -611,61 +608,61 @@ def _count(drivers: Mapping[str, Mapping[str, Values]]) -> str:
     )
 
 
-def told(values: Values, it: str) -> str:
-    """One difference in counts or metres: ``it crashed in 24 of 110 trials, people in 28 of 990``.
+def difference_sentence(values: Values, it: str) -> str:
+    """Return a difference as ``it crashed in 24 of 110 trials, people in 28 of 990``.
 
-    Without counts of who goes first it is what the state says. A driver's interval beside a margin
-    has the level of its row, which is named if not 95 %.
+    Without counts of who goes first it is the sentence part of the state. A driver's interval
+    beside a margin has the level of its row, which is named if not 95 %.
     """
     measure = MEASURES[str(values["measure"])]
-    own, people = values.get("counted"), values.get("human_counted")
-    if own is None or people is None:
+    driver, people = values.get("counted"), values.get("human_counted")
+    if driver is None or people is None:
         if measure.name in {"headway", "velocity"}:
             return _part(values)
-        own = with_interval(values["estimate"], values["ci"])
+        driver = with_interval(values["estimate"], values["ci"])
         people = with_interval(values["human"], values["human_ci"])
         if measure.name == "collisions":
-            own, people = f"{own} % of its", f"{people} %"
+            driver, people = f"{driver} % of its", f"{people} %"
     level = values.get("level") if measure.margin is not None and values["ci"] else None
     at = "" if level is None or f"{level:.4g}" == "95" else f" (interval at {level:.4g} %)"
-    return f"{measure.told.format(it=it, own=own, people=people)}{at}"
+    return f"{measure.difference.format(it=it, driver=driver, people=people)}{at}"
 
 
 def with_interval(value: float | None, ci: Sequence[float] | None) -> str:
-    """``68.18 [47.32, 83.64]``; an en dash where there is no value."""
+    """Return ``68.18 [47.32, 83.64]``, or an en dash without a value."""
     return number(value) if value is None else f"{number(value)} {brackets(ci)}".rstrip()
 
 
 def number(value: float | None, decimals: int = DECIMALS, unit: str = "") -> str:
-    """A number as pages and sentences print it: with a true minus sign, and never minus zero."""
+    """Return a number as pages print it: with a true minus sign, and never minus zero."""
     return MISSING if value is None else f"{value:z.{decimals}f}{unit}".replace("-", MINUS)
 
 
 def brackets(ci: Sequence[float] | None, form: Callable[[float], str] = number) -> str:
-    """``[47.32, 83.64]``, or nothing."""
+    """Return ``[47.32, 83.64]``, or nothing."""
     return "" if ci is None else f"[{', '.join(map(form, ci))}]"
 
 
 def money(value: float | None, unit: str = "") -> str:
-    """A price with two decimals, and of a small one two digits that are not 0: ``0.0012``."""
+    """Return a price with two decimals, or with two digits that are not 0: ``0.0012``."""
     if value is None or not 0 < abs(value) < 1:
         return number(value, unit=unit)
     return number(value, max(DECIMALS, 1 - floor(log10(abs(value)))), unit)
 
 
 def p_value(p: float | None) -> str:
-    """A p of three decimals, or that it is smaller."""
+    """Return a p of three decimals, or that it is smaller."""
     return "<0.001" if p is not None and p < 0.001 else number(p, 3)
 
 
 def equal_p(p: float) -> str:
-    """``= 0.012``, or that it is smaller."""
+    """Return ``= 0.012``, or ``< 0.001``."""
     text = p_value(p)
     return f"< {text[1:]}" if text.startswith("<") else f"= {text}"
 
 
 def verdict_word(values: Values) -> str:
-    """A state in words, as it stands in a list of verdicts."""
+    """Return a state in words, as it stands in a list of verdicts."""
     if values.get("state") and (values.get("n") or 0) < ENOUGH:
         return f"fewer than {ENOUGH} trials"
     words = VERDICTS | DIRECTIONS.get(str(values.get("measure")), {})
@@ -673,10 +670,10 @@ def verdict_word(values: Values) -> str:
 
 
 def joined(items: Sequence[str]) -> str:
-    """``a, b and c``."""
+    """Return items as ``a, b and c``."""
     return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"
 
 
 def capital(text: str) -> str:
-    """The text with a capital letter at its beginning."""
+    """Return the text with a capital letter at its beginning."""
     return text[:1].upper() + text[1:]

@@ -15,7 +15,7 @@ SOURCES = (
     *(PROJECT / "analysis/merge_runner_analysis").rglob("*.py"),
 )
 # Files and folders whose sources are checked.
-CHECKED = ("merge_runner",)
+CHECKED = ("merge_runner", "analysis/merge_runner_analysis")
 # Everyday words in place of terms, and relative clauses in place of nouns.
 PHRASES = re.compile(
     r"\b(told|singly|set aside|heeds?|dearest|both ways round|stand-ins?|nobody listens"

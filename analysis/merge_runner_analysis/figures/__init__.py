@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """What a figure shows, for lists; its caption; and the table that holds its numbers.
+    """Title of a figure for lists, its caption, and the table that holds its numbers.
 
     The numbers of those without a table are the metrics of the list of trials.
     """

@@ -102,7 +102,6 @@ def _lines(study: Study) -> dict[str, list[tuple[str, Level]]]:
 
 
 def _named(driver: str, level: Level) -> str:
-    """The driver, with what is said of a stand-in."""
     return f"{driver} ({level.posing})" if level.posing else driver
 
 

@@ -113,18 +113,18 @@ def figure2(study: Study, chosen: list[Group]) -> Figure:
 
 
 def left_first(merged_first: pd.Series) -> Estimate:
-    """Panel C: how often the left vehicle merges first."""
+    """Return how often the left vehicle merges first (panel C)."""
     known = merged_first.dropna()
     return proportion(int((known == "left").sum()), len(known))
 
 
 def gap(gaps_m: pd.Series) -> Estimate:
-    """Panel D: mean gap in m."""
+    """Return the mean gap in m (panel D)."""
     return mean(gaps_m.to_numpy(float))
 
 
 def deviation(rmse_mps: pd.Series) -> Estimate:
-    """Panel E: mean RMSE of the speed in m/s, of a trial that of both vehicles; never below 0."""
+    """Return the mean RMSE of both vehicles' speeds in m/s, never below 0 (panel E)."""
     rmse = mean(rmse_mps.to_numpy(float))
     return rmse if rmse.low is None else replace(rmse, low=max(0.0, rmse.low))
 
@@ -134,7 +134,7 @@ COLUMNS: dict[Summary, str] = {left_first: "merged_first", gap: "gap_m", deviati
 
 
 def points(group: Group, velocity_mps: float, summary: Summary) -> Points:
-    """A summary of the finished trials of each condition with this velocity, by headway in m."""
+    """Return a summary by headway in m of the finished trials with this velocity."""
     return _points(group, summary).get(velocity_mps, [])
 
 
@@ -155,15 +155,15 @@ def _points(group: Group, summary: Summary) -> dict[float, Points]:
 
 @remembered
 def _played(study: Study, group: Group) -> Group:
-    """The group in the conditions of the study: humans drove in others, too."""
+    """Return the group in the conditions of the study: humans drove in others, too."""
     return group.part(lambda trials: trials["condition"].isin(study.conditions))
 
 
 @remembered
 def left_traces(study: Study, group: Group, first: str) -> dict[float, list[Array]]:
-    """Panels A and B: times in s and left speeds in m/s, (n, 2), where ``first`` merged first.
+    """Return times in s and left speeds in m/s, (n, 2), where ``first`` merged first (A, B).
 
-    By relative velocity. Of two different drivers the left one is the ego, as everywhere here.
+    They are by relative velocity. The left one of two different drivers is the ego.
     """
     if not group.measured:
         return {}
@@ -177,11 +177,11 @@ def left_traces(study: Study, group: Group, first: str) -> dict[float, list[Arra
 
 
 def published_gap_line(velocity_mps: float) -> tuple[Array, Array]:
-    """The human regression of the gap as the paper prints it: headways and gaps in m.
+    """Return the human regression of the gap as the paper prints it: headways and gaps in m.
 
     The line spans the headways of the humans' conditions, whatever other conditions were driven.
     """
-    farthest_m = max(abs(one.projected_headway_m) for one in HUMAN_CONDITIONS.values())
+    farthest_m = max(abs(condition.projected_headway_m) for condition in HUMAN_CONDITIONS.values())
     headway = np.linspace(-farthest_m, farthest_m, 81)
     terms = published("paper_gap").query("driver == 'human'")["b"].to_numpy(float)
     return headway, gap_design(headway, np.full_like(headway, velocity_mps)) @ terms
@@ -209,12 +209,12 @@ def _draw_traces(axis: Axes, study: Study, group: Group, first: str, styles: Sty
 
 
 def _draw_estimates(axis: Axes, group: Group, summary: Summary, styles: Styles) -> None:
-    found = [points(group, velocity, summary) for velocity in styles]
-    for index, (part, look) in enumerate(zip(found, styles.values(), strict=True)):
+    series = [points(group, velocity, summary) for velocity in styles]
+    for index, (part, look) in enumerate(zip(series, styles.values(), strict=True)):
         draw_points(axis, part, 0.3 * (index - (len(styles) - 1) / 2), look)
     if summary is gap and not group.measured:
         _draw_humans(axis, group, summary, styles, "--")
-    elif not any(found):
+    elif not any(series):
         _say(axis, "no such trial" if group.measured else MISSING)
 
 
@@ -224,28 +224,31 @@ def _say(axis: Axes, text: str) -> None:
 
 
 def _draw_humans(axis: Axes, human: Group, summary: Summary, styles: Styles, dashes: str) -> None:
-    """The humans as lines, of gaps before an import as the paper's regression has them."""
+    """Draw the humans as lines; before an import gaps follow the paper's regression."""
     for velocity in {*styles} & {*HUMAN_VELOCITIES_MPS}:
         if summary is gap and not human.measured:
             x, y = published_gap_line(velocity)
         else:
-            found = [(x, one.value) for x, one in points(human, velocity, summary)]
-            x, y = np.array(found, dtype=float).reshape(-1, 2).T
+            means = [(x, estimate.value) for x, estimate in points(human, velocity, summary)]
+            x, y = np.array(means, dtype=float).reshape(-1, 2).T
         axis.plot(x, y, color=styles[velocity]["color"], ls=dashes, lw=0.8)
 
 
 def _scale(axes: NDArray[np.object_], groups: list[Group], study: Study) -> None:
-    """One scale per quantity: all values and lines, and intervals as far as single trials reach."""
+    """Set one scale per quantity: all values and lines, intervals as far as single trials reach."""
     speeds = [limit for axis in axes[0, :2] for limit in axis.get_ylim()]
     for axis in axes[0, :2]:
         axis.set_ylim(min(speeds), max(speeds))
     axes[0, 2].set(ylim=(-0.08, 1.08), yticks=[0, 0.5, 1])
     velocities = {velocity for _, velocity in study.conditions.values()}
     for axis, summary in zip(axes[0, 3:], (gap, deviation), strict=True):
-        found = [one for g in groups for v in velocities for _, one in points(g, v, summary)]
-        if not found:
+        estimates = [
+            estimate for g in groups for v in velocities for _, estimate in points(g, v, summary)
+        ]
+        if not estimates:
             continue
-        frame = pd.DataFrame([(one.value, one.low, one.high) for one in found], dtype=float)
+        ends_of = [(estimate.value, estimate.low, estimate.high) for estimate in estimates]
+        frame = pd.DataFrame(ends_of, dtype=float)
         single = pd.concat([g.finished[COLUMNS[summary]] for g in groups if g.measured])
         ends = frame[1].quantile(1 - SHOWN), frame[2].quantile(SHOWN)
         values = [*frame[0], max(ends[0], single.min()), min(ends[1], single.max())]

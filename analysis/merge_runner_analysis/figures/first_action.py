@@ -61,5 +61,5 @@ def _human_first_actions(study: Study) -> Points:
 
 def _first_actions(study: Study, seat: Seat) -> Points:
     by_velocity = first_actions(study, seat).groupby("velocity_mps")
-    found = ((float(velocity), mean(rows)) for velocity, rows in by_velocity)
-    return [(velocity, estimate) for velocity, estimate in found if estimate]
+    estimates = ((float(velocity), mean(rows)) for velocity, rows in by_velocity)
+    return [(velocity, estimate) for velocity, estimate in estimates if estimate]

@@ -58,7 +58,7 @@ def write_figures(study: Study, folder: Path) -> Iterator[Path]:
 
 
 def rendered(study: Study, name: str, form: Form) -> bytes:
-    """One figure as a file, without a date, so that equal results give equal bytes."""
+    """Return a figure as a file, without a date, so that equal results give equal bytes."""
     out = io.BytesIO()
     with mpl.rc_context(SETTINGS):
         MAKERS[name](study).savefig(out, format=form, metadata=METADATA[form])

@@ -1,4 +1,4 @@
-"""What all figures share: sizes, colours, markers, the fonts; and estimates as they draw them."""
+"""Style of all figures: sizes, colours, markers, fonts, and how estimates are drawn."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def wrapped(text: str, width: int) -> str:
 def place(figure: Figure, grid: NDArray[Any] = NO_GRID) -> None:
     """Lay a figure out once: matplotlib would do so at each drawing, and draw it once more.
 
-    Of a ``grid`` of panels with shared scales those inside are placed by the others.
+    The inner panels of a ``grid`` with shared scales are aligned with the outer ones.
     """
     inner = grid[1:-1, 1:]
     for panel in inner.flat:
@@ -64,15 +64,17 @@ def place(figure: Figure, grid: NDArray[Any] = NO_GRID) -> None:
     engine.execute(figure)
     figure.set_layout_engine(None)
     for (row, column), panel in np.ndenumerate(inner):
-        above, beside = (other.get_position() for other in (grid[0, column + 1], grid[row + 1, 0]))
-        panel.set_position((above.x0, beside.y0, above.width, beside.height))
+        above, left = (other.get_position() for other in (grid[0, column + 1], grid[row + 1, 0]))
+        panel.set_position((above.x0, left.y0, above.width, left.height))
 
 
 def draw_points(
     axis: Axes, points: Points, shift: float, style: Style, *, horizontal: bool = False
 ) -> None:
     """Draw estimates with their intervals, ``shift`` beside their places on the axis."""
-    rows = [(place + shift, one.value, one.low, one.high) for place, one in points]
+    rows = [
+        (place + shift, estimate.value, estimate.low, estimate.high) for place, estimate in points
+    ]
     places, values, low, high = np.array(rows, dtype=float).reshape(-1, 4).T
     errors = np.nan_to_num(np.vstack([values - low, high - values]))
     at: Style = {"x": places, "y": values, "yerr": errors}

@@ -48,7 +48,7 @@ class File:
 
 @contextmanager
 def open_files(path: Path) -> Iterator[list[File]]:
-    """All files of a folder and those below it, or of a zip; raises UsageError."""
+    """Yield all files of a folder and those below it, or of a zip; raises UsageError."""
     if path.is_dir():
         yield list(_files_below(path))
     elif not path.exists():
@@ -96,7 +96,7 @@ def _file(path: Path, name: str) -> File:
 
 
 def _member(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> File:
-    """A file of a zip; raises UsageError for a path out of it: such a zip is an attack."""
+    """Return a file of a zip; raises UsageError for a path out of it: such a zip is an attack."""
     inside = PureWindowsPath(member.orig_filename)
     if inside.anchor or ".." in inside.parts:
         raise UsageError(

@@ -21,18 +21,18 @@ FROM trials LEFT JOIN specs USING (spec_hash) WHERE source = 'human'
 
 
 def human_trials(db: Path) -> pd.DataFrame:
-    """The human trials of a database; raises UsageError."""
+    """Return the human trials of a database; raises UsageError."""
     return load(TRIALS, db)
 
 
 def of_published_pairs(trials: pd.DataFrame) -> pd.DataFrame:
-    """The trials of the nine published pairs; all, where there is none of these."""
+    """Return the trials of the nine published pairs; all, where there is none of these."""
     is_published = trials["pair"].isin(PAIRS.values())
     return trials[is_published] if is_published.any() else trials
 
 
 def findings(trials: pd.DataFrame) -> Iterator[str]:
-    """What to know of human trials, which have the columns of TRIALS."""
+    """Yield remarks on imported human trials, which have the columns of TRIALS."""
     chosen = of_published_pairs(trials)
     if len(chosen) < HUMAN_TRIALS:
         yield (
@@ -52,12 +52,12 @@ def findings(trials: pd.DataFrame) -> Iterator[str]:
 
 
 def by_pair(trials: pd.DataFrame) -> pd.DataFrame:
-    """Counts of each pair: trials and OUTCOMES."""
+    """Return counts of each pair: trials and OUTCOMES."""
     return _counted(trials, "pair")
 
 
 def by_condition(trials: pd.DataFrame) -> pd.DataFrame:
-    """The same of each condition over the published pairs, and how many trials are published."""
+    """Return counts of each condition over the published pairs, and the published ones."""
     published_pairs = trials[trials["pair"].isin(PAIRS.values())]
     known = published("human_outcomes").set_index("condition")[OUTCOMES].astype(str)
     counts = _counted(published_pairs, "condition").reindex(HUMAN_CONDITIONS, fill_value=0)

@@ -44,7 +44,7 @@ class Report:
 
 
 def sort_files(files: Iterable[File]) -> list[Source]:
-    """The files with trials, recordings first; raises UsageError for a bomb."""
+    """Return the files with trials, recordings first; raises UsageError for a bomb."""
     sources: list[Source] = []
     for file in files:
         if name := NAME.fullmatch(PurePath(file.name).name):

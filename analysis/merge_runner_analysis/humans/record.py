@@ -62,7 +62,7 @@ _READ = {
 }
 SPEC = canonical_json(_READ)
 SPEC_HASH = spec_hash(SPEC)
-# Of the velocity pages, which show no positions.
+# The spec of the velocity pages, which show no positions.
 PAGE_SPEC = canonical_json(
     _READ
     | {
@@ -127,7 +127,7 @@ def parse_csv(content: bytes) -> Trace:
 
 
 def trial_record(trace: Trace, experiment: int, iteration: int, page: str = "") -> TrialRecord:
-    """The record of trial ``iteration`` of an experiment; raises Unreadable.
+    """Return the record of trial ``iteration`` of an experiment; raises Unreadable.
 
     ``page`` is the condition of the velocity page that shows it.
     """
@@ -175,7 +175,7 @@ def _status(trace: Trace) -> Status:
 
 
 def _condition(trace: Trace) -> str:
-    """The condition from whose start the first sample is within the tolerances."""
+    """Return the condition from whose start the first sample is within the tolerances."""
     at_m = [trace.positions_m[side][0] for side in SIDES]
     mps = [trace.velocities_mps[side][0] for side in SIDES]
     for name, condition in HUMAN_CONDITIONS.items():
@@ -188,7 +188,7 @@ def _condition(trace: Trace) -> str:
 
 
 def _arrival(positions_m: list[float]) -> float:
-    """When a vehicle reaches the merge point, in steps from the first sample; inf: never."""
+    """Return the steps from the first sample to the merge point; inf if it is never reached."""
     for step, (before, now) in enumerate(pairwise(positions_m)):
         if before < TRACK.merge_point_m <= now:
             return step + (TRACK.merge_point_m - before) / (now - before)
@@ -196,7 +196,7 @@ def _arrival(positions_m: list[float]) -> float:
 
 
 def _states(trace: Trace) -> Iterator[StateRow]:
-    """Every sample; time 0 is the first with both vehicles out of their tunnels."""
+    """Yield every sample; time 0 is the first with both vehicles out of their tunnels."""
     places = zip(*trace.positions_m.values(), strict=True)
     out = (sample for sample, both in enumerate(places) if min(both) > TRACK.tunnel_exit_m)
     if (start := next(out, None)) is None:
@@ -214,13 +214,13 @@ def _states(trace: Trace) -> Iterator[StateRow]:
 
 
 def condition_of(name: str) -> str | None:
-    """The condition whose page has this file name, or None."""
+    """Return the condition whose page has this file name, or None."""
     file = PurePath(name).name
     return PAGES.get(file) or PAGES.get(file.partition("_")[2])
 
 
 def trials_of(page: bytes, condition: str) -> Iterator[tuple[int, int, Lines]]:
-    """Experiment, iteration and both lines of each trial; raises Unreadable for a whole page."""
+    """Yield each trial's experiment, iteration and lines; raises Unreadable for a whole page."""
     trials: dict[tuple[int, int], Lines] = {}
     try:
         # The page holds all of Plotly before the last plot, whose lines are its first list.
@@ -243,7 +243,7 @@ def trials_of(page: bytes, condition: str) -> Iterator[tuple[int, int, Lines]]:
 
 
 def trace_of(trial: Lines, condition: str) -> Trace:
-    """A trial's trace, with positions from its speeds; raises Unreadable."""
+    """Return a trial's trace, with positions from its speeds; raises Unreadable."""
     try:
         numbers = {(axis, side): _numbers(trial[side][axis]) for axis in "xy" for side in SIDES}
         shown = pd.DataFrame(numbers, dtype=float)
@@ -266,7 +266,7 @@ def trace_of(trial: Lines, condition: str) -> Trace:
 
 
 def _numbers(values: object) -> object:
-    """The numbers of a line: a list, or base64 of little-endian ones."""
+    """Return the numbers of a line: a list, or base64 of little-endian ones."""
     if isinstance(values, dict):
         content = base64.b64decode(values["bdata"], validate=True)
         return np.frombuffer(content, np.dtype(values["dtype"]).newbyteorder("<"))
@@ -274,7 +274,7 @@ def _numbers(values: object) -> object:
 
 
 def _end_state(trial: Lines, ends_m: dict[Side, float], end_s: float) -> str:
-    """The recorder's word for the end, of how the lines are drawn and where the vehicles are."""
+    """Return the recorder's word for the end, by the drawn lines and the vehicles' positions."""
     dashes = [(trial[side].get("line") or {}).get("dash", FIRST) for side in SIDES]
     if dashes == [COLLIDED, COLLIDED]:
         return "Collided"

@@ -39,7 +39,7 @@ class HumanCounts(NamedTuple):
 
 @cache
 def human_counts() -> dict[str, HumanCounts]:
-    """The published outcomes by condition."""
+    """Return the published outcomes by condition."""
     return {
         row["condition"]: HumanCounts(*(int(row[name]) for name in HumanCounts._fields))
         for row in _rows("human_outcomes")
@@ -48,7 +48,7 @@ def human_counts() -> dict[str, HumanCounts]:
 
 @cache
 def citation(name: str) -> str:
-    """Where the values of a shipped file come from."""
+    """Return the source of the values in a shipped file."""
     return next(row["citation"] for row in _rows("sources") if row["file"] == f"{name}.csv")
 
 
@@ -59,19 +59,19 @@ def _rows(name: str) -> list[dict[str, str]]:
 
 @cache
 def published(name: str) -> pd.DataFrame:
-    """One shipped file, by its name without ``.csv``; texts stay texts, gaps become NaN."""
+    """Return a shipped file, by its name without ``.csv``; texts stay texts, gaps become NaN."""
     import pandas as pd
 
     return pd.read_csv(DATA / f"{name}.csv", keep_default_na=False, na_values={})
 
 
 def printed_value(value: str | float) -> str | float:
-    """A printed number; a bound of p such as ``<0.001`` stays text."""
+    """Return a printed number; a bound of p such as ``<0.001`` stays text."""
     return float(value) if isinstance(value, str) and not value.startswith("<") else value
 
 
 def human_outcomes() -> pd.DataFrame:
-    """The 990 human trials as far as they are published.
+    """Return the 990 human trials as far as they are published.
 
     Columns as in ``trials``: condition, projected_headway_m, relative_velocity_mps, status,
     merged_first. ``collided_boxes``: the experiment's collisions are boxes that overlap.

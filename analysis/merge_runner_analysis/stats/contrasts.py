@@ -40,7 +40,7 @@ class Cells:
 
     @property
     def shares(self) -> NDArray[np.float64]:
-        """What each cell weighs, of 1; a trial that stands in two cells is half a one in each."""
+        """Weight of each cell, of 1; a trial that stands in two cells counts half in each."""
         n, m = (
             (1 + of) / 2 * size for of, size in zip(self.varying, (self.n, self.m), strict=True)
         )
@@ -66,8 +66,9 @@ class Cells:
         n, m = self.n, self.m
         p, q = _likeliest(self.a, n, self.b, m, apart)
         every = n + m
-        one, other = self.varying
-        of_cells = (one * p * (1 - p) / n + other * q * (1 - q) / m) * every / (every - 1)
+        first_varying, second_varying = self.varying
+        of_cells = (first_varying * p * (1 - p) / n + second_varying * q * (1 - q) / m) * every
+        of_cells = of_cells / (every - 1)
         return float(self.shares**2 @ of_cells)
 
     def end(self, sign: int, z: float = Z) -> float:
@@ -83,19 +84,19 @@ class Cells:
         far, near = float(sign), value + sign * NEAREST
         if sign * near >= 1 or beyond(far) <= 0:
             return far
-        # The side of 0 on which the end lies is what the test of no difference says.
+        # The test of no difference says on which side of 0 the end lies.
         if sign * value < 0 and sign * near < 0:
             far, near = (0.0, near) if beyond(0.0) > 0 else (far, 0.0)
         return near if beyond(near) >= 0 else float(optimize.brentq(beyond, near, far))
 
     @property
     def p(self) -> float:
-        """Of Fisher's exact test within cells, two-sided by probability."""
+        """The p-value of Fisher's exact test within cells, two-sided by probability."""
         chances, least = np.ones(1), 0
         for a, n, b, m in zip(self.a, self.n, self.b, self.m, strict=True):
-            there = np.arange(max(0, a + b - m), min(n, a + b) + 1)
-            chances = np.convolve(chances, stats.hypergeom.pmf(there, n + m, a + b, n))
-            least += there[0]
+            possible = np.arange(max(0, a + b - m), min(n, a + b) + 1)
+            chances = np.convolve(chances, stats.hypergeom.pmf(possible, n + m, a + b, n))
+            least += possible[0]
         # As likely but for rounding is as likely.
         likely = chances <= chances[self.a.sum() - least] * (1 + 1e-7)
         return min(1.0, float(chances[likely].sum() / chances.sum()))
@@ -104,7 +105,7 @@ class Cells:
 def _likeliest(
     a: NDArray[np.int_], n: NDArray[np.int_], b: NDArray[np.int_], m: NDArray[np.int_], apart: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The likeliest rates of which the first is by so much larger (Miettinen and Nurminen 1985).
+    """Return the likeliest rates that are so far apart (Miettinen and Nurminen 1985).
 
     The second is a root of a cubic, which their appendix gives in closed form.
     """
@@ -123,7 +124,7 @@ def _likeliest(
 def weighted(
     k: NDArray[np.int_], n: NDArray[np.int_], weights: NDArray[np.float64]
 ) -> tuple[float, float]:
-    """A rate of which conditions have weights, and the trials that it is as good as."""
+    """Return a rate of which conditions have weights, and the trials that it is as good as."""
     shares = weights / weights.sum()
     return float(shares @ (k / n)), 1 / float(shares**2 @ (1 / n))
 
@@ -149,11 +150,11 @@ def shared_cells(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Cel
 
 
 def contrast_rates(cells: Cells) -> Estimate:
-    """Two rates within cells: the test of Mantel and Haenszel (1959), and its score interval.
+    """Compare two rates within cells: Mantel and Haenszel's test (1959), with a score interval.
 
     The interval has the differences that the test of Miettinen and Nurminen (1985) does not reject.
     ``detectable`` is the one that is so many standard errors from 0 as it takes for the power. None
-    where not even rates of 0 and 1 would be told apart.
+    where not even rates of 0 and 1 would differ.
     """
     value, se = cells.difference, sqrt(cells.variance(0))
     ends = cells.end(-1), cells.end(1)
@@ -167,25 +168,23 @@ def contrast_rates(cells: Cells) -> Estimate:
 
 
 def _detectable(cells: Cells, sign: int) -> float | None:
-    """Return the smallest difference in this direction that is found with the power."""
-
     def missing(size: float) -> float:
         return Z_WITH_POWER * sqrt(cells.variance(sign * size)) - size
 
     return None if missing(NEAREST) <= 0 else float(optimize.brentq(missing, NEAREST, 1.0))
 
 
-def difference_of_contrasts(one: Cells, other: Cells) -> Estimate:
-    """How far two differences of rates differ: an interaction.
+def difference_of_contrasts(cells: Cells, others: Cells) -> Estimate:
+    """Return the difference of two differences of rates: an interaction.
 
     Its interval follows from those of both (MOVER; Zou and Donner 2008), and p is the level at
     which that leaves 0 out.
     """
-    differences = one.difference, other.difference
+    differences = cells.difference, others.difference
     value = differences[0] - differences[1]
 
     def half(sign: int, z: float) -> float:
-        apart = (one.end(sign, z) - differences[0], other.end(-sign, z) - differences[1])
+        apart = (cells.end(sign, z) - differences[0], others.end(-sign, z) - differences[1])
         return hypot(*apart)
 
     def left_out(z: float) -> float:
@@ -201,10 +200,10 @@ def difference_of_contrasts(one: Cells, other: Cells) -> Estimate:
 
 
 def detectable_rate(n: int, m: int, rate: float) -> float | None:
-    """The smallest difference from a true ``rate`` that Fisher's test of n and m trials finds.
+    """Return the minimum detectable effect of Fisher's test of n and m trials at a true ``rate``.
 
-    In the direction in which less is enough; None where not even rates of 0 and 1 are told apart
-    from it with the power.
+    In the direction in which less is enough; None where not even rates of 0 and 1 differ from it
+    with the power.
     """
     chances = rejected(n, m) @ stats.binom.pmf(np.arange(m + 1), m, rate)
 
@@ -217,8 +216,8 @@ def detectable_rate(n: int, m: int, rate: float) -> float | None:
 
 @cache
 def rejected(n: int, m: int) -> NDArray[np.bool_]:
-    """Of all outcomes, successes of n by successes of m, those with a Fisher's p below .05."""
-    found = np.empty((n + 1, m + 1), dtype=bool)
+    """Return by successes of n and of m whether Fisher's p is below .05."""
+    is_rejected = np.empty((n + 1, m + 1), dtype=bool)
     ways = [-special.betaln(np.arange(k + 1) + 1, k + 1 - np.arange(k + 1)) for k in (n, m)]
     for total in range(n + m + 1):
         a = np.arange(max(0, total - m), min(n, total) + 1)
@@ -229,12 +228,12 @@ def rejected(n: int, m: int) -> NDArray[np.bool_]:
         order = np.argsort(p)
         # As likely but for rounding is as likely.
         last = np.searchsorted(p[order], p * (1 + 1e-7), side="right") - 1
-        found[a, total - a] = np.cumsum(p[order])[last] < 1 - LEVEL
-    return found
+        is_rejected[a, total - a] = np.cumsum(p[order])[last] < 1 - LEVEL
+    return is_rejected
 
 
 def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Estimate | None:
-    """Two means, compared within the conditions that both have by Welch's test.
+    """Compare two means within the conditions that both have, by Welch's test.
 
     The difference is that of a linear model with a level for each condition, so that another mix of
     conditions, as when one group collides more in some, makes no difference. Its error holds where
@@ -247,14 +246,16 @@ def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> E
     shared = {*known[0]["condition"]} & {*known[1]["condition"]}
     if not shared:
         return None
-    one, other = (frame[frame["condition"].isin(shared)] for frame in known)
-    cells, conditions = pd.factorize(pd.concat([one["condition"], other["condition"]]))
-    belongs = np.repeat([1.0, 0.0], [len(one), len(other)])
-    values = np.concatenate([one[measure], other[measure]]).astype(float)
+    first_rows, second_rows = (frame[frame["condition"].isin(shared)] for frame in known)
+    cells, conditions = pd.factorize(pd.concat([first_rows["condition"], second_rows["condition"]]))
+    belongs = np.repeat([1.0, 0.0], [len(first_rows), len(second_rows)])
+    values = np.concatenate([first_rows[measure], second_rows[measure]]).astype(float)
     trials = np.bincount(cells)[cells]
-    # Of what is left of both within conditions, the slope is that of the whole model (Frisch and
-    # Waugh 1933; Lovell 1963).
-    group, value = (each - np.bincount(cells, each)[cells] / trials for each in (belongs, values))
+    # The slope of the residuals within conditions is that of the whole model (Frisch and Waugh
+    # 1933; Lovell 1963).
+    group, value = (
+        column - np.bincount(cells, column)[cells] / trials for column in (belongs, values)
+    )
     weight = float(group @ group)
     left_over = 1 - 1 / trials - group**2 / weight
     if left_over.min() < LEVERAGE:
@@ -272,19 +273,19 @@ def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> E
 
 
 def means_within(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> tuple[float, float]:
-    """Both means, of the conditions that both have, which weigh as in their difference."""
+    """Return both means, of the conditions that both have, which weigh as in their difference."""
     frames = first.loc[first[measure].notna()], second.loc[second[measure].notna()]
     cells, conditions = pd.factorize(pd.concat([frame["condition"] for frame in frames]))
     size, counts, sums = len(frames[0]), [], []
-    for own, frame in zip((cells[:size], cells[size:]), frames, strict=True):
+    for codes, frame in zip((cells[:size], cells[size:]), frames, strict=True):
         values = frame[measure].to_numpy(float)
-        counts.append(np.bincount(own, minlength=len(conditions)))
-        sums.append(np.bincount(own, values, minlength=len(conditions)))
+        counts.append(np.bincount(codes, minlength=len(conditions)))
+        sums.append(np.bincount(codes, values, minlength=len(conditions)))
     shared = (counts[0] > 0) & (counts[1] > 0)
-    (n, m), (one, other) = ([part[shared] for part in parts] for parts in (counts, sums))
+    (n, m), (first_sum, second_sum) = ([part[shared] for part in parts] for parts in (counts, sums))
     shares = n * m / (n + m)
     shares /= shares.sum()
-    return float(shares @ (one / n)), float(shares @ (other / m))
+    return float(shares @ (first_sum / n)), float(shares @ (second_sum / m))
 
 
 def _freedom(
@@ -294,7 +295,7 @@ def _freedom(
     left_over: NDArray[np.float64],
     variances: NDArray[np.float64],
 ) -> float:
-    """The degrees of freedom of an HC2 error of the first group's effect, by Satterthwaite (1946).
+    """Return the degrees of freedom of an HC2 error by Satterthwaite (1946).
 
     The error is a quadratic form of the residuals, whose mean and variance follow from the
     ``variances`` of the second and the first group. Trials of one group and condition are alike, so
@@ -303,20 +304,20 @@ def _freedom(
     both = 2 * cells + belongs.astype(int)
     _, at, size = np.unique(both, return_index=True, return_counts=True)
     cell, x, n = cells[at], group[at], size.astype(float)
-    variance, each = variances[belongs[at].astype(int)], group[at] ** 2 / left_over[at]
+    variance, factor = variances[belongs[at].astype(int)], group[at] ** 2 / left_over[at]
     trials = np.bincount(cells)[cell]
     fitted = (cell[:, None] == cell) / trials + np.outer(x, x) / float(group @ group)
     # The covariance of residuals of different trials, and what one has beside that with itself.
     apart = (fitted * (n * variance)) @ fitted - fitted * (variance[:, None] + variance)
-    own = variance + np.diag(apart)
-    mean = float(n * each @ own)
-    square = float((n * each) @ apart**2 @ (n * each))
-    square += float((n * each**2) @ (own**2 - np.diag(apart) ** 2))
+    residual_variance = variance + np.diag(apart)
+    mean = float(n * factor @ residual_variance)
+    square = float((n * factor) @ apart**2 @ (n * factor))
+    square += float((n * factor**2) @ (residual_variance**2 - np.diag(apart) ** 2))
     return mean**2 / square
 
 
 def corrected(p: list[float]) -> list[float]:
-    """A family's p-values by Holm (1979).
+    """Return a family's p-values by Holm (1979).
 
     Not by statsmodels' multipletests, which collects garbage at every call: 0.1 s each, and there
     is a family for every measure of every driver. A test holds both against each other.

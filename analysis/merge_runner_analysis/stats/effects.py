@@ -1,4 +1,4 @@
-"""What a factor changes: each of its levels against the reference, in every measure.
+"""Effects of factors: each level against the reference, in every measure.
 
 Levels are compared within the cells that both have: a condition with one level of each other
 factor. A driver is a level of the factor ``model``; an interaction is a difference of differences,
@@ -40,8 +40,8 @@ class Effect:
 
     ``at_level`` and ``at_reference`` are the estimates within the shared cells, in which the trials
     count without ``left_out``; their ``difference`` has its interval, p and detectable. Values are
-    None where nothing is compared. Of an interaction the first two have no value but their trials.
-    Of an interaction ``across`` are the same two levels at the reference of the other factor.
+    None where nothing is compared. The first two of an interaction have no value but their trials;
+    its ``across`` are the same two levels at the reference of the other factor.
     ``p_corrected`` is by Holm's method, in the family that ``primary`` tells.
     """
 
@@ -70,7 +70,7 @@ class Effect:
 
     @property
     def key(self) -> tuple[frozenset[str], str, str]:
-        """What is compared, whichever of two factors it is shown by."""
+        """Identity of the comparison, whichever of two factors it is shown by."""
         level = self.level
         names = {f"{level.factor}={level.name}", level.at}
         return frozenset(names), level.mark, self.metric.name
@@ -96,19 +96,22 @@ def effects(study: Study, by: str = "") -> list[Effect]:
     factor.
     """
     if not by:
-        main = [one for levels in levels_by_factor(study) for one in _of_levels(study, levels)]
+        main = [
+            effect for levels in levels_by_factor(study) for effect in _of_levels(study, levels)
+        ]
         return _with_corrected(study, [*main, *_interactions(study)])
     if by == DRIVER:
         names = list(dict.fromkeys(group.driver for group in study.models))
         interactions = []
     else:
         names = require(levels_of(study.models, study.order), "factor", by)
-        p_corrected = {one.key: one.p_corrected for one in effects(study)}
+        p_corrected = {effect.key: effect.p_corrected for effect in effects(study)}
         interactions = [
-            replace(one, p_corrected=p_corrected.get(one.key)) for one in _interactions(study, by)
+            replace(effect, p_corrected=p_corrected.get(effect.key))
+            for effect in _interactions(study, by)
         ]
     by_factor = chain.from_iterable(levels_by_factor(study, by, name) for name in names)
-    simple = [one for levels in by_factor for one in _of_levels(study, levels)]
+    simple = [effect for levels in by_factor for effect in _of_levels(study, levels)]
     return [*_with_corrected(study, simple), *interactions]
 
 
@@ -128,7 +131,7 @@ def driver_effects(study: Study, driver: Group, reference: Group) -> list[Effect
 
 @remembered
 def primary(study: Study) -> Metric:
-    """The measure that the study names as its primary one, else who goes first.
+    """Return the measure that the study names as its primary one, else who goes first.
 
     Raises UsageError where there is no such measure.
     """
@@ -144,12 +147,11 @@ def asks_of_models(study: Study) -> bool:
 
 
 def _measures() -> dict[str, Metric]:
-    """What a study may call its primary measure."""
     return {PRIMARY: LEFT_FIRST, "collided": COLLISIONS, **METRICS}
 
 
 def _named(study: Study) -> str:
-    """The primary measure that stands in the study's file: empty without one.
+    """Return the primary measure that stands in the study's file: empty without one.
 
     The file is that of the chosen study, else the one whose parts are in use, else the only one
     that was played, whose own measures are missing where its plug-ins are not in use.
@@ -190,7 +192,7 @@ def _file(study: Study) -> tuple[StudyFile | None, str]:
 
 @remembered
 def measured(study: Study) -> list[Metric]:
-    """The metrics of which some trial has a value, the primary one first.
+    """Return the metrics of which some trial has a value, the primary one first.
 
     Where the rule that was played is the humans' own, collisions by that are no second measure.
     """
@@ -198,7 +200,7 @@ def measured(study: Study) -> list[Metric]:
     same = all(rows[COLLISIONS.column].equals(rows[BOXES.column]) for rows in trials)
     return [
         metric
-        for metric in sorted(METRICS.values(), key=lambda one: one is not primary(study))
+        for metric in sorted(METRICS.values(), key=lambda measure: measure is not primary(study))
         if any(rows[metric.column].notna().any() for rows in trials)
         and not (same and metric is BOXES)
     ]
@@ -213,8 +215,8 @@ def _of_levels(study: Study, levels: Sequence[Level]) -> Iterator[Effect]:
 def _interactions(study: Study, by: str = "") -> Iterator[Effect]:
     """Compare effects between the levels of another factor, or of this one, and its first.
 
-    The two differences are those of the factor that stands first, so that both ways round the
-    interaction is one number.
+    The two differences are those of the factor that stands first, so that the interaction is one
+    number in either order.
     """
     factors = levels_of(study.models, study.order)
     varying = [name for name, levels in factors.items() if len(levels) > 1]
@@ -223,7 +225,7 @@ def _interactions(study: Study, by: str = "") -> Iterator[Effect]:
     pairs = [(name, by) for name in varying if name != by] if by else combinations(varying, 2)
     for factor, other in pairs:
         swapped = other in varying and varying.index(other) < varying.index(factor)
-        # Those of stand-ins are apart.
+        # Those of mock models are apart.
         first, *others = (
             [levels for levels in levels_by_factor(study, other, at) if levels[0].factor == factor]
             for at in factors[other]
@@ -311,31 +313,31 @@ def _with_corrected(study: Study, effects: list[Effect]) -> list[Effect]:
     """
     of_model = {MODEL, DRIVER} if asks_of_models(study) else set()
     is_primary = [
-        one.metric is primary(study)
-        and not one.across
-        and (one.level.factor in of_model or one.level.factor not in (MODEL, DRIVER))
-        for one in effects
+        effect.metric is primary(study)
+        and not effect.across
+        and (effect.level.factor in of_model or effect.level.factor not in (MODEL, DRIVER))
+        for effect in effects
     ]
-    p = {place: one.difference.p for place, one in enumerate(effects)}
-    for own in (True, False):
+    p = {place: effect.difference.p for place, effect in enumerate(effects)}
+    for of_primary in (True, False):
         family = {
-            place: one.difference.p
-            for place, one in enumerate(effects)
-            if is_primary[place] is own
-            and one.difference.p is not None
-            and (one.difference.se or one.difference.value)
+            place: effect.difference.p
+            for place, effect in enumerate(effects)
+            if is_primary[place] is of_primary
+            and effect.difference.p is not None
+            and (effect.difference.se or effect.difference.value)
         }
         p |= dict(zip(family, contrasts.corrected([*family.values()]), strict=True))
     return [
-        replace(one, primary=is_primary[place], p_corrected=p[place])
-        for place, one in enumerate(effects)
+        replace(effect, primary=is_primary[place], p_corrected=p[place])
+        for place, effect in enumerate(effects)
     ]
 
 
 def trials_by_cell(study: Study, groups: Sequence[Group], metric: Metric) -> list[pd.DataFrame]:
     """Return the ``value`` of each group's trials and their cell as ``condition``, in cells of all.
 
-    Cells of programs that do not heed what the groups differ in are left out. Nothing where the
+    Cells of programs that ignore the groups' difference are left out. Nothing where the
     groups are of several studies or have undecided trials.
     """
     if not in_one_study(study, *groups) or any(undecided(group, metric) for group in groups):

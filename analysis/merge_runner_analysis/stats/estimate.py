@@ -43,13 +43,13 @@ class Estimate:
     ends_at: Callable[[float], tuple[float, float] | None] | None = None
 
     def bounds(self) -> tuple[float, float] | None:
-        """Both ends of the interval."""
+        """Return both ends of the interval."""
         if self.low is None or self.high is None:
             return None
         return self.low, self.high
 
     def times(self, factor: float) -> Estimate:
-        """The same in another unit, as a share in percent; not its weight or its trials."""
+        """Return the same in another unit, as a share in percent; not its weight or its trials."""
         ends = (self.value, self.low, self.high, self.se, self.detectable)
         value, low, high, se, least = (None if end is None else factor * end for end in ends)
         return replace(self, value=value, low=low, high=high, se=se, detectable=least)

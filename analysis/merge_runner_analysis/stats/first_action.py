@@ -59,11 +59,11 @@ class Seat(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The group's label, or that of one of a mixed pair: its program is no stand-in."""
+        """The group's label, or that of one of a mixed pair: its program is no mock model."""
         group, side = self
         if not side:
             return group.label
-        remark = group.said if group.trials[f"{side}_scripted"].any() else group.caution
+        remark = group.remark if group.trials[f"{side}_scripted"].any() else group.caution
         driver = f"{group.models[SIDES.index(side)]} of {group.driver}"
         return f"{driver} ({remark})" if remark else driver
 

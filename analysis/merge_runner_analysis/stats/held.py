@@ -10,7 +10,7 @@ ways: into straight lines (held accelerations), and into cubics (accelerations t
 
 A piece has its coefficients, and all but the first a place where it begins (Schwarz 1978). Above 0
 the acceleration is rather held, below 0 it rather moves. The best pieces are found by dynamic
-programming (Bellman 1961; exact). What is left is taken relative to how far the speed leaves one
+programming (Bellman 1961; exact). The residual is taken relative to how far the speed leaves one
 straight line, so that driving twice as hard changes nothing; the tolerance sigma keeps the last
 digits of a simulation from ruling.
 """
@@ -59,13 +59,13 @@ def measure_profiles(speeds: pd.DataFrame) -> pd.DataFrame:
 
 
 def at_5_hz(time_s: Array, velocity_mps: Array) -> Array:
-    """The speeds at multiples of 0.2 s, linear between samples where they lie closer."""
+    """Return the speeds at multiples of 0.2 s, linear between samples where they lie closer."""
     samples = int(np.floor(time_s[-1] / SAMPLE_S + 1e-9)) + 1 if len(time_s) else 0
     return np.asarray(np.interp(np.arange(samples) * SAMPLE_S, time_s, velocity_mps))
 
 
 def without_resistance(time_s: Array, velocity_mps: Array) -> Array:
-    """The speeds had the human simulator not slowed the vehicle, by 0.5 + 0.005 v^2 in m/s^2.
+    """Return the speeds without the human simulator's resistance of 0.5 + 0.005 v^2 in m/s^2.
 
     A pedal that is held gives a straight line here, and an exponential there. A vehicle that stands
     is slowed by nothing.
@@ -76,7 +76,7 @@ def without_resistance(time_s: Array, velocity_mps: Array) -> Array:
 
 
 def gains(velocity_mps: Array) -> Array:
-    """The gains of vehicles with equally many samples at 5 Hz, (vehicles, samples)."""
+    """Return the gains of vehicles with equally many samples at 5 Hz, (vehicles, samples)."""
     n, parts = velocity_mps.shape[1], []
     for start in range(0, len(velocity_mps), AT_ONCE):
         lines, cubics = residuals(velocity_mps[start : start + AT_ONCE])
@@ -88,7 +88,7 @@ def gains(velocity_mps: Array) -> Array:
 
 
 def _criterion(left: Array, coefficients: int, n: int) -> Array:
-    """The lowest criterion of 1, 2, ... pieces: ``left`` of 1 is (pieces, vehicles)."""
+    """Return the lowest criterion of 1, 2, ... pieces: ``left`` of 1 is (pieces, vehicles)."""
     pieces = np.arange(1, len(left) + 1)
     numbers = pieces * coefficients + pieces - 1
     criterion = n * np.log(left + TOLERANCE**2) + (numbers * np.log(n))[:, None]
@@ -96,7 +96,7 @@ def _criterion(left: Array, coefficients: int, n: int) -> Array:
 
 
 def residuals(velocity_mps: Array) -> tuple[Array, Array]:
-    """Least sums of squares of 1, 2, ... lines, and of cubics, (pieces, vehicles); or inf."""
+    """Return (pieces, vehicles) least sums of squares of 1, 2, ... lines, and of cubics; or inf."""
     y = (velocity_mps - velocity_mps[:, :1]).T
     n, vehicles = y.shape
     i = np.arange(n)[:, None]
@@ -115,7 +115,7 @@ def residuals(velocity_mps: Array) -> tuple[Array, Array]:
 
 
 def _last_piece(sums: list[Array], end: int) -> tuple[Array, Array]:
-    """Sums of squares beside one piece that ends before ``end``: (starts, vehicles) from 0 on.
+    """Return a last piece's sums of squares, (starts, vehicles), where it ends before ``end``.
 
     By projections on the discrete orthogonal polynomials of degree 0 to 3 (Gram 1883).
     """

@@ -53,14 +53,14 @@ TESTED = {
 
 
 class Judgement(NamedTuple):
-    """Whether an indicator holds; None where the data cannot tell, for the reason ``why``."""
+    """Verdict on an indicator: ``passed`` is None where the data cannot tell, for ``why``."""
 
     passed: bool | None
     why: Fact | None = None
 
 
 def disagree(first: Judgement, second: Judgement) -> bool:
-    """Whether one says that an indicator holds and the other that it does not."""
+    """Return whether one judgement passed and the other failed."""
     return None not in {first.passed, second.passed} and first.passed != second.passed
 
 
@@ -87,7 +87,7 @@ def _judged(fit: Regression, name: str, *, robust: bool) -> Judgement:
 
 
 def profiles(study: Study, group: Group) -> pd.DataFrame:
-    """One row a vehicle of a group: whether it acted, and how far its acceleration is held."""
+    """Return a row a vehicle: whether it acted, and how far its acceleration is held."""
     return of_trials(_all_profiles(study), group.trials)
 
 
@@ -100,7 +100,7 @@ def _all_profiles(study: Study) -> pd.DataFrame:
 
 @remembered
 def gains(study: Study, group: Group) -> pd.DataFrame:
-    """One row a finished trial: condition, pair, ``steady`` (nobody acted), and ``gain`` or NaN."""
+    """Return a row a finished trial: condition, pair, ``steady`` (nobody acted), ``gain``."""
     by_trial = profiles(study, group).groupby(KEYS, as_index=False)
     gain = by_trial.agg(steady=("steady", "all"), gain=("gain", "mean"))
     return group.finished[[*KEYS, "condition", "pair"]].merge(gain, on=KEYS)
@@ -113,7 +113,7 @@ def mean_gain(study: Study, group: Group) -> Estimate:
 
 
 def less_humans(study: Study, group: Group) -> Estimate | None:
-    """The mean gain less that of humans in the same conditions, in human standard deviations.
+    """Return the mean gain less that of humans in equal conditions, in human standard deviations.
 
     None for the humans, and without a spread of human trials in every condition.
     """
@@ -123,7 +123,7 @@ def less_humans(study: Study, group: Group) -> Estimate | None:
 
 
 def likeness(driver: pd.DataFrame, human: pd.DataFrame) -> Estimate:
-    """The difference between rows of ``gains``, with Welch's interval over trials and pairs.
+    """Return the difference between rows of ``gains``, with Welch's interval over trials and pairs.
 
     The standard deviation is that of human trials within conditions.
     """
@@ -143,14 +143,14 @@ def likeness(driver: pd.DataFrame, human: pd.DataFrame) -> Estimate:
 
 
 def _independent(trials: pd.DataFrame, column: str) -> pd.Series:
-    """Values of trials, or means of human pairs, whose trials hang together."""
+    """Return values of trials, or means of human pairs, whose trials are correlated."""
     paired = trials["pair"].notna()
     means = trials[paired].groupby("pair")[column].mean()
     return pd.concat([trials.loc[~paired, column], means])
 
 
 def piecewise_constant(study: Study, group: Group) -> Judgement:
-    """I5: whether the accelerations of a group are held and jump, rather than move."""
+    """Judge I5: whether the accelerations of a group are piecewise constant."""
     gain = mean_gain(study, group)
     if gain.low is not None:
         return Judgement(gain.low > 0)
@@ -213,7 +213,7 @@ def ceiling(sizes: tuple[int, ...]) -> dict[str, dict[str, float]]:
 
 
 def total(judged: dict[str, Judgement]) -> str | None:
-    """How many indicators hold by one rule, ``3 of 4``; None where none can be judged."""
+    """Return how many indicators hold, ``3 of 4``; None where none can be judged."""
     known = [verdict.passed for verdict in judged.values() if verdict.passed is not None]
     return f"{sum(known)} of {len(known)}" if known else None
 

@@ -30,7 +30,7 @@ NOTHING = Estimate()
 
 
 def proportion(successes: int, n: int) -> Estimate:
-    """A proportion with its Wilson score interval (Wilson 1927).
+    """Return a proportion with its Wilson score interval (Wilson 1927).
 
     Not by statsmodels, whose bounds can miss 0, 1 and the proportion by a rounding, and which takes
     60 times as long and seconds to import; a test holds both against each other.
@@ -54,21 +54,21 @@ def melded(
     less, more = _at_most(first, second), _at_most(second, first)
     tails = [less(0.0), more(0.0)]
     near = min(tails)
-    wanted = min(alpha * near / max(p, TINY), (1 + near) / 2)
-    part = max(alpha / 2, wanted) if p < alpha else min(alpha / 2, wanted)
+    share = min(alpha * near / max(p, TINY), (1 + near) / 2)
+    part = max(alpha / 2, share) if p < alpha else min(alpha / 2, share)
     parts = [part if place == tails.index(near) else alpha / 2 for place in (0, 1)]
     return _lower(less, parts[0]), -_lower(more, parts[1])
 
 
 def _lower(at_most: Callable[[float], float], part: float) -> float:
-    """The lower end of the melded interval of a difference, which leaves this part out."""
+    """Return the lower end of the melded interval of a difference, which leaves this part out."""
     if at_most(-1.0) >= part:
         return -1.0
     return float(optimize.brentq(lambda at: at_most(at) - part, -1.0, 1.0))
 
 
 def _at_most(first: tuple[float, float], second: tuple[float, float]) -> Callable[[float], float]:
-    """The chance that one rate at its lowest exceeds another at its highest by at most so much.
+    """Return the chance that a lowest rate exceeds a highest one by at most so much.
 
     They are the lower and the upper beta distribution of Clopper and Pearson (1934). At 0 it is the
     p of Fisher's exact test that the first rate is not the larger.
@@ -88,7 +88,7 @@ def _beta(a: float, b: float, x: float | NDArray[np.float64]) -> NDArray[np.floa
 
 
 def mean(values: Sequence[float] | NDArray[np.float64]) -> Estimate:
-    """A mean of numbers with its interval of Student's t; none for fewer than two of them."""
+    """Return a mean with its interval of Student's t; fewer than two numbers have no interval."""
     sample = np.asarray(values, dtype=float)
     sample = sample[np.isfinite(sample)]
     n = len(sample)
@@ -98,20 +98,20 @@ def mean(values: Sequence[float] | NDArray[np.float64]) -> Estimate:
 
 
 def estimate(value: float, se: float, freedom: float, n: int) -> Estimate:
-    """An estimate with its interval of Student's t."""
+    """Return an estimate with its interval of Student's t."""
     return Estimate(value, *interval(value, se, freedom), n, se, freedom)
 
 
 def interval(
     value: float, se: float, freedom: float = inf, level: float = LEVEL
 ) -> tuple[float, float]:
-    """The interval of an estimate with this standard error, by Student's t."""
+    """Return the interval of an estimate with this standard error, by Student's t."""
     half = float(special.stdtrit(freedom, (1 + level) / 2)) * se
     return value - half, value + half
 
 
 def at(result: Estimate, level: float) -> Estimate:
-    """The same with its interval at a level; without its ends where there are none."""
+    """Return the same with its interval at a level; without its ends where there are none."""
     ends = None
     if result.ends_at:
         ends = result.ends_at(level)
@@ -122,12 +122,12 @@ def at(result: Estimate, level: float) -> Estimate:
 
 
 def two_sided_p(statistic: float, freedom: float = inf) -> float:
-    """The p-value of a t statistic against no effect, in either direction."""
+    """Return the p-value of a t statistic against no effect, in either direction."""
     return float(2 * special.stdtr(freedom, -abs(statistic)))
 
 
 def tested(value: float, se: float, freedom: float) -> Estimate:
-    """A difference with this standard error, against none by Student's t."""
+    """Return a difference with this standard error, against none by Student's t."""
     # Equal but for rounding is equal; where nothing varies, any other difference is sure.
     statistic = 0.0 if abs(value) < ROUNDING else value / se if se else inf
     p = two_sided_p(statistic, freedom)
@@ -136,7 +136,7 @@ def tested(value: float, se: float, freedom: float) -> Estimate:
 
 
 def difference(first: Estimate, second: Estimate) -> Estimate | None:
-    """One independent estimate less another.
+    """Return one independent estimate less another.
 
     It is tested as Welch (1947) does, so that the 5 % hold also where the groups differ in size and
     in variance, with the degrees of freedom of a sum of variances (Satterthwaite 1946). None where
@@ -151,7 +151,7 @@ def difference(first: Estimate, second: Estimate) -> Estimate | None:
 
 
 def detectable(se: float, freedom: float = inf) -> float:
-    """The smallest effect that a two-sided t test at 5 % finds with a power of 0.8.
+    """Return the smallest effect that a two-sided t test at 5 % finds with a power of 0.8.
 
     It is (t.975 + t.8) standard errors, the usual approximation to the noncentral t.
     """

@@ -30,7 +30,7 @@ class Level:
 
     The trials have a column ``cell``: their condition and the levels of all other factors. Cells
     in which programs play the same trials are one cell. ``pooled.whole`` has the copies, too.
-    ``posing`` is what is said of scripted stand-ins; the ``mark`` tells their level from others'.
+    ``posing`` is the label of mock models; the ``mark`` distinguishes their level.
     ``at`` is the level of another factor that all of its trials have, if it is shown by that one.
     """
 
@@ -59,50 +59,50 @@ class Level:
 
 @remembered
 def copied_cells(study: Study, groups: tuple[Group, ...]) -> set[Cell]:
-    """The cells of programs that do not heed what the groups differ in.
+    """Return the cells of programs that ignore the groups' difference.
 
     With the same other levels, all trials of one of two groups are copies of the other's there, in
-    every condition that both have. What they differ by is how often each was drawn, so that nothing
+    every condition that both have. They differ only by how often each was drawn, so that nothing
     can be tested. Conditions are never left out one by one: which of them stay would depend on
     what happened there.
     """
     ways = [_ways(study, group) for group in groups]
     copied: set[Cell] = set()
-    for one, other in combinations(ways, 2):
-        for others in one.keys() & other.keys():
-            if _are_copies(one[others], other[others]):
-                copied |= {(name, *others) for name in one[others].keys() & other[others].keys()}
+    for first, second in combinations(ways, 2):
+        for others in first.keys() & second.keys():
+            if _are_copies(first[others], second[others]):
+                copied |= {(name, *others) for name in first[others].keys() & second[others].keys()}
     return copied
 
 
 @remembered
 def _ways(study: Study, group: Group) -> dict[Cell, dict[str, set[object]]]:
-    """The ways in which trials went, by the levels of the other factors and by condition."""
+    """Return the ways in which trials went, by the levels of the other factors and by condition."""
     ways: dict[Cell, dict[str, set[object]]] = {}
     for (condition, *others), way in zip(group.ended["cell"], group.ended["way"], strict=True):
         ways.setdefault((*others,), {}).setdefault(condition, set()).add(way)
     return ways
 
 
-def _are_copies(one: Mapping[str, set[object]], other: Mapping[str, set[object]]) -> bool:
-    """Whether in every condition that both have all trials of one are among the other's."""
-    shared = one.keys() & other.keys()
+def _are_copies(ways: Mapping[str, set[object]], others: Mapping[str, set[object]]) -> bool:
+    """Return whether in each shared condition all trials of one are among the other's."""
+    shared = ways.keys() & others.keys()
     return bool(shared) and all(
-        one[name] <= other[name] or other[name] <= one[name] for name in shared
+        ways[name] <= others[name] or others[name] <= ways[name] for name in shared
     )
 
 
 def copied_of_shared(study: Study, *levels: Level) -> tuple[int, int]:
-    """How many of the cells that levels share are copied ones, and how many they share."""
+    """Return the numbers of copied cells and of all cells that levels share."""
     shared = set.intersection(*({*level.pooled.ended["cell"]} for level in levels))
     return len(shared & copied_cells(study, tuple(level.pooled for level in levels))), len(shared)
 
 
 @remembered
 def levels_by_factor(study: Study, by: str = "", at: str = "", least: int = 2) -> list[list[Level]]:
-    """The levels of each factor that has so many of them at ``least``, the reference first.
+    """Return the levels of each factor that has so many of them at ``least``, the reference first.
 
-    Trials of scripted stand-ins are never pooled with others. With ``by``, the trials are those
+    Trials of mock models are never pooled with others. With ``by``, the trials are those
     ``at`` one of its levels.
     """
     chosen = [group for group in study.models if not by or _level_of(group, by) == at]
@@ -122,8 +122,8 @@ def _level_of(group: Group, factor: str) -> str | None:
 
 def _level(every: list[Group], factor: str, name: str, by: str, *, apart: bool) -> Level:
     groups = [group for group in every if group.levels.get(factor) == name]
-    said = {group.posing for group in groups}
-    posing = said.pop() if len(said) == 1 else "scripted stand-ins"
+    texts = {group.posing for group in groups}
+    posing = texts.pop() if len(texts) == 1 else "scripted stand-ins"
     mark = " [scripted]" if apart and posing else ""
     at = f"{by}={_level_of(groups[0], by)}" if by else ""
     pooled = _with_cells(groups, {factor, by})
@@ -131,7 +131,7 @@ def _level(every: list[Group], factor: str, name: str, by: str, *, apart: bool) 
 
 
 def _with_cells(groups: Sequence[Group], apart_from: set[str]) -> Group:
-    """Groups as one, whose trials have their cell: condition and levels of the other factors."""
+    """Return groups as one, with each trial's cell: condition and levels of the other factors."""
     parts = []
     for group in groups:
         others = [f"{n}={level}" for n, level in group.levels.items() if n not in apart_from]
@@ -142,27 +142,27 @@ def _with_cells(groups: Sequence[Group], apart_from: set[str]) -> Group:
     return replace(groups[0], trials=pd.concat(parts, ignore_index=True))
 
 
-def crossing(study: Study, factors: Sequence[str], wanted: Mapping[str, str]) -> list[Level]:
-    """The trials at these levels of several factors, as a level of their crossing.
+def crossing(study: Study, factors: Sequence[str], levels: Mapping[str, str]) -> list[Level]:
+    """Return the trials at these levels of several factors, as a level of their crossing.
 
-    Those of scripted stand-ins are another one.
+    Those of mock models are another one.
     """
-    chosen = [g for g in study.models if all(_level_of(g, f) == at for f, at in wanted.items())]
-    found = []
+    chosen = [g for g in study.models if all(_level_of(g, f) == at for f, at in levels.items())]
+    crossed = []
     for scripted in (False, True):
         groups = [group for group in chosen if group.scripted == scripted]
         if not groups:
             continue
         mark = " [scripted]" if scripted and len(groups) < len(chosen) else ""
-        name = ", ".join(wanted[factor] for factor in factors)
-        pooled = _with_cells(groups, {*wanted})
+        name = ", ".join(levels[factor] for factor in factors)
+        pooled = _with_cells(groups, {*levels})
         ids = tuple(group.id for group in groups)
-        found += _distinct(study, [Level(TIMES.join(factors), name, ids, pooled, mark=mark)])
-    return found
+        crossed += _distinct(study, [Level(TIMES.join(factors), name, ids, pooled, mark=mark)])
+    return crossed
 
 
 def _distinct(study: Study, levels: list[Level]) -> list[Level]:
-    """The levels, each without copies of trials, and with the cells that share these as one."""
+    """Return the levels without copies of trials; cells that share copies become one."""
     names: dict[Cell, Cell] = {}
 
     def first(cell: Cell) -> Cell:
@@ -178,33 +178,35 @@ def _distinct(study: Study, levels: list[Level]) -> list[Level]:
 
 
 def _with_copies(study: Study, group: Group) -> Iterator[Iterable[Cell]]:
-    """Cells that have copies of each other's trials.
+    """Yield cells that have copies of each other's trials.
 
-    Of programs those of a condition in which any trials are equal. A stand-in plays with chance:
-    its trials of two levels that it reads may be equal here and there, which makes them no copies.
+    Cells of programs have them in a condition with any equal trials. A mock model plays with
+    chance: a few equal trials of two levels that it reads are no copies.
     """
     if not group.scripted:
         yield from (cells for _, cells in group.trials.groupby(["condition", "way"])["cell"])
         return
-    for (own, one), (its, other) in combinations(_ways(study, group).items(), 2):
-        if _are_copies(one, other):
-            yield from (((name, *own), (name, *its)) for name in one.keys() | other.keys())
+    for (levels, ways), (other_levels, other_ways) in combinations(_ways(study, group).items(), 2):
+        if _are_copies(ways, other_ways):
+            yield from (
+                ((name, *levels), (name, *other_levels)) for name in ways.keys() | other_ways.keys()
+            )
 
 
 @remembered
 def distinct(study: Study, group: Group) -> Group:
-    """A group with each of its trials once, as a level has it; ``whole`` has the copies, too."""
+    """Return a group with each trial once, as a level has it; ``whole`` has the copies, too."""
     every = Level(DRIVER, group.id, (group.id,), _with_cells([group], set()))
     (level,) = _distinct(study, [every])
     return level.pooled if level.copies else group
 
 
 def _without_copies(level: Level, first: Callable[[tuple[str, ...]], tuple[str, ...]]) -> Level:
-    """The level with each trial once.
+    """Return the level with each trial once.
 
     Where the copies of one have their ego on both sides, nobody was given anything that is read:
-    it is a trial of two that are told the same, and read from both sides (``sides``). That is so
-    where all trials of one side are among the other's: here and there a stand-in's are by chance.
+    it is a trial of two with the same prompt, and read from both sides (``sides``). That is so
+    where all trials of one side are among the other's: here and there a mock model's are by chance.
     """
     every = level.pooled.trials
     every = every.assign(cell=pd.Series([first(cell) for cell in every["cell"]], dtype=object))
@@ -214,7 +216,7 @@ def _without_copies(level: Level, first: Callable[[tuple[str, ...]], tuple[str, 
 
 
 def _once(every: pd.DataFrame, *, scripted: bool) -> pd.DataFrame:
-    """The trials without copies; a stand-in's are so at the same levels of other factors alone."""
+    """Return the trials without copies; a mock model's are copies at equal other levels alone."""
     others = pd.Series([" ".join(others) for _, *others in every["cell"]], every.index)
     way = every["way"] + (" " + others if scripted else "")
     for _, rows in every.groupby(others):

@@ -1,4 +1,4 @@
-"""What a group of trials comes to by a metric, and what is known of the humans."""
+"""Estimates of a group of trials by a metric, and the published ones of humans."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def trials_of(group: Group, metric: Metric) -> pd.DataFrame:
 
 
 def values(group: Group, metric: Metric) -> pd.Series:
-    """The values of the trials that count. Everything that counts trials counts these."""
+    """Return the values of the trials that count. Everything that counts trials counts these."""
     return trials_of(group, metric)[metric.column].dropna()
 
 
@@ -40,7 +40,7 @@ def counts(group: Group, metric: Metric) -> tuple[int, int]:
 
 @remembered
 def estimate(group: Group, metric: Metric) -> Estimate:
-    """The metric of a group with its 95 % interval, rates in percent.
+    """Return the metric of a group with its 95 % interval, rates in percent.
 
     Where trials end undecided a rate has no value, and the interval is that of both worst cases
     (Manski 1989): from none of them to all of them.
@@ -80,7 +80,7 @@ def linear(value: pd.Series, weight: pd.Series, cells: pd.Series) -> pd.Series:
 
 
 def mean_of(trials: pd.DataFrame, column: str, shares: pd.Series | None = None) -> Estimate:
-    """The mean of trials with its interval; with ``shares`` conditions weigh so.
+    """Return the mean of trials with its interval; with ``shares`` conditions weigh so.
 
     Trials of human pairs hang together: there the error is a jackknife over the pairs, with t on a
     degree of freedom less than there are.
@@ -108,7 +108,7 @@ def _weighted_mean(trials: pd.DataFrame, column: str, shares: pd.Series) -> floa
 
 
 def median(sample: np.ndarray) -> Estimate:
-    """A median with its interval of order statistics; fewer than six values have no interval."""
+    """Return a median with its interval of order statistics; fewer than six values have none."""
     if not len(sample):
         return NOTHING
     n, ordered = len(sample), np.sort(sample)
@@ -129,7 +129,7 @@ def _ranks(n: int) -> tuple[int, int]:
 
 @remembered
 def undecided(group: Group, metric: Metric) -> int:
-    """How many trials another collision rule ended, so that they are not known to collide by it."""
+    """Return the number of trials that another collision rule ended before this one could."""
     if metric.value not in JUDGED or not known(group, metric):
         return 0
     trials = trials_of(group, metric)
@@ -137,7 +137,7 @@ def undecided(group: Group, metric: Metric) -> int:
 
 
 def undecided_note(group: Group, metric: Metric) -> Fact | None:
-    """What is known of a rate some of whose trials are undecided; None where none is."""
+    """Return the bounds of a rate with undecided trials; None without such trials."""
     if not (cut_off := undecided(group, metric)):
         return None
     k, n = counts(group, metric)
@@ -148,7 +148,7 @@ def undecided_note(group: Group, metric: Metric) -> Fact | None:
 
 
 def known(group: Group, metric: Metric) -> bool:
-    """Whether a group's trials hold this metric: before an import humans have outcomes alone."""
+    """Return whether a group's trials have this metric: humans may have outcomes alone."""
     trials = trials_of(group, metric)
     if group.published_outcomes is None:
         return True
@@ -156,7 +156,7 @@ def known(group: Group, metric: Metric) -> bool:
 
 
 def estimate_or_reference(group: Group, metric: Metric) -> Estimate | None:
-    """What a group comes to; of humans without traces what the paper says, None where nothing."""
+    """Return a group's estimate; of humans without traces that of the paper, or None."""
     if known(group, metric):
         return estimate(group, metric)
     if not metric.paper_of_humans:
@@ -166,13 +166,13 @@ def estimate_or_reference(group: Group, metric: Metric) -> Estimate | None:
 
 
 def no_human_value(metric: Metric) -> Fact:
-    """Why the humans have no value of a metric before their recordings are imported."""
+    """Return why the humans have no value of a metric before an import."""
     why = Why.OTHER_RULE if metric.value in JUDGED else Why.NOT_PUBLISHED
     return Fact(why, (metric.heading,))
 
 
 def outcomes_note(group: Group) -> Fact | None:
-    """What rests on the published outcomes, where only a part of the traces is imported."""
+    """Return which numbers rest on published outcomes, where only some traces are imported."""
     if not group.measured or group.traced:
         return None
     sizes = len(group.outcomes), len(group.trials), len(group.finished)

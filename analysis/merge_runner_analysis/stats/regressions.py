@@ -124,7 +124,7 @@ class Counts:
         return likelihood, p, weights, information
 
     def penalised(self, b: Array) -> Penalised:
-        """Return what is known of the penalised log-likelihoods at ``b``, (starts, terms).
+        """Return the penalised log-likelihoods at ``b``, (starts, terms), with their derivatives.
 
         Firth's score adds to each residual the leverage times (1/2 - p): as if each trial were
         split, and half of its leverage had gone either way (Heinze and Schemper 2002).
@@ -237,11 +237,11 @@ class Fit:
         of such coefficients, and of all, those nearest to the fit by its information. The latter
         are also scaled, down to 0, where the likelihood is always known.
         """
-        held = np.eye(len(self.b))[[] if term is None else [term]]
+        fixed = np.eye(len(self.b))[[] if term is None else [term]]
         pairs = self.counts.design[[*combinations(range(len(self.counts.design)), 2)]]
-        even = np.concatenate([np.broadcast_to(held, (len(pairs), *held.shape)), pairs], axis=1)
-        values = np.array([value] * len(held) + [0.0, 0.0])
-        nearest = self._nearest(held[None], values[: len(held)])
+        even = np.concatenate([np.broadcast_to(fixed, (len(pairs), *fixed.shape)), pairs], axis=1)
+        values = np.array([value] * len(fixed) + [0.0, 0.0])
+        nearest = self._nearest(fixed[None], values[: len(fixed)])
         starts = np.vstack([np.outer(SCALES, nearest), self._nearest(even, values)])
         if term is not None:
             starts[:, term] = value
@@ -253,10 +253,10 @@ class Fit:
     def _nearest(self, rows: Array, linear: Array) -> Array:
         """Return the coefficients nearest to the fit at which rows have these linear predictors.
 
-        ``rows`` are (sets, rows, terms), and what is returned (sets, terms).
+        ``rows`` are (sets, rows, terms), and the result (sets, terms).
         """
         spread = rows @ np.linalg.inv(self.information)
-        # Of dependent rows the solution is far off, and unlikely.
+        # The solution of dependent rows is far off, and unlikely.
         square = spread @ rows.transpose(0, 2, 1) + FLAT * np.eye(len(linear))
         weights = np.linalg.solve(square, (linear - rows @ self.b)[:, :, None])
         return np.asarray(self.b + (weights.transpose(0, 2, 1) @ spread)[:, 0])
@@ -277,12 +277,11 @@ class Regression:
     """A fit to ``n`` trials; ``problem`` says why there are no terms.
 
     ``freedom`` is the residual degrees of freedom of a linear fit, infinite where tests are normal;
-    ``remark`` is what to know of a fit that has terms. Of a gap alone: the ``covariance`` of its
-    terms, (terms, terms); ``equivalence_p``, that
-    relative velocity alone moves it by less than GAP_MARGIN_M, and ``velocity_p``, that no term
-    with relative velocity has an effect (an F test of all of them). These are None where no two
-    played conditions differ in relative velocity alone, and where the errors of the terms are not
-    two, as without residuals.
+    ``remark`` is a caution on a fit that has terms. Fits of a gap alone have the ``covariance`` of
+    their terms, (terms, terms); ``equivalence_p``, that relative velocity alone moves it by less
+    than GAP_MARGIN_M, and ``velocity_p``, that no term with relative velocity has an effect (an F
+    test of all of them). These are None where no two played conditions differ in relative velocity
+    alone, and where the errors of the terms are not two, as without residuals.
     """
 
     n: int
@@ -369,27 +368,27 @@ class Moved:
 
 
 def who_first_data(trials: pd.DataFrame) -> tuple[Array, Array]:
-    """Design (n, 3) of intercept, h in m, dv in m/s; and left-first as 0 or 1, shape (n,)."""
+    """Return the design (n, 3) of intercept, h in m, dv in m/s; and left-first as 0 or 1, (n,)."""
     chosen = trials[(trials["status"] == "finished") & trials["merged_first"].notna()]
     design = np.column_stack([np.ones(len(chosen)), chosen[CONDITION].to_numpy(float)])
     return design, (chosen["merged_first"] == "left").to_numpy(float)
 
 
 def gap_data(trials: pd.DataFrame, measure: str = "gap_m") -> tuple[Array, Array, pd.DataFrame]:
-    """Design (n, 4) of intercept, |h|, |dv|, h*dv; gaps in m, shape (n,); and their trials."""
+    """Return the design (n, 4) of intercept, |h|, |dv|, h*dv; gaps in m, (n,); and their trials."""
     chosen = trials[(trials["status"] == "finished") & trials[measure].notna()]
     design = gap_design(*chosen[CONDITION].to_numpy(float).T)
     return design, chosen[measure].to_numpy(float), chosen
 
 
 def gap_design(headway_m: Array, velocity_mps: Array) -> Array:
-    """The regressors of the gap: intercept, |h|, |dv| and the signed product h*dv."""
+    """Return the regressors of the gap: intercept, |h|, |dv| and the signed product h*dv."""
     columns = (np.ones(len(headway_m)), np.abs(headway_m), np.abs(velocity_mps))
     return np.column_stack([*columns, headway_m * velocity_mps])
 
 
 def equivalence_p(b: float, se: float, freedom: float) -> float:
-    """The p-value of |difference| < GAP_MARGIN_M, by two one-sided t tests (Schuirmann 1987).
+    """Return the p of |difference| < GAP_MARGIN_M by two one-sided t tests (Schuirmann 1987).
 
     It is the larger of the two, that against the nearer margin. A difference without an error, as
     of a driver without spread, is sure: it lies within the margin or it does not.
@@ -399,7 +398,7 @@ def equivalence_p(b: float, se: float, freedom: float) -> float:
 
 
 def who_first_logit(trials: pd.DataFrame) -> Regression:
-    """Logit of left-first on h and dv by maximum likelihood, with Wald tests (eq. 1)."""
+    """Fit a logit of left-first on h and dv by maximum likelihood, with Wald tests (eq. 1)."""
     from statsmodels.discrete.discrete_model import Logit
 
     design, left = who_first_data(trials)
@@ -413,7 +412,7 @@ def who_first_logit(trials: pd.DataFrame) -> Regression:
 
 
 def who_first_firth(trials: pd.DataFrame, less: pd.DataFrame | None = None) -> Regression:
-    """The same by Firth's penalised likelihood (1993), which is finite under separation.
+    """Return the same by Firth's penalised likelihood (1993), which is finite under separation.
 
     Its tests are penalised likelihood ratios (Heinze and Schemper 2002). With other trials its
     terms are the coefficients ``less`` theirs, of one model of both in which every term may differ.
@@ -437,7 +436,7 @@ def who_first_firth(trials: pd.DataFrame, less: pd.DataFrame | None = None) -> R
 
 
 def gap_ols(trials: pd.DataFrame, measure: str = "gap_m", *, robust: bool = False) -> Regression:
-    """OLS of a gap on |h|, |dv| and h*dv (eq. 2); ``robust`` takes HC3 standard errors.
+    """Fit a gap on |h|, |dv| and h*dv by OLS (eq. 2); ``robust`` takes HC3 standard errors.
 
     HC3 holds under unequal variances (MacKinnon and White 1985).
     """
@@ -472,7 +471,7 @@ def gap_ols(trials: pd.DataFrame, measure: str = "gap_m", *, robust: bool = Fals
 def by_pairs(
     fit: Callable[[pd.DataFrame], Regression], trials: pd.DataFrame, measure: str
 ) -> Regression:
-    """A fit to those trials that have the measure, with errors clustered by human pair.
+    """Return a fit to those trials that have the measure, with errors clustered by human pair.
 
     Errors are a jackknife over the pairs (CV3 of MacKinnon, Nielsen and Webb 2023), whose
     correction holds for as few clusters as there are; tests are t on pairs - 1 degrees of freedom.
@@ -504,7 +503,7 @@ def _terms(names: Sequence[str], b: Array, se: Array, freedom: float = inf) -> d
 
 
 def unfit_for_logit(design: Array, left: Array) -> Fact | None:
-    """Why a logit has no finite maximum likelihood estimate, None where it has."""
+    """Return why a logit has no finite maximum likelihood estimate, None where it has."""
     problem = _unidentified(design, left)
     if problem or not any(infinite := _cells(design, left).infinite()):
         return problem

@@ -1,4 +1,4 @@
-"""Who goes first, read from both sides: where one of two equal drivers is given something.
+"""First merger read from both sides, where one of two equal drivers is given something.
 
 The other trials, in which both are given the same, have no driver that is asked about: each is read
 from the left and from the right, and counts half for either.
@@ -20,7 +20,7 @@ from merge_runner_analysis.study import Study
 
 @remembered
 def one_sided(study: Study) -> bool:
-    """Whether in some trials one driver is given what the other, who is equal to it, is not."""
+    """Return whether in some trials only one of two equal drivers is given something."""
     return any(
         (group.trials["focal"].notna() & _of_equals(group.trials)).any() for group in study.models
     )
@@ -28,22 +28,23 @@ def one_sided(study: Study) -> bool:
 
 @remembered
 def level_estimate(study: Study, level: Level, metric: Metric) -> Estimate:
-    """A metric of all trials of a level, with its 95 % interval.
+    """Return a metric of all trials of a level, with its 95 % interval.
 
-    Who goes first is read from both sides where equal drivers are told the same: each of these
+    Who goes first is read from both sides where equal drivers read the same prompt: each of these
     trials counts half for either, and has no variance.
     """
     group = level.pooled
     trials = group.trials
-    same = trials[metric.column].notna() & _told_the_same(trials)
+    same = trials[metric.column].notna() & _have_same_prompts(trials)
     if metric is not LEFT_FIRST or not one_sided(study) or not same.any():
         return estimate(group, metric)
-    own = estimate(replace(group, trials=trials[~same]), metric)
-    n = own.n + int(same.sum())
-    if own.value is None:
+    varying = estimate(replace(group, trials=trials[~same]), metric)
+    n = varying.n + int(same.sum())
+    if varying.value is None:
         return Estimate(50.0, n=n)
     value, low, high = (
-        None if of is None else 50 + (of - 50) * own.n / n for of in (own.value, own.low, own.high)
+        None if of is None else 50 + (of - 50) * varying.n / n
+        for of in (varying.value, varying.low, varying.high)
     )
     return Estimate(value, low, high, n)
 
@@ -53,12 +54,12 @@ def cells_seen(study: Study, level: Level) -> set[Cell]:
     trials = level.pooled.ended
     seen = {*trials["cell"]}
     if one_sided(study):
-        same = trials.loc[_told_the_same(trials), "cell"].unique()
+        same = trials.loc[_have_same_prompts(trials), "cell"].unique()
         seen |= {(_mirrored(study, condition), *others) for condition, *others in same}
     return seen
 
 
-def _told_the_same(trials: pd.DataFrame) -> pd.Series:
+def _have_same_prompts(trials: pd.DataFrame) -> pd.Series:
     return trials["focal"].isna() & _of_equals(trials)
 
 
@@ -67,7 +68,7 @@ def _of_equals(trials: pd.DataFrame) -> pd.Series:
 
 
 def from_both_sides(study: Study, frame: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
-    """Return who goes first by cell and side; trials of two told the same are read from both.
+    """Return who goes first by cell and side; trials with equal prompts are read from both.
 
     So whoever is given something on the left is compared with the left ones who are not, and on the
     right with the right ones: no side is favoured.
@@ -77,7 +78,7 @@ def from_both_sides(study: Study, frame: pd.DataFrame, trials: pd.DataFrame) -> 
     images = [(_mirrored(study, cell[0]), *cell[1:], "right") for cell in frame["condition"]]
     cells, mirrored = (pd.Series(names, frame.index, dtype=object) for names in (sided, images))
     frame = frame.assign(condition=cells, value=frame["value"].astype(float))
-    return read_twice(frame, mirrored.where(_told_the_same(trials)))
+    return read_twice(frame, mirrored.where(_have_same_prompts(trials)))
 
 
 def read_twice(frame: pd.DataFrame, images: pd.Series) -> pd.DataFrame:

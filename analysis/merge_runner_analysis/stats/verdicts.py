@@ -66,7 +66,7 @@ class Both(NamedTuple):
 
 
 class Counted(NamedTuple):
-    """How many of ``n`` trials went as a measure has it, and the humans' in these conditions."""
+    """Number of ``n`` trials that went as a measure has it, and the humans' in these conditions."""
 
     k: int
     n: int
@@ -76,22 +76,22 @@ class Counted(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Statistic:
-    """How a measure is estimated of a driver and of humans, and tested: if not said, by Welch.
+    """Estimators of a measure for a driver and for humans, and its test: by default Welch's.
 
     The test is of the difference, or of a value with a margin against that. ``indicator`` is the
     one whose own test shows the trait.
     """
 
-    own: Callable[[Both], Estimate]
+    driver: Callable[[Both], Estimate]
     human: Callable[[Both], Estimate]
     test: Callable[[Both], Estimate | None] | None = None
     indicator: str = ""
 
     def tested(self, both: Both) -> Estimate | None:
-        """The test, if it can be made."""
+        """Return the test, if it can be made."""
         if self.test:
             return self.test(both)
-        return intervals.difference(self.own(both), self.human(both))
+        return intervals.difference(self.driver(both), self.human(both))
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +104,7 @@ class Comparison:
     """
 
     measure: Measure
-    own: Estimate
+    driver: Estimate
     human: Estimate
     tested: Estimate
     state: str
@@ -124,22 +124,22 @@ def compared(study: Study, group: Group) -> tuple[Comparison, ...]:
     comparisons = []
     for name, measure in MEASURES.items():
         statistic = STATISTICS[name]
-        own, human = statistic.own(both), statistic.human(both)
+        driver, human = statistic.driver(both), statistic.human(both)
         why = judgements[statistic.indicator].why if statistic.indicator else None
-        remarks = own.problem, human.problem, None if own.problem else why
-        state, tested = states.get(name, OPEN if own.undecided else ""), Estimate()
+        remarks = driver.problem, human.problem, None if driver.problem else why
+        state, tested = states.get(name, OPEN if driver.undecided else ""), Estimate()
         if name in tests:
             tested = intervals.at(tests[name], tests[name].level)
             if measure.margin is not None and tested.low is not None:
-                own = replace(own, low=tested.low, high=tested.high)
-        comparison = Comparison(measure, own, human, tested, state, remarks, counts.get(name))
+                driver = replace(driver, low=tested.low, high=tested.high)
+        comparison = Comparison(measure, driver, human, tested, state, remarks, counts.get(name))
         comparisons.append(comparison)
     return tuple(comparisons)
 
 
 @remembered
 def of_humans(study: Study) -> dict[str, Estimate]:
-    """The humans by measure, over all conditions."""
+    """Return the humans by measure, over all conditions."""
     both = Both(study.human, study.human)
     return {name: statistic.human(both) for name, statistic in STATISTICS.items()}
 
@@ -147,7 +147,7 @@ def of_humans(study: Study) -> dict[str, Estimate]:
 def counted(both: Both) -> dict[str, Counted]:
     """Return what a person counts, by measure; nothing where no trial could go so.
 
-    Who goes first: the one ahead, and where neither is, the slower one.
+    First mergers are counted for the vehicle ahead or, side by side, for the slower one.
     """
     played = both.human.outcomes["condition"].isin(both.group.ended["condition"])
     humans = both.human.outcomes[played]
@@ -155,9 +155,9 @@ def counted(both: Both) -> dict[str, Counted]:
     counts = {}
     for name in ("collisions", "headway", "velocity"):
         of_humans = crashed if name == "collisions" else _went_first(humans, name)
-        own = went_so(both.group, name)
-        if len(own):
-            counts[name] = Counted(int(own.sum()), len(own), int(of_humans.sum()), len(of_humans))
+        went = went_so(both.group, name)
+        if len(went):
+            counts[name] = Counted(int(went.sum()), len(went), int(of_humans.sum()), len(of_humans))
     return counts
 
 
@@ -215,8 +215,10 @@ def decided(both: Both, tests: Mapping[str, Estimate]) -> dict[str, str]:
         if _within(measure, test):
             states[name] = SHOWN
         elif measure.margin is None and statistic.indicator in traits:
-            own, human = (abs(of(both).value or 0.0) for of in (statistic.own, statistic.human))
-            states[name] = (WEAKER if own < human else STRONGER) if differs else SHOWN
+            driver, human = (
+                abs(of(both).value or 0.0) for of in (statistic.driver, statistic.human)
+            )
+            states[name] = (WEAKER if driver < human else STRONGER) if differs else SHOWN
     return states
 
 
@@ -398,7 +400,6 @@ def _moved(fit: Regression, group: Group) -> Estimate:
 
 
 def _collided(group: Group) -> Estimate:
-    """Return the share of ended trials with a collision by the humans' rule, in percent."""
     (k, n), cut_off = measures.counts(group, BOXES), measures.undecided(group, BOXES)
     if not n + cut_off:
         return Estimate(problem=Fact(Why.NONE_ENDED, (group.left_out,)))

@@ -70,7 +70,7 @@ def make_tables(study: Study, names: Sequence[str] = ()) -> list[Table]:
 
 
 def _made(name: str, study: Study) -> Table:
-    """A table with its notes, and a row, of a note alone, for each group that is not judged."""
+    """Return a table with its notes, and a row with a note alone for each group not judged."""
     # Imported only here, so that a table that is kept is shown without waiting for pandas.
     from merge_runner_analysis.tables.makers import MAKERS
     from merge_runner_analysis.tables.notes import footnoted
@@ -100,17 +100,17 @@ def finished_tables(
     study: Study | None = None,
     selection: Selection | None = None,
 ) -> list[Table]:
-    """The named tables of a database, or all: read where they are kept, else computed.
+    """Return the named tables of a database, or all: read where they are kept, else computed.
 
     ``study`` stands in the place of a ``selection``, if the caller already has it.
     Raises UsageError for an unknown name.
     """
-    wanted, selection = _valid(names), selection or Selection()
+    chosen, selection = _valid(names), selection or Selection()
     options = study.options if study else selection.key(db)
     state = study.state if study else present_state(db)
-    tables = {name: from_text(text) for name, text in finished(db, state, options, wanted).items()}
+    tables = {name: from_text(text) for name, text in finished(db, state, options, chosen).items()}
     # A name may be given twice; the table is computed once.
-    missing = [name for name in dict.fromkeys(wanted) if name not in tables]
+    missing = [name for name in dict.fromkeys(chosen) if name not in tables]
     if missing:
         from merge_runner_analysis.study import Study
 
@@ -119,14 +119,14 @@ def finished_tables(
         # The state is the one before the study was read: trials stored since then outdate it.
         keep_finished(db, study.state, options, {name: to_text(made[name]) for name in missing})
         tables |= made
-    return [tables[name] for name in wanted]
+    return [tables[name] for name in chosen]
 
 
 def table(study: Study | Path | str, name: str, selection: Selection | None = None) -> pd.DataFrame:
-    """A table of a study, or of a ``selection`` of a database, as a data frame at full precision.
+    """Return a table of a study, or of a database's ``selection``, as a data frame.
 
-    It has the rows of the table's CSV, and what the study adds that this process has planned into
-    the database. Raises UsageError.
+    It has the rows of the table's CSV at full precision, and what the study adds that this process
+    has planned into the database. Raises UsageError.
     """
     import pandas as pd
 
@@ -136,7 +136,7 @@ def table(study: Study | Path | str, name: str, selection: Selection | None = No
         read = study if isinstance(study, Study) else Study(study, selection or Selection())
         (made,) = make_tables(read, [name])
         frame = pd.DataFrame(value_rows(made), columns=names_of(made)).set_index("row")
-    # Of a column without a value pandas cannot tell the type.
+    # pandas cannot infer the type of a column without a value.
     missing = [name for name in frame if frame[name].isna().all()]
     return frame.astype(dict.fromkeys(missing, "float64"))
 

@@ -29,7 +29,7 @@ from merge_runner_analysis.wording import INDICATORS
 
 
 def ablation_qualitative(study: Study) -> Table:
-    """Table VI: I1 to I5 of every driver and prompt."""
+    """Return Table VI: I1 to I5 of every driver and prompt."""
     columns = [*GROUP_COLUMNS, Column("n", "n", "count", "trials that ended")]
     for name, text in INDICATORS.items():
         prefix = name.lower()

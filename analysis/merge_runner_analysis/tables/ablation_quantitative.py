@@ -26,14 +26,14 @@ from merge_runner_analysis.tables.model import (
 
 
 def ablation_quantitative(study: Study) -> Table:
-    """Table VII: collisions, gap, RMSE and joint rate of every driver and prompt."""
+    """Return Table VII: collisions, gap, RMSE and joint rate of every driver and prompt."""
     ended = ", ".join(metric.heading for metric in shown_in("tables") if metric.trials == "ended")
     trials = f"{ended}: of all trials that ended; the rest: of the finished ones"
     return metric_table("ablation-quantitative", study.groups, "tables", trials, RULES_NOTE)
 
 
 def metric_table(name: str, groups: list[Group], place: str, *notes: str) -> Table:
-    """A row for each group, with the metrics that a place of ``metrics.SHOWN`` has."""
+    """Return a row for each group, with the metrics that a place of ``metrics.SHOWN`` has."""
     metrics = shown_in(place)
     columns = [*GROUP_COLUMNS, Column("n", "n", "count", "trials that ended")]
     for metric in metrics:

@@ -28,32 +28,33 @@ Key = tuple[str, str, str]
 
 
 def against(table: Table, study: Study) -> Table:
-    """A table with published values and differences, for drivers of exactly the paper's names."""
+    """Return a table with published values and differences, for drivers named as in the paper."""
     if table.name not in FILES:
         return replace(table, notes=(*table.notes, "the paper has no such table"))
     paper: dict[Key, dict[str, Value]] = {}
     known = {column.name for column in table.columns}
-    for key, column, value in _printed(table.name):
-        if column in known:
-            paper.setdefault(key, {})[column] = value
-    named = {column for values in paper.values() for column in values}
+    for key, name, value in _printed(table.name):
+        if name in known:
+            paper.setdefault(key, {})[name] = value
+    named = {name for values in paper.values() for name in values}
     columns = []
-    for one in table.columns:
-        columns.append(one)
-        if one.name in named:
-            meaning = f"{one.heading} as printed in the paper"
+    for column in table.columns:
+        columns.append(column)
+        if column.name in named:
+            meaning = f"{column.heading} as printed in the paper"
             columns += [
-                Optional(f"{one.name}_in_paper", "paper", one.kind, meaning, digits=one.digits),
-                Optional(f"{one.name}_difference", "diff.", "number", digits=one.digits),
+                Optional(
+                    f"{column.name}_in_paper", "paper", column.kind, meaning, digits=column.digits
+                ),
+                Optional(f"{column.name}_difference", "diff.", "number", digits=column.digits),
             ]
     groups = {group.id: group for group in (*study.groups, *study.unjudged)}
-    rows = [_beside(row, groups[row.groups[0]], paper) for row in table.rows]
+    rows = [_with_paper(row, groups[row.groups[0]], paper) for row in table.rows]
     notes = [*table.notes, *(f"paper: {citation(name)}" for name in FILES[table.name])]
     return replace(table, columns=columns, rows=rows, notes=notes)
 
 
 def _printed(table: str) -> Iterator[tuple[Key, str, Value]]:
-    """The values that the paper prints of a table: row, our column, value."""
     if table in {"who-first", "gap"}:
         for row in published(*FILES[table]).to_dict(orient="records"):
             for name in ("n", "b", "se", {"who-first": "z", "gap": "t"}[table], "p"):
@@ -76,8 +77,8 @@ def _printed(table: str) -> Iterator[tuple[Key, str, Value]]:
                 yield key, "value" if items else metric.name, printed_value(row[column])
 
 
-def _beside(row: Row, group: Group, paper: dict[Key, dict[str, Value]]) -> Row:
-    """The row with the paper's values, and the differences of numbers unless ours are published."""
+def _with_paper(row: Row, group: Group, paper: dict[Key, dict[str, Value]]) -> Row:
+    """Return the row with the paper's values, and differences unless ours are published."""
     # In each of the paper's rows one model drives both vehicles. Another sample set is still the
     # same driver: it only draws other samples. A mock model poses as none.
     asked, posing = group.models[0], group.scripted and not MOCKS.issuperset(group.models)

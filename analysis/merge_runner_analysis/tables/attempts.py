@@ -1,4 +1,4 @@
-"""What became of the calls: retried, lost, unusable, or replaced by an older plan."""
+"""Outcomes of the calls: retried, lost, unusable, or replaced by an older plan."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from merge_runner_analysis.tables.model import GROUP_COLUMNS, STORED, Column, Ta
 # Failures with a share of the answers beside their number; the others are malformed answers, and
 # have a column where they occur.
 FAILURES = {"refused": "refusal", "truncated": "truncated", "empty": "empty"}
-# What each share is of: a call may take several attempts, and a lost call has no answer that could
-# be invalid.
+# Denominator of each share: a call may take several attempts, and a lost call has no answer that
+# could be invalid.
 OF = {"retried": "attempts", "lost": "calls", "fallback": "decisions"}
 MEANINGS = {
     "trials": "all trials, also those that failed",
@@ -33,7 +33,7 @@ SHARES = {"retried", "lost", *FAILURES, "invalid", NO_DECISION, "fallback"}
 
 
 def attempts(study: Study) -> Table:
-    """A row per driver and variant: trials, calls, attempts, and what went wrong with them."""
+    """Return a row per driver and variant: trials, calls, attempts, and failures."""
     tallies = {group: tally(study, group.stored) for group in study.played}
     known = {"answers", "decisions", *MEANINGS, *FAILURES.values()}
     reasons = dict.fromkeys(name for of in tallies.values() for name in sorted({*of} - known))

@@ -1,4 +1,4 @@
-"""What the tables of regressions have in common: a row for each term, driver and fit."""
+"""Rows of the regression tables: one for each term, driver and fit."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ KEYS = (
     Column("se", "SE", "number", "standard error", digits=3),
 )
 P = Column("p", "p", "p", "Wald test")
-# Of the same trials: how its rows differ in name and label from the first ones, and the fit and a
-# robust one by the prefix of their values' names.
+# A prefix of row names, a suffix of labels, and a fit and a robust one to the same trials, by the
+# prefix of their values' names.
 Fit = tuple[str, str, dict[str, Regression]]
 BY_PAIR = ", errors by pair"
 
 
 def row_of_term(group: Group, term: str, fit: Fit, rests_on: str, note: object = "") -> Row:
-    """The row of a term by one of a group's fits, of the trials with a value in this column."""
+    """Return a term's row by one of a group's fits to the trials with a value in this column."""
     item, label, regressions = fit
     values: dict[str, Value] = {
         "term": TERM_NAMES[term],
@@ -62,7 +62,7 @@ def row_of_term(group: Group, term: str, fit: Fit, rests_on: str, note: object =
 
 
 def mixed_note(study: Study, table: str, model: str) -> Iterator[str]:
-    """A note with the published mixed model, for comparison with the human rows."""
+    """Yield a note with the published mixed model, for comparison with the human rows."""
     if study.human in study.groups:
         values = "; ".join(
             f"{TERM_NAMES[row.term]} {row.estimate:g} (SE {row.std_error:g})"

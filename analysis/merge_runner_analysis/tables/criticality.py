@@ -10,7 +10,7 @@ from merge_runner_analysis.tables.model import Table
 
 
 def criticality(study: Study) -> Table:
-    """Surrogate measures of safety of every group whose traces are known."""
+    """Return surrogate measures of safety of every group whose traces are known."""
     note = (
         "a conflict is resolved when no vehicle, at its present speed, would meet the other at the "
         "first possible contact, the merge point or the end of the track; vehicles that after the "

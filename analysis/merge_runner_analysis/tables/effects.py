@@ -1,4 +1,4 @@
-"""What a factor changes, in every measure; prompts and single factors are selections of it."""
+"""Effects of factors in every measure; prompts and single factors are selections of it."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ SIDES = ("", "_reference")  # of a comparison
 
 
 def effects_table(study: Study) -> Table:
-    """A row per factor, level, and measure, and per interaction of two factors."""
+    """Return a row per factor, level, and measure, and per interaction of two factors."""
     by = study.selection.by or ""
     return Table(
         "effects",
@@ -67,19 +67,20 @@ def effects_table(study: Study) -> Table:
             Column("n_reference", "n ref.", "count", "trials of the reference in these"),
             Optional("primary", "primary", "text", "the study's own question"),
         ),
-        [_row(study, one) for one in effects(study, by) if _is_shown(one)],
+        [_row(study, effect) for effect in effects(study, by) if _is_shown(effect)],
         tuple(_notes(study, by)),
     )
 
 
-def comparison(study: Study, one: str, other: str) -> Table:
-    """A driver with its prompt less another, by their groups' ids: a row per measure.
+def comparison(study: Study, driver: str, reference: str) -> Table:
+    """Return a driver with its prompt less another, by their groups' ids: a row per measure.
 
     ``k`` of ``n`` trials and the value are of the situations of both, of which the difference is;
     of all of a driver's trials where nothing is compared. Without rows where one is not judged.
     """
     known = {group.id: group for group in study.models}
-    found = driver_effects(study, known[one], known[other]) if {one, other} <= {*known} else []
+    are_judged = {driver, reference} <= {*known}
+    differences = driver_effects(study, known[driver], known[reference]) if are_judged else []
     return Table(
         "comparison",
         (
@@ -88,100 +89,102 @@ def comparison(study: Study, one: str, other: str) -> Table:
             *(Optional(f"value{of}", f"value{of}", "number") for of in SIDES),
             *DIFFERENCE,
         ),
-        [_compared_row(study, effect) for effect in found if _is_shown(effect)],
+        [_compared_row(study, effect) for effect in differences if _is_shown(effect)],
         (),
     )
 
 
-def _compared_row(study: Study, one: Effect) -> Row:
+def _compared_row(study: Study, effect: Effect) -> Row:
     values: dict[str, Value] = {}
-    sides = (one.level, one.at_level), (one.reference, one.at_reference)
-    for of, (level, own) in zip(SIDES, sides, strict=True):
-        shown = level_estimate(study, level, one.metric) if own.value is None else own
-        k = shown.k if one.metric.rate else None  # that of valid replies counts replies
+    sides = (effect.level, effect.at_level), (effect.reference, effect.at_reference)
+    for of, (level, estimate) in zip(SIDES, sides, strict=True):
+        shown = level_estimate(study, level, effect.metric) if estimate.value is None else estimate
+        k = shown.k if effect.metric.rate else None  # that of valid replies counts replies
         values |= {f"k{of}": k, f"n{of}": shown.n, f"value{of}": shown.value}
-    return _row(study, one, values)
+    return _row(study, effect, values)
 
 
-def _is_shown(one: Effect) -> bool:
-    """Whether it has a test; of a level that has none a row says why."""
-    return one.metric.estimator != "median" and not (one.across and one.difference.p is None)
+def _is_shown(effect: Effect) -> bool:
+    """Return whether it has a test; of a level that has none a row says why."""
+    is_tested = not effect.across or effect.difference.p is not None
+    return effect.metric.estimator != "median" and is_tested
 
 
-def _row(study: Study, one: Effect, others: dict[str, Value] | None = None) -> Row:
+def _row(study: Study, effect: Effect, others: dict[str, Value] | None = None) -> Row:
     """Return the row of an effect, with ``others`` beside or instead of its values."""
-    difference = one.difference
-    level, reference = one.level.name, one.reference.name
-    if one.across and not study.selection.by:
-        level, reference = (TIMES.join(pair) for pair in _crossed(one.level, one.across[1]))
+    difference = effect.difference
+    level, reference = effect.level.name, effect.reference.name
+    if effect.across and not study.selection.by:
+        level, reference = (TIMES.join(pair) for pair in _crossed(effect.level, effect.across[1]))
     values: dict[str, Value] = {
-        "at": _place(one.level, one.across),
-        "factor": one.factor,
-        "drivers": "scripted" if one.level.posing else None,
-        "level": f"{level}{one.level.mark}",
+        "at": _place(effect.level, effect.across),
+        "factor": effect.factor,
+        "drivers": "scripted" if effect.level.posing else None,
+        "level": f"{level}{effect.level.mark}",
         "reference": reference,
-        "measure": one.metric.heading,
-        "estimate": one.at_level.value,
-        "estimate_reference": one.at_reference.value,
+        "measure": effect.metric.heading,
+        "estimate": effect.at_level.value,
+        "estimate_reference": effect.at_reference.value,
         "difference": difference.value,
         "ci": difference.bounds(),
         "p": difference.p,
-        "p_corrected": one.p_corrected,
+        "p_corrected": effect.p_corrected,
         "detectable": difference.detectable,
-        "n": one.at_level.n,
-        "n_reference": one.at_reference.n,
-        "primary": "primary" if one.primary else None,
+        "n": effect.at_level.n,
+        "n_reference": effect.at_reference.n,
+        "primary": "primary" if effect.primary else None,
     }
     return Row(
-        one.id,
-        one.groups,
+        effect.id,
+        effect.groups,
         values | (others or {}),
-        problem(study, one),
-        one.metric.column,
-        copies=one.left_out,
-        untested=others is None and one.at_level.value is None and _is_copied(study, one),
+        problem(study, effect),
+        effect.metric.column,
+        copies=effect.left_out,
+        untested=others is None and effect.at_level.value is None and _is_copied(study, effect),
     )
 
 
 def _crossed(*levels: Level) -> Iterator[tuple[str, str]]:
-    """Each level with that of the other factor at which it is."""
+    """Return each level's name with that of its level of the other factor."""
     return ((level.name, level.at.partition("=")[2]) for level in levels)
 
 
-def _is_copied(study: Study, one: Effect) -> bool:
+def _is_copied(study: Study, effect: Effect) -> bool:
     """Return whether in all shared cells a level has the trials of another one."""
-    copies, shared = copied_of_shared(study, *one.levels)
+    copies, shared = copied_of_shared(study, *effect.levels)
     return 0 < copies == shared
 
 
 def _place(level: Level, across: tuple[Level, Level] | None) -> str:
-    """Return where a level stands that is shown by another factor, and of an interaction both."""
+    """Return the other factor's level of a simple effect, and both of an interaction."""
     at = level.at.partition("=")[2]
     return f"{at} - {across[0].at.partition('=')[2]}" if across else at
 
 
-def problem(study: Study, one: Effect) -> str:
-    """Why an effect has no test, or which cells its test leaves out."""
-    copies, shared = copied_of_shared(study, *one.levels)
-    remarks = [note_of(undecided_note(level.pooled, one.metric)) for level in one.levels]
-    column = one.metric.column
-    if not one.across and any(level.pooled.trials[column].isna().all() for level in one.levels):
-        remarks.append(f"{one.metric.heading}: a level has no trial with this measure")
-    elif _is_copied(study, one):
+def problem(study: Study, effect: Effect) -> str:
+    """Return why an effect has no test, or which cells its test leaves out."""
+    copies, shared = copied_of_shared(study, *effect.levels)
+    metric, difference = effect.metric, effect.difference
+    remarks = [note_of(undecided_note(level.pooled, metric)) for level in effect.levels]
+    lacks = [level.pooled.trials[metric.column].isna().all() for level in effect.levels]
+    if not effect.across and any(lacks):
+        remarks.append(f"{metric.heading}: a level has no trial with this measure")
+    elif _is_copied(study, effect):
         remarks.append(SAME_TRIALS)
-    elif one.difference.value is None:
-        remarks.append(f"{one.metric.heading}: {UNTESTED}")
-    elif one.difference.p is None and not one.difference.se and one.metric.estimator != "median":
+    elif difference.value is None:
+        remarks.append(f"{metric.heading}: {UNTESTED}")
+    elif difference.p is None and not difference.se and metric.estimator != "median":
         remarks.append("the same in every trial, so that there is nothing to test")
     elif copies:
         remarks.append(
             f"the difference leaves out {copies} of {shared} shared cells, those with the same "
             "trials at both levels"
         )
-    elif one.metric.rate and one.difference.p is not None and one.difference.detectable is None:
-        remarks.append(f"{one.metric.heading}: so few trials can show no difference, however large")
-    if one.metric.trials == "ended" and one.metric.value not in JUDGED:
-        remarks += [_left_out(level, one.metric) for level in one.levels]
+    elif metric.rate and difference.p is not None and difference.detectable is None:
+        remarks.append(f"{metric.heading}: so few trials can show no difference, however large")
+    if metric.trials == "ended" and metric.value not in JUDGED:
+        remarks += [_left_out(level, metric) for level in effect.levels]
     return note_of(*dict.fromkeys(remarks))
 
 
@@ -197,10 +200,10 @@ def _left_out(level: Level, metric: Metric) -> str:
 
 
 def _notes(study: Study, by: str) -> Iterator[str]:
-    tested = any(one.difference.p is not None for one in effects(study, by))
+    tested = any(effect.difference.p is not None for effect in effects(study, by))
     every = levels_by_factor(study)
-    if said := unreadable(study):
-        yield said
+    if failure := unreadable(study):
+        yield failure
     if not tested and not every:
         yield "the trials of judged drivers differ in no factor"
         return
@@ -236,20 +239,20 @@ def factors(study: Study) -> Table:
     """Return the effects with a row for every level, also the references."""
     by = study.selection.by or ""
     rows: dict[str, Row] = {}
-    for one in effects(study, by):
-        if not one.across:
-            name = f"{one.reference.id}/{one.metric.name}"
-            rows.setdefault(name, _level_row(study, name, one, one.reference))
-        if by or not one.across:
-            row = _level_row(study, one.id, one, one.level)
+    for effect in effects(study, by):
+        if not effect.across:
+            name = f"{effect.reference.id}/{effect.metric.name}"
+            rows.setdefault(name, _level_row(study, name, effect, effect.reference))
+        if by or not effect.across:
+            row = _level_row(study, effect.id, effect, effect.level)
             difference = {
-                "difference": one.difference.value,
-                "difference_ci": one.difference.bounds(),
-                "p": one.difference.p,
-                "p_holm": one.p_corrected,
+                "difference": effect.difference.value,
+                "difference_ci": effect.difference.bounds(),
+                "p": effect.difference.p,
+                "p_holm": effect.p_corrected,
             }
             values = {**row.values, **difference}
-            rows[one.id] = replace(row, values=values, note=problem(study, one))
+            rows[effect.id] = replace(row, values=values, note=problem(study, effect))
     return Table(
         "factors",
         (
@@ -275,44 +278,44 @@ def factors(study: Study) -> Table:
     )
 
 
-def _level_row(study: Study, name: str, one: Effect, level: Level) -> Row:
-    own = Estimate() if one.across else level_estimate(study, level, one.metric)
+def _level_row(study: Study, name: str, effect: Effect, level: Level) -> Row:
+    estimate = Estimate() if effect.across else level_estimate(study, level, effect.metric)
     values: dict[str, Value] = {
-        "at": _place(level, one.across),
-        "factor": one.factor,
+        "at": _place(level, effect.across),
+        "factor": effect.factor,
         "drivers": "scripted" if level.posing else None,
-        "measure": one.metric.heading,
+        "measure": effect.metric.heading,
         "level": level.name,
         "trials": len(level.pooled.ended),
-        "n": one.at_level.n if one.across else own.n,
-        "value": own.value,
-        "ci": own.bounds(),
+        "n": effect.at_level.n if effect.across else estimate.n,
+        "value": estimate.value,
+        "ci": estimate.bounds(),
     }
-    note = note_of(undecided_note(level.pooled, one.metric))
-    return Row(name, level.groups, values, note, one.metric.column, copies=level.copies)
+    note = note_of(undecided_note(level.pooled, effect.metric))
+    return Row(name, level.groups, values, note, effect.metric.column, copies=level.copies)
 
 
 def contrasts(study: Study) -> Table:
-    """The effects of prompts, driver by driver."""
+    """Return the effects of prompts, driver by driver."""
     known = {group.id: group for group in study.models}
     shown = {LEFT_FIRST, *shown_in("tables")}
     rows = []
-    for one in effects(study, DRIVER):
-        if one.across or one.level.factor != PROMPT or one.metric not in shown:
+    for effect in effects(study, DRIVER):
+        if effect.across or effect.level.factor != PROMPT or effect.metric not in shown:
             continue
-        group, other = (known[level.groups[0]] for level in (one.level, one.reference))
-        if one.difference.p is None:
+        group, other = (known[level.groups[0]] for level in (effect.level, effect.reference))
+        if effect.difference.p is None:
             continue
-        freedom = one.difference.freedom
+        freedom = effect.difference.freedom
         values: dict[str, Value] = {
             "driver": group.label,
             "setting": group.setting,
             "reference": other.setting,
-            "p_holm": one.p_corrected,
+            "p_holm": effect.p_corrected,
             "freedom": None if isinf(freedom) else freedom,
         }
-        name = f"{group.id}/{other.setting}/{one.metric.name}"
-        rows.append(replace(_row(study, one, values), id=name))
+        name = f"{group.id}/{other.setting}/{effect.metric.name}"
+        rows.append(replace(_row(study, effect, values), id=name))
     return Table(
         "contrasts",
         (
@@ -338,10 +341,12 @@ def contrasts(study: Study) -> Table:
 
 
 def _same_as_reference(study: Study) -> Iterator[str]:
-    """Which prompts have no row, since programs do not read them."""
-    every = [one for one in effects(study, DRIVER) if one.level.factor == PROMPT]
+    """Yield a note on prompts without a row, since programs do not read them."""
+    every = [effect for effect in effects(study, DRIVER) if effect.level.factor == PROMPT]
     same = [
-        one.level.groups[0] for one in every if copied_of_shared(study, one.level, one.reference)[0]
+        effect.level.groups[0]
+        for effect in every
+        if copied_of_shared(study, effect.level, effect.reference)[0]
     ]
     if same:
         yield f"{', '.join(dict.fromkeys(same))}, beside {study.reference}: {SAME_TRIALS}"

@@ -51,7 +51,7 @@ LATEX = str.maketrans(
 
 
 def render(tables: Sequence[Table], form: TableFormat, width: int | None = None) -> str:
-    """All tables as one text that ends without a line break; ``width`` is that of a terminal."""
+    """Return all tables as one text without a final line break; ``width`` is a terminal's."""
     if form is TableFormat.JSON:
         return json.dumps({"tables": [as_json(t) for t in tables]}, indent=2, ensure_ascii=False)
     writers: dict[TableFormat, Callable[[Table], str]] = {
@@ -60,7 +60,7 @@ def render(tables: Sequence[Table], form: TableFormat, width: int | None = None)
         TableFormat.MD: as_markdown,
         TableFormat.LATEX: as_latex,
     }
-    # Several CSV tables in one stream could not be told apart without their names.
+    # Several CSV tables in one stream could not be distinguished without their names.
     named = form is TableFormat.CSV and len(tables) > 1
     return "\n\n".join(f"# {table.name}\n" * named + writers[form](table) for table in tables)
 
@@ -72,7 +72,7 @@ def _grid(table: Table) -> tuple[list[Column], list[list[str]]]:
 
 
 def as_text(table: Table, width: int | None = None) -> str:
-    """A table for a terminal; without its ``width`` lines are as long as they need to be."""
+    """Return a table for a terminal; without its ``width`` lines are as long as they need to be."""
     # Characters differ in width on a terminal, so len() would misalign the columns.
     from rich.cells import cell_len
 
@@ -100,7 +100,7 @@ def as_text(table: Table, width: int | None = None) -> str:
 
 
 def _fitting(columns: Sequence[Column], widths: Sequence[int], width: int) -> list[int]:
-    """The places of the columns that fit a terminal; of equal weight, the right ones go first."""
+    """Return the places of the columns that fit; of equal weight, the right ones go first."""
     fitting = [*range(len(columns))]
     for place in sorted(fitting, key=lambda place: (_weight(columns[place]), -place))[:-1]:
         if sum(widths[shown] + len(BETWEEN) for shown in fitting) - len(BETWEEN) <= width:
@@ -110,7 +110,7 @@ def _fitting(columns: Sequence[Column], widths: Sequence[int], width: int) -> li
 
 
 def _weight(column: Column) -> int:
-    """How much a reader misses a column: what is found weighs most, then what names a row."""
+    """Return a column's weight for a reader: results weigh most, then names of rows."""
     if (column.name, column.kind) in ASIDE:
         return 0
     if column.name in WEIGHTS:
@@ -121,7 +121,7 @@ def _weight(column: Column) -> int:
 
 
 def as_csv(table: Table) -> str:
-    """A table's values at full precision; an interval takes two columns."""
+    """Return a table's values at full precision; an interval takes two columns."""
     out = io.StringIO()
     writer = csv_writer(out)
     writer.writerow(names_of(table))
@@ -135,7 +135,7 @@ def as_csv(table: Table) -> str:
 
 
 def as_json(table: Table) -> dict[str, object]:
-    """A table as JSON values."""
+    """Return a table as JSON values."""
     return {
         "name": table.name,
         "number": table.number,
@@ -150,19 +150,19 @@ def as_json(table: Table) -> dict[str, object]:
 
 
 def names_of(table: Table) -> list[str]:
-    """The names of what ``value_rows`` gives of each row."""
+    """Return the names of what ``value_rows`` gives of each row."""
     return ["row", *(name for column in table.columns for name in value_names(column)), "note"]
 
 
 def value_names(column: Column) -> tuple[str, ...]:
-    """The names of the values of a column: those of an interval are two."""
+    """Return the names of the values of a column: those of an interval are two."""
     if column.kind == "interval":
         return f"{column.name}_low", f"{column.name}_high"
     return (column.name,)
 
 
 def value_rows(table: Table) -> list[dict[str, Value]]:
-    """Each row's id, values and note; an interval becomes two values."""
+    """Return each row's id, values and note; an interval becomes two values."""
     rows = []
     for row in table.rows:
         cells: dict[str, Value] = {"row": row.id}
@@ -175,7 +175,7 @@ def value_rows(table: Table) -> list[dict[str, Value]]:
 
 
 def as_markdown(table: Table) -> str:
-    """A table for a README or an issue."""
+    """Return a table for a README or an issue."""
     columns, grid = _grid(table)
     rules = "|".join(":--" if column.kind == "text" else "--:" for column in columns)
     escaped = ([cell.replace("|", r"\|") for cell in cells] for cells in grid)
@@ -185,7 +185,7 @@ def as_markdown(table: Table) -> str:
 
 
 def as_latex(table: Table) -> str:
-    r"""A table for the paper: needs the packages booktabs, amssymb and graphicx."""
+    r"""Return a table for the paper: needs the packages booktabs, amssymb and graphicx."""
     columns, (head, *body) = _grid(table)
     form = "".join("l" if column.kind == "text" else "r" for column in columns)
     numeric = [column.kind in {"p", "number", "percent", "interval"} for column in columns]
@@ -216,12 +216,12 @@ def as_latex(table: Table) -> str:
 
 
 def printed(table: Table, row: Row) -> dict[str, str]:
-    """A row's values as a reader sees them, by column."""
+    """Return a row's values as a reader sees them, by column."""
     return {c.name: shown_value(c, row) for c in table.columns}
 
 
 def shown_columns(table: Table) -> list[Column]:
-    """The columns with at least one value that the notes do not say."""
+    """Return the columns with at least one value that the notes do not say."""
     return [
         column
         for column in table.columns
@@ -231,7 +231,7 @@ def shown_columns(table: Table) -> list[Column]:
 
 
 def notes_of(table: Table) -> list[str]:
-    """The notes of rows, then of the table; equal notes of rows appear once, with whose they are.
+    """Return the notes of rows, then of the table; equal notes of rows are one, with its owners.
 
     They are a group's, or where a row rests on several those of the row without its measure.
     """
@@ -244,12 +244,12 @@ def notes_of(table: Table) -> list[str]:
 
 
 def shown_rows(table: Table) -> list[Row]:
-    """The rows of a table but those that are untested: of these the notes say why."""
+    """Return the rows of a table but those that are untested: of these the notes say why."""
     return [row for row in table.rows if not row.untested]
 
 
 def shown_value(column: Column, row: Row) -> str:
-    """One value of a row as a reader sees it."""
+    """Return a value of a row as a reader sees it."""
     value = row.values.get(column.name)
     if value is None:
         return "" if column.kind == "text" else MISSING
@@ -273,7 +273,7 @@ def _rounded(value: float, column: Column, row: Row) -> str:
 
 
 def table_view(table: Table, link: Callable[[Table, Row, Column], object]) -> dict[str, object]:
-    """A table as templates need it: headings, cells with what ``link`` returns, notes.
+    """Return a table as templates need it: headings, cells with what ``link`` returns, notes.
 
     The text cells before a row's first other cell are its headers: a screen reader announces them
     with each of its cells. A value leads to trials unless it is published or a count of zero.

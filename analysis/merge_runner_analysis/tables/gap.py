@@ -22,7 +22,7 @@ from merge_runner_analysis.tables.model import Column, Optional, Row, Table, row
 
 
 def gap(study: Study) -> Table:
-    """Table IV: linear regression of the gap (m) on |h|, |dv| and h*dv."""
+    """Return Table IV: linear regression of the gap (m) on |h|, |dv| and h*dv."""
     mean100 = "random intercept per pair, gap where the mean position reaches 100 m"
     fitted = {group: _fits(group) for group in study.measured}
     return Table(
@@ -58,7 +58,7 @@ def gap(study: Study) -> Table:
 
 
 def _fits(group: Group) -> list[Fit]:
-    """By least squares and with HC3 errors, the humans also with errors by pair."""
+    """Return fits by least squares and with HC3 errors, of humans also with errors by pair."""
     # HC3 errors (MacKinnon and White 1985) hold for unequal variances.
     every: list[Fit] = [("", "", {"": fits(group).ols, "hc3_": fits(group).hc3})]
     if not group.setting:

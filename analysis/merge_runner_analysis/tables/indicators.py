@@ -44,7 +44,7 @@ NOTES = (
 
 
 def indicators(study: Study) -> Table:
-    """Table V: I1 to I5 and the quantitative measures, each with a row per driver."""
+    """Return Table V: I1 to I5 and the quantitative measures, each with a row per driver."""
     groups = study.baselines
     return Table(
         "indicators",
@@ -72,7 +72,7 @@ def indicators(study: Study) -> Table:
 
 
 def ceiling_columns(paper: str, robust: str) -> list[Column]:
-    """The columns of how often human data sets pass, by both rules."""
+    """Return the columns of how often human data sets pass, by both rules."""
     return [
         Optional("ceiling_paper", paper, "percent", f"{RESAMPLED} by the paper's rule", digits=0),
         Optional("ceiling_robust", robust, "percent", f"{RESAMPLED} by the robust rule", digits=0),

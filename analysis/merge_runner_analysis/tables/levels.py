@@ -1,4 +1,4 @@
-"""What drivers do at each level of each factor, and in the crossings of those that a study varies.
+"""Results at each level of each factor, and in the crossings of those that a study varies.
 
 The first page draws its chart and counts its trials from this table.
 """
@@ -23,7 +23,7 @@ MOST_CROSSINGS = 8
 
 
 def levels(study: Study) -> Table:
-    """A row per level of a factor, and per crossing of the factors, of all drivers and of each."""
+    """Return a row per level and per crossing of factors, of all drivers and of each."""
     metric = primary(study)
     hits = metric.column if metric.rate else ""
     return Table(
@@ -52,7 +52,7 @@ def levels(study: Study) -> Table:
 
 
 def varied(study: Study) -> tuple[str, ...]:
-    """The factors that a study varies, but the driver and its opponent; so many can be crossed."""
+    """Return the factors that a study varies, apart from the driver and its opponent."""
     named = {
         levels[0].factor: len(levels)
         for levels in levels_by_factor(study)
@@ -68,7 +68,7 @@ def varied(study: Study) -> tuple[str, ...]:
 
 
 def _every(study: Study) -> Iterator[tuple[str, Level]]:
-    """Each level of all drivers, then of each driver, then each crossing of each driver."""
+    """Yield each level of all drivers, then of each driver, then each crossing of each driver."""
     levels = [group.levels for group in study.models]
     drivers = [*dict.fromkeys(named[MODEL] for named in levels if MODEL in named)]
     for of_factor in levels_by_factor(study):
@@ -80,8 +80,8 @@ def _every(study: Study) -> Iterator[tuple[str, Level]]:
     if len(factors) < 2:
         return
     for driver, names in product(drivers, product(*_names(study, factors))):
-        wanted = {MODEL: driver, **dict(zip(factors, names, strict=True))}
-        yield from ((driver, level) for level in crossing(study, factors, wanted))
+        chosen = {MODEL: driver, **dict(zip(factors, names, strict=True))}
+        yield from ((driver, level) for level in crossing(study, factors, chosen))
 
 
 def _names(study: Study, factors: tuple[str, ...]) -> list[list[str]]:
@@ -93,16 +93,16 @@ def _names(study: Study, factors: tuple[str, ...]) -> list[list[str]]:
 
 
 def _row(study: Study, level: Level, driver: str, metric: Metric) -> Row:
-    group, found = level.pooled, level_estimate(study, level, metric)
+    group, shown = level.pooled, level_estimate(study, level, metric)
     crashed, ended = counts(group, COLLISIONS)
     values: dict[str, Value] = {
         "factor": level.factor,
         "level": f"{level.name}{level.mark}",
         "driver": driver or None,
-        "k": found.k if metric.rate else None,
-        "n": found.n,
-        "value": found.value,
-        "ci": found.bounds(),
+        "k": shown.k if metric.rate else None,
+        "n": shown.n,
+        "value": shown.value,
+        "ci": shown.bounds(),
         "crashed": crashed,
         "ended": ended,
         "gap_m": estimate(group, GAP).value,

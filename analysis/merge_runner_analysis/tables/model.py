@@ -23,7 +23,7 @@ Kind = Literal["text", "count", "number", "percent", "p", "verdict", "interval"]
 Value = str | int | float | bool | tuple[float, float] | None
 # The trials of a group that a row may rest on, beside those with a value in some column of theirs.
 STORED, ENDED, FINISHED = "stored", "ended", "finished"
-# What a verdict counts: as its measure has it.
+# The trials that a verdict counts, as its measure has it.
 COUNTED = "counted"
 
 
@@ -52,7 +52,7 @@ Optional = partial(Column, optional=True)
 
 
 def interval(name: str, meaning: str, rests_on: str = "", digits: int = DECIMALS) -> Column:
-    """The column of a 95 % interval."""
+    """Return the column of a 95 % interval."""
     return Optional(name, "95 % CI", "interval", meaning, rests_on=rests_on, digits=digits)
 
 
@@ -86,7 +86,7 @@ def row_of(
     item: str = "",
     rests_on: str = FINISHED,
 ) -> Row:
-    """A group's row with its GROUP_COLUMNS, named ``o3/A2/item``; its note joins the remarks.
+    """Return a group's row with its GROUP_COLUMNS, named ``o3/A2/item``, and the joined remarks.
 
     The published values of humans rest on no trials here.
     """
@@ -130,10 +130,10 @@ AS_JSON = TypeAdapter(Table)
 
 
 def to_text(table: Table) -> str:
-    """A table as JSON text, which ``from_text`` turns back into an equal table."""
+    """Return a table as JSON text, which ``from_text`` turns back into an equal table."""
     return AS_JSON.dump_json(table).decode()
 
 
 def from_text(text: str) -> Table:
-    """The table that ``to_text`` wrote."""
+    """Return the table that ``to_text`` wrote."""
     return AS_JSON.validate_json(text)

@@ -1,4 +1,4 @@
-"""Sentences under the tables: what n rests on, what was left out, and who is a stand-in."""
+"""Sentences under the tables: what n rests on, what was left out, and which models are mocks."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from merge_runner_analysis.tables.model import Table
 
 
 def footnoted(table: Table, study: Study) -> Table:
-    """The table with notes on its trials, and ``*`` for what is said of drivers, told in a note."""
+    """Return the table with notes on its trials, and ``*`` for remarks on drivers."""
     drivers = (*study.groups, *study.asked, *study.unjudged, *study.unjudged_asked)
-    remarks = {text for group in drivers for text in (group.posing, group.said)}
+    remarks = {text for group in drivers for text in (group.posing, group.remark)}
     whose: dict[str, dict[str, None]] = {}
     rows = []
     for row in table.rows:

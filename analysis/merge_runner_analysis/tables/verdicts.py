@@ -77,7 +77,7 @@ VERDICT_COLUMNS = (
 
 
 def verdicts(study: Study) -> Table:
-    """Every driver and prompt that is judged, and the humans first, by every measure."""
+    """Return every judged driver and prompt by every measure, the humans first."""
     rows = [] if study.human not in study.groups else [*_human_rows(study)]
     for group in (*(group for group in study.models if not group.caution), *study.unjudged):
         rows += _driver_rows(study, group)
@@ -88,8 +88,8 @@ def verdicts(study: Study) -> Table:
         (
             *sentences(rows),
             *(
-                f"{one.name}: {one.trait}, {one.unit}; verdict: {one.rule}"
-                for one in MEASURES.values()
+                f"{measure.name}: {measure.trait}, {measure.unit}; verdict: {measure.rule}"
+                for measure in MEASURES.values()
             ),
             f"{VERDICT_RULE}. The interval of the difference has the level at which Holm tests it, "
             "so that it leaves 0 out where the verdict says so",
@@ -139,7 +139,7 @@ def _driver_rows(study: Study, group: Group) -> Iterator[Row]:
 
 
 def _copies(study: Study, group: Group) -> tuple[tuple[str, str], ...]:
-    """The trials of a stand-in that went as another one, with words that it does not read."""
+    """Return a mock model's trials that are copies of others, with words that it does not read."""
     once = distinct(study, group).trials
     if len(once) == len(group.trials):
         return ()
@@ -154,7 +154,7 @@ def _compared(
     difference = tested if measure.margin is None else Estimate()
     values = driver | {
         "measure": measure.name,
-        **_known(comparison.own),
+        **_known(comparison.driver),
         "human": comparison.human.value,
         "human_ci": comparison.human.bounds(),
         "difference": difference.value,
@@ -181,7 +181,7 @@ def _compared(
 def _human_rows(study: Study) -> Iterator[Row]:
     for name, estimate in of_humans(study).items():
         values = _driver(study.human, HUMANS) | {"measure": name, **_known(estimate)}
-        # What is published rests on no trials here.
+        # Published values rest on no trials here.
         published = estimate.source or not study.human.measured
         rests_on = "" if published else MEASURES[name].rests_on
         note = note_of(estimate.problem, estimate.source)

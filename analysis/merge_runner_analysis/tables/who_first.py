@@ -21,7 +21,7 @@ from merge_runner_analysis.tables.model import Column, Optional, Table
 
 
 def who_first(study: Study) -> Table:
-    """Table III: logistic regression of left-first on h (m) and dv (m/s)."""
+    """Return Table III: logistic regression of left-first on h (m) and dv (m/s)."""
     fitted = {group: _fits(group) for group in study.groups}
     return Table(
         "who-first",
@@ -49,7 +49,7 @@ def who_first(study: Study) -> Table:
 
 
 def _fits(group: Group) -> list[Fit]:
-    """By maximum likelihood and by Firth's fit, the humans also with errors by pair."""
+    """Return fits by maximum likelihood and by Firth, of humans also with errors by pair."""
     # Wald's p fails where conditions nearly separate the outcomes, as those of humans do (Hauck and
     # Donner 1977); Firth's penalty (1993) keeps estimates finite there.
     every: list[Fit] = [("", "", {"": fits(group).logit, "firth_": fits(group).firth})]

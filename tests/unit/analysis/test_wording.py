@@ -14,11 +14,11 @@ from merge_runner_analysis.wording import (
     SHOWN,
     TOO_FEW,
     crashes,
+    difference_sentence,
     differs,
     headline,
     money,
     sentence,
-    told,
     verdict_word,
 )
 
@@ -188,10 +188,10 @@ def test_crashes_are_said_raw_then_by_the_humans_rule(of, says):
 def test_an_interval_beside_a_margin_names_its_level_where_that_is_not_95_percent(
     measure, level, said
 ):
-    text = told(row(measure, n=14, level=level), "it")
+    text = difference_sentence(row(measure, n=14, level=level), "it")
     assert ("interval at" in text) == bool(said)
     assert not said or text.endswith(f"(interval at {said} %)")
-    assert "interval at" not in told(row("gap", n=14, level=level), "it")
+    assert "interval at" not in difference_sentence(row("gap", n=14, level=level), "it")
 
 
 @pytest.mark.parametrize(

@@ -91,12 +91,12 @@ def test_i4_is_judged_by_the_largest_predicted_difference(study, gap_of, scatter
     gap = gap_of(headway, velocity) + scatter * noise
     moved = replace(group, trials=group.trials.assign(gap_m=gap, counted_gap_m=gap))
     (found,) = (c for c in compared(study, moved) if c.measure.name == "gap-velocity")
-    low, high = found.own.bounds()
+    low, high = found.driver.bounds()
     assert found.state == state
     assert level is None or found.tested.level == pytest.approx(level)
     assert found.human.value == pytest.approx(6.4 * 0.06)
     if state == "unlike":
-        assert found.own.value == pytest.approx(0.34 * 6.4, abs=0.05)
+        assert found.driver.value == pytest.approx(0.34 * 6.4, abs=0.05)
         assert found.tested.level >= 0.95
     assert {"unlike": low > 1, "shown": high < 1, "inconclusive": low <= 1 <= high}[state]
 
