@@ -125,7 +125,7 @@ def explorer(site: Site) -> Starlette:
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
         yield
-        site.close()  # a server that is told to end is killed after this
+        site.close()  # a server that gets a signal to end is killed after this
 
     return Starlette(
         routes=[
@@ -150,7 +150,6 @@ def explorer(site: Site) -> Starlette:
 
 
 def _page(site: Site, render: Callable[..., str | Response], asked: Request) -> Response:
-    """A page, of what the database holds now."""
     if site.beginning:
         text = site.render("message.html", heading="Reading the trials", text=FIRST_TIME, here="")
         return HTMLResponse(text, headers={"refresh": "1"})  # in s
@@ -219,7 +218,7 @@ async def _noted(site: Site, request: Request) -> Response:
 
 
 def _errors(site: Site) -> dict[Any, Callable[[Request, Exception], Response]]:
-    """The pages that say why there is no other."""
+    """Return the error page of each exception."""
 
     def said(heading: str, code: int, request: Request, exc: Exception) -> Response:
         text = str(exc)
@@ -235,7 +234,7 @@ def _errors(site: Site) -> dict[Any, Callable[[Request, Exception], Response]]:
         NothingNew: lambda *_: Response(status_code=204),
         NotThere: partial(said, "Not there", 404),
         TooMuch: partial(said, "Too much", 400),
-        # Nobody reads what is answered to a browser that has left.
+        # Nobody reads an answer to a browser that has left.
         ClientDisconnect: lambda *_: Response(status_code=400),
         404: partial(said, "Not there", 404),
         MergeRunnerError: partial(said, "Not now", 503),

@@ -1,4 +1,4 @@
-"""The list of all trials of a database as it is now, and what its trials come to together."""
+"""List of all trials of a database in its present state, with counts and means over them."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ PAGE = 100
 MANY, STANDS_S = 3_000, 20.0
 MOST_COUNTED = 50  # filters whose counts are remembered
 Wanted = Mapping[str, Any]
-"""Which trials are wanted, by facet or column; an empty value wants all, and of a list one must be.
+"""A filter of trials by facet or column: an empty value admits all, a list any of its values.
 
-``who`` is ``drivers``, ``humans`` or ``stand-ins``, and ``q`` are parts of a name. ``trials`` are
-(trial, spec), where those behind a cell of a table are wanted.
+``who`` is a kind of driver, ``q`` has parts of a name, and ``trials`` are the (trial, spec) behind
+a cell of a table.
 """
 Facets = dict[str, list[tuple[str, int]]]
 Counted = TypeVar("Counted")
@@ -101,7 +101,7 @@ MEMBERS = " JOIN (SELECT number, value AS sweep FROM several WHERE facet = 'swee
 
 
 def where_of(wanted: Wanted, leave_out: str = "") -> tuple[str, list[Any]]:
-    """A filter as SQL with its values; without one facet, to count its alternatives."""
+    """Return a filter as an SQL condition with its values; ``leave_out`` drops a facet."""
     parts, values = ["true"], list[Any]()
     for name, value in wanted.items():
         if name == leave_out or value in ("", (), None):
@@ -165,31 +165,31 @@ class Catalogue:
 
     @property
     def held(self) -> bool:
-        """Whether another program holds the database, and what is listed may be old."""
+        """Return whether another program holds the database, so that the list may be old."""
         return self.copies.held
 
     @property
     def state(self) -> Row:
-        """What differs where other ``trials`` are listed, or the same otherwise."""
+        """State of the list, which differs wherever the listed ``trials`` or their values do."""
         return self._listing.state
 
     @property
     def others(self) -> list[Pair]:
-        """Which model was asked for where another one answered, and which."""
+        """Pairs of the requested and the served model that differ."""
         return self._listing.others
 
     @property
     def has_humans(self) -> bool:
-        """Whether any human trial is listed."""
+        """Return whether any human trial is listed."""
         return bool(self.ask("SELECT 1 FROM listed WHERE who = 'humans' LIMIT 1"))
 
     def ask(self, sql: str, *values: object) -> list[Row]:
-        """Rows of a query of ours."""
+        """Return the rows of a query of ours."""
         with self._lock:
             return records(self._listing.connection, sql, values)
 
     def cursor(self) -> duckdb.DuckDBPyConnection:
-        """Another connection: its queries keep no page waiting."""
+        """Return another connection: its queries keep no page waiting."""
         with self._lock:
             return self._listing.cursor()
 
@@ -207,7 +207,7 @@ class Catalogue:
                 self._tags, self._counted = tags, {}
 
     def factors(self) -> list[str]:
-        """The factors of the listed studies, with ``model`` where there is any, but no prompt."""
+        """Return the factors of the listed studies but the prompt; none if only models differ."""
         rows = self.ask(
             f"SELECT DISTINCT facet FROM several WHERE facet LIKE '{FACTOR}%' ORDER BY ALL"  # noqa: S608 # constants
         )
@@ -215,7 +215,7 @@ class Catalogue:
         return names if names != ["model"] else []
 
     def facets(self, wanted: Wanted) -> Facets:
-        """Each facet's values with how many trials they would leave, the other facets as wanted."""
+        """Return each facet's values with the number of trials left under the other filters."""
 
         def count() -> Facets:
             names = (*FACETS, *(f"{FACTOR}{name}" for name in self.factors()))
@@ -224,7 +224,7 @@ class Catalogue:
         return self._once(("facets", wanted), count)
 
     def counts(self, wanted: Wanted, *columns: str) -> list[Row]:
-        """What a filter's trials come to by columns: counts of all, means of those with a value.
+        """Return a filter's trials grouped by columns: counts of all, means of those with a value.
 
         Without columns it is one row. A trial counts in each ``sweep`` of which it is a member.
         """
@@ -238,13 +238,13 @@ class Catalogue:
         return self._once((columns, wanted), lambda: self.ask(sql, *values))
 
     def totals(self, wanted: Wanted) -> list[Row]:
-        """What a filter's trials come to by model, as it stands above their list."""
+        """Return a filter's totals by model, for the line above the list."""
         where, values = where_of(wanted)
         sql = f"SELECT model, {TOTALS} FROM listed WHERE {where} GROUP BY ALL ORDER BY model"  # noqa: S608 # constants
         return self._once(("totals", wanted), lambda: self.ask(sql, *values))
 
     def _once(self, of: object, count: Callable[[], Counted]) -> Counted:
-        """Count something of the present list, or give what was counted of it before."""
+        """Return a count of the present list, from memory after the first call."""
         with self._lock:
             if len(self._counted) > MOST_COUNTED:
                 self._counted.clear()
@@ -255,7 +255,7 @@ class Catalogue:
             return found
 
     def every(self, wanted: Wanted, sort: str = "trial") -> list[Row]:
-        """All trials of a filter; ``-gap`` sorts the largest gap first, what has none last."""
+        """Return all trials of a filter; ``-gap`` sorts largest first, missing ones last."""
         where, values = where_of(wanted)
         return self.ask(
             f"SELECT {UNDRAWN} FROM listed WHERE {where} ORDER BY {_order_of(sort)}",  # noqa: S608 # constants
@@ -263,7 +263,7 @@ class Catalogue:
         )
 
     def page(self, wanted: Wanted, sort: str, number: int) -> list[Row]:
-        """The trials of a page from 1, with their speeds and the ``causes`` of their errors."""
+        """Return the trials of a page from 1, with their speeds and the ``causes`` of errors."""
         where, values = where_of(wanted)
         order = _order_of(sort)
         sql = (
@@ -274,7 +274,7 @@ class Catalogue:
         return self._once((sort, number, wanted), lambda: self.ask(sql, *values))
 
     def find(self, trial_id: str, spec_hash: str = "") -> Row | None:
-        """One trial; where its name stands for several, the one of that spec, or any."""
+        """Return a trial; of several with its name the one of that spec, or any."""
         found = self.ask(
             f"SELECT {UNDRAWN} FROM listed WHERE trial_id = ? AND spec_hash LIKE ? "  # noqa: S608 # constants
             "ORDER BY spec_hash LIMIT 1",
@@ -283,7 +283,7 @@ class Catalogue:
         return next(iter(found), None)
 
     def condition_texts(self) -> dict[str, str]:
-        """In words: the conditions that humans drove, and those of all trials."""
+        """Return the conditions in words: those that humans drove, and those of all trials."""
         numbers = "condition, projected_headway_m, relative_velocity_mps"
         played = self.ask(f"SELECT DISTINCT {numbers} FROM listed")  # noqa: S608 # constants
         return {
@@ -292,7 +292,7 @@ class Catalogue:
         } | {name: condition_text(*of) for name, *of in map(dict.values, played)}
 
     def export(self, wanted: Wanted, sort: str) -> str:
-        """All trials of a filter as CSV, with a column for each factor but the model."""
+        """Return all trials of a filter as CSV, with a column for each factor but the model."""
         factors = [name for name in self.factors() if name != "model"]
         names, lines = EXPORTED.split(), io.StringIO()
         writer = csv_writer(lines)
@@ -306,7 +306,7 @@ class Catalogue:
 def facets_of(
     cursor: duckdb.DuckDBPyConnection, listed: str, names: Sequence[str], wanted: Wanted
 ) -> Facets:
-    """The values of facets with how many rows of a table they would leave, the others as wanted."""
+    """Return each facet's values with the number of rows left under the other filters."""
     counts, values = [], list[Any]()
     for name in names:
         where, wants = where_of(wanted, leave_out=name)

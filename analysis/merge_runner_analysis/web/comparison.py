@@ -74,9 +74,9 @@ class Comparison:
 def compared(
     site: Site, own: Driver, other: Driver, scope: Scope
 ) -> tuple[Job, bool, Comparison | None]:
-    """One driver less another, each with its prompt: the computation, if it is awaited, the result.
+    """Compare two drivers: return the job, whether to wait for it, and the result.
 
-    The computation may end meanwhile: whether it is awaited is what was found.
+    A job without a result is waited for, even if it ends meanwhile.
     """
     groups = (f"{one.name}/{one.prompt}" for one in (own, other))
     named = short_names([own.name, other.name])
@@ -91,7 +91,7 @@ def compared(
 def comparison_of(
     table: Table, names: tuple[str, str], trials: tuple[TrialsOf, TrialsOf]
 ) -> Comparison | None:
-    """The comparison of two drivers; None where one of them is not judged."""
+    """Return the comparison of two drivers; None where one of them is not judged."""
     if not table.rows:
         return None
     # What a person sees at once comes first.
@@ -113,7 +113,7 @@ def comparison_of(
 
 
 def _corrected(rows: Sequence[Row]) -> str:
-    """How the p of these rows are corrected."""
+    """Describe the correction of these rows' p."""
     tested = [row for row in rows if row.values["p_corrected"] is not None]
     own = [name_of(row) for row in tested if row.values["primary"]]
     others = f"for the number of {'other ' * bool(own)}comparisons, {len(tested) - len(own)} (Holm)"
@@ -122,7 +122,7 @@ def _corrected(rows: Sequence[Row]) -> str:
 
 
 def trials_of(own: Driver, scope: Scope) -> TrialsOf:
-    """The filters of a driver's trials, of those that keep just as many as are counted."""
+    """Return a function from a count to the filter that keeps exactly its trials."""
     every, facts = scope.trials(own.name, own.prompt), own.facts or {}
 
     def behind(what: str, count: int) -> Filter:
@@ -143,7 +143,7 @@ def trials_of(own: Driver, scope: Scope) -> TrialsOf:
 
 
 def no_trials(_what: str, _count: int) -> Filter:
-    """No filter: a report has no list of trials."""
+    """Return no filter: a report has no list of trials."""
     return None
 
 

@@ -1,4 +1,4 @@
-"""Which trials an address asks for, and in what order."""
+"""Filter and order of trials in an address."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ HEADINGS = {
 
 
 def filter_of(asked: Mapping[str, str]) -> dict[str, str]:
-    """The filter in an address; raises TooMuch."""
+    """Return the filter in an address; raises TooMuch."""
     wanted = {
         name: value
         for name, value in asked.items()
@@ -49,6 +49,6 @@ def filter_of(asked: Mapping[str, str]) -> dict[str, str]:
 
 
 def sort_of(asked: Mapping[str, str]) -> str:
-    """The order in an address; one that is unknown is that of the names."""
+    """Return the order in an address; an unknown one is that of the names."""
     sort = asked.get("sort", "trial")
     return sort if sort.removeprefix("-") in SORTS else "trial"

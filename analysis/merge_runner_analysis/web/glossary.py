@@ -22,7 +22,7 @@ _MARKED = (
 
 @cache
 def sections() -> dict[str, list[tuple[str, Markup]]]:
-    """All words by the headings that they stand under, each with what is meant by it.
+    """Return all terms by heading, each with its meaning.
 
     Links of the meanings lead nowhere from a page, and become their texts.
     """
@@ -39,5 +39,5 @@ def sections() -> dict[str, list[tuple[str, Markup]]]:
 
 
 def meaning(term: str) -> Markup:
-    """What a word means; raises KeyError for one that the glossary lacks."""
+    """Return the meaning of a term; raises KeyError for one that the glossary lacks."""
     return {word: said for words in sections().values() for word, said in words}[term]

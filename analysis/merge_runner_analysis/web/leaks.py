@@ -1,4 +1,4 @@
-"""What must not leave this machine: its keys, and paths that name its folders."""
+"""Refusal of files that hold keys of this machine, or paths that name its folders."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _HOMES = re.compile(r"(?<![\w.])(?:/home|/Users|[A-Z]:\\+Users)[/\\]+[\w.-]+[/\\
 
 
 def refuse_leaks(db: Path, where: str, text: str) -> None:
-    """Raises UsageError where a text holds a key, or a path of this machine."""
+    """Raise UsageError where a text holds a key, or a path of this machine."""
     for name in filter(lambda name: name.endswith(_SECRET_NAMES), os.environ):
         if len(os.environ[name]) >= SHORTEST_SECRET and os.environ[name] in text:
             raise UsageError(f"nothing was written: {where} holds the value of {name}")

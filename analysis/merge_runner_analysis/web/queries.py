@@ -20,11 +20,11 @@ from merge_runner_analysis.web.database_copy import Copies
 from merge_runner_analysis.web.display_text import csv_cell, text_of
 
 AT_ONCE = 2
-WAITING = 8  # beside those that run: each keeps a thread of the server
+WAITING = 8  # in addition to those that run: each keeps a thread of the server
 LONGEST_S = 10.0
 LONGEST = 10_000  # characters of a query
 MEMORY_MB = 512
-# What is shown of a result: rows, characters of a cell, and of all cells with what each costs.
+# Shown of a result: rows, characters of a cell, and of all cells with what each costs.
 ROWS, TEXT, SIZE, CELL_COSTS = 1_000, 2_000, 5_000_000, 30
 DOWNLOADED_ROWS, DOWNLOADED = 100_000, 50_000_000  # the second are characters
 AGAIN_S = 0.1  # a query that is about to begin forgets that it was to end
@@ -35,7 +35,7 @@ Cell = tuple[str, int] | None
 
 @dataclass(frozen=True, slots=True)
 class QueryResult:
-    """What a query found: names and types of columns, and rows; with ``more`` there are others."""
+    """Result of a query: names and types of columns, and rows; with ``more`` it is cut."""
 
     columns: list[tuple[str, str]]
     rows: list[list[Cell]]
@@ -53,7 +53,7 @@ class Queries:
         self._places = threading.Semaphore(AT_ONCE + WAITING)
 
     def result(self, sql: str) -> QueryResult:
-        """What a query finds, as much of it as is shown; raises UsageError."""
+        """Return the result of a query, as much of it as is shown; raises UsageError."""
         began, size, rows = time.monotonic(), 0, list[list[Cell]]()
         with self._answering(sql) as found:
             columns = [(name, str(kind)) for name, kind, *_ in found.description]
@@ -69,7 +69,7 @@ class Queries:
         return QueryResult(columns, rows, more, time.monotonic() - began)
 
     def csv(self, sql: str) -> str:
-        """All that a query finds; raises UsageError, also where it is more than a download holds.
+        """Return the whole result of a query; raises UsageError, also where it is too large.
 
         A file that ended early would be taken for the whole.
         """

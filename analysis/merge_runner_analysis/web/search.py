@@ -53,7 +53,7 @@ FOUND = "hits JOIN listed USING (number)"
 
 @dataclass(slots=True)
 class Words:
-    """What the drivers of a database said. One search goes on at a time."""
+    """Search in the words of a database's drivers, one query at a time."""
 
     catalogue: Catalogue
     _lock: threading.Lock = field(default_factory=threading.Lock)
@@ -65,12 +65,10 @@ class Words:
         limits: Mapping[str, str] | None = None,
         page: int = 1,
     ) -> dict[str, Any]:
-        """Decisions with all ``terms`` within ``limits``, of which ``hits`` are those of a page.
+        """Return decisions with all ``terms`` within ``limits``; ``hits`` are those of a page.
 
-        Those of scripted stand-ins come last.
-
-        Each has the ``pieces`` of its words. ``crossed`` counts all of them by what was said, M or
-        Y, and by what was planned.
+        Those of mock models are the last. Each has the ``pieces`` of its words. ``crossed`` counts
+        all of them by intention, M or Y, and by plan.
         """
         limits = limits or {}
         conditions = ["true", *(LIMITS[name] for name in limits)]
@@ -114,7 +112,7 @@ class Words:
 
 
 def terms_of(query: str) -> tuple[str, ...]:
-    """The words of a query, and its phrases in quotes.
+    """Return the words of a query, and its phrases in quotes.
 
     >>> terms_of('yield "collision course')
     ('yield', 'collision course')
@@ -126,7 +124,7 @@ def terms_of(query: str) -> tuple[str, ...]:
 
 
 def pieces_of(text: str, terms: Sequence[str]) -> list[tuple[str, bool]]:
-    """A part of a text with its first match, cut into the terms, True, and what is between them."""
+    """Cut a part of a text with its first match into terms, True, and the text between them."""
     longest_first = sorted(terms, key=len, reverse=True)
     looked_for = "|".join(re.escape(term).replace(r"\ ", r"\s") for term in longest_first)
     pattern = re.compile(f"({looked_for or '(?!)'})", re.IGNORECASE)

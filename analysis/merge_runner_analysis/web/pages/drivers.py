@@ -36,7 +36,7 @@ GROUP BY ALL ORDER BY ALL
 
 
 def drivers_page(site: Site, asked: Mapping[str, str]) -> str:
-    """All drivers with their prompts; raises NotThere."""
+    """Return all drivers with their prompts; raises NotThere."""
     bar = scope_of(site, asked)
     chosen = bar.scope.drivers or bar.drivers
     drivers, values = judged(site, bar, asked)
@@ -45,7 +45,7 @@ def drivers_page(site: Site, asked: Mapping[str, str]) -> str:
 
 
 def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
-    """A driver with one prompt, of ``human`` the humans; raises NotThere."""
+    """Return the page of a driver with one prompt, or of ``human``; raises NotThere."""
     bar = scope_of(site, asked, "" if name == HUMAN else name)
     scope = bar.scope
     drivers, values = judged(site, bar, asked)
@@ -101,9 +101,9 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
 
 
 def _counted(cells: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str]]:
-    """What is counted in each situation: its heading, and the counts of trials and of all of them.
+    """Return the counts to show by situation: heading, and the names of counts k and n.
 
-    Where an ego sat on the right, who goes first is also counted for it, on either side.
+    Where an ego was on the right, its going first is counted too, on either side.
     """
     egos = [side for side in SIDES if any(cell[f"ego_merged_{side}"] for cell in cells)]
     left = "Left, the ego, goes first" if egos == ["left"] else "Left goes first"
@@ -118,7 +118,7 @@ def _counted(cells: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str]]:
 
 
 def _summary(own: Driver) -> str:
-    """How many of the humans' traits are shown, and how many measures are open."""
+    """Return the number of human traits that are shown, and of measures that are open."""
     states = {
         name: state for name, cell in own.cells.items() if (state := shown_state(cell.values))
     }
@@ -131,7 +131,7 @@ def _summary(own: Driver) -> str:
 
 
 def _first(site: Site, driver: str, scope: Scope) -> tuple[Job | None, str]:
-    """What is awaited, and what a driver does first, by the table of first actions."""
+    """Return the job to wait for, and a driver's first actions in sentences."""
     found, table = computed_table(site, "first-action", scope.sweep, scope.condition)
     told = []
     for row in table.rows if table else []:
@@ -147,7 +147,7 @@ def _first(site: Site, driver: str, scope: Scope) -> tuple[Job | None, str]:
 
 
 def _harder(row: TableRow) -> str:
-    """By how many m/s² one who is faster brakes, or speeds up, harder; with its interval."""
+    """Return by how many m/s² a faster driver brakes, or speeds up, harder; with interval."""
     values: Mapping[str, Any] = row.values
     brakes = values["slope"] < 0
     low, high = sorted(-end if brakes else end for end in values["slope_ci"])

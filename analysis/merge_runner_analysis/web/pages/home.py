@@ -21,9 +21,9 @@ TABLES = ("effects", "levels")  # of what a study's factors change
 
 
 def _question(site: Site, bar: Bar) -> tuple[list[Job], list[Job], Answer | None]:
-    """The computations of what the study's factors change, if any, those awaited, the answer.
+    """Return the jobs of the tables on factors, if any, those to wait for, and the answer.
 
-    A computation may end meanwhile: whether it is awaited is what its table was.
+    A job without a table is waited for, even if it ends meanwhile.
     """
     if len(bar.prompts) < 2 and not site.catalogue.factors():
         return [], [], None
@@ -38,7 +38,7 @@ def _is_tested(driver: Driver, measure: str) -> bool:
 
 
 def home_page(site: Site, asked: Mapping[str, str]) -> str:
-    """The study; raises NotThere, and NothingNew where nothing is new since it was ``seen``."""
+    """Return the study's page; raises NotThere, and NothingNew where it is as ``seen``."""
     standing = standing_of(site.catalogue)
     bar = scope_of(site, asked)
     scope = bar.scope

@@ -1,4 +1,4 @@
-"""What readers noted, all of it."""
+"""List of all notes, and new ones."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from merge_runner_analysis.web.urls import whole
 
 
 def notes_page(site: Site, _: Mapping[str, str]) -> str:
-    """Return all notes, the latest first, each with the address of what it is of.
+    """Return all notes, the latest first, each with the address of its trial or decision.
 
     It has none where the trial is not in this database.
     """

@@ -1,4 +1,4 @@
-"""Prompts: what each says otherwise than the baseline, and what that does, driver by driver."""
+"""Prompts: how each differs from the baseline, and the effect on each driver."""
 
 from __future__ import annotations
 
@@ -30,9 +30,8 @@ SELECT any_value(names) AS names FROM listed JOIN (
     SELECT spec_hash, json_keys(spec, '$.prompt_blocks') AS names FROM specs
 ) USING (spec_hash) WHERE variant = ? AND len(names) > 0
 """
-# What each variant asks first, beside the baseline on the same side: of all of them in the same
-# condition, as far as that was played. Where the two drivers may be told different things: what the
-# ego and what the other is.
+# The first prompt of each variant with the baseline's on the same side: all of the same condition,
+# as far as that was played. The ego's and the other driver's apart, where their words may differ.
 FIRST = """
 WITH asked AS (
     SELECT *, CASE WHEN focal IS NULL THEN 'both' WHEN side = focal THEN 'ego' ELSE 'other' END
@@ -70,7 +69,7 @@ WITHOUT_PROMPT = json.dumps({"prompt_blocks": None, **dict.fromkeys(SIDES, _UNPL
 
 
 def prompts_page(site: Site, asked: Mapping[str, str]) -> str:
-    """All prompts side by side, and the differences that they make."""
+    """Return all prompts side by side, and the differences that they make."""
     bar = scope_of(site, asked)
     chosen = bar.scope.drivers or bar.drivers
     found, contrasts = computed_table(site, "contrasts", bar.scope.sweep, bar.scope.condition)
@@ -104,7 +103,7 @@ def prompts_page(site: Site, asked: Mapping[str, str]) -> str:
 
 
 def _told(site: Site) -> dict[str, dict[str, list[Part]]]:
-    """What each prompt asks first, by its reader: one, or the two drivers where these differ."""
+    """Return the first prompt's parts, by variant and reader: two readers where theirs differ."""
     told: dict[str, dict[str, list[Part]]] = {}
     seen: dict[str, list[list[Part]]] = {}
     for row in site.catalogue.ask(FIRST, BASELINE):
@@ -120,10 +119,10 @@ def _told(site: Site) -> dict[str, dict[str, list[Part]]]:
 def differences(
     table: Table, chosen: Collection[str]
 ) -> tuple[dict[str, dict[str, dict[str, Any]]], dict[str, float]]:
-    """What each prompt changes, by driver of these, by both prompts, and by measure.
+    """Return each prompt's differences by driver, pair of prompts and measure, and axis ends.
 
     Each difference is as it is printed, with its mark, filled where its corrected p is below 5 %,
-    and what a link to its trials needs. And where the axis of each measure ends on both sides.
+    and the names for a link to its trials. An axis ends at the same distance on both sides.
     """
     # A driver that is not judged has none.
     rows = [row for row in table.rows if row.values.get("difference") is not None]
@@ -151,19 +150,19 @@ def differences(
 
 
 def _values(row: Row) -> list[float]:
-    """A difference, with the ends of its interval if it has one."""
+    """Return a difference, with the ends of its interval if it has one."""
     values: Mapping[str, Any] = row.values
     return [values["difference"], *(values.get("ci") or ())]
 
 
 def left_out(site: Site, variant: str) -> str:
-    """What a variant's prompt leaves out and adds, by name and meaning."""
+    """Describe the blocks that a variant's prompt leaves out and adds, by name and meaning."""
     ((names,),) = map(dict.values, site.catalogue.ask(STORED, variant))
     if names is None:
         return f"of which {UNKNOWN}"
     baseline = frozenset(blocks_of(BASELINE))
-    # A block that one driver alone is told has its side behind its name; of the baseline's ones
-    # that is what the other one is not told.
+    # A block of one driver's prompt alone has its side behind its name; a baseline's block is then
+    # left out of the other driver's.
     own = frozenset(level_of(name.partition("@")[0]) for name in names) - baseline
     own |= baseline & frozenset(names)
     # The levels of words are in the variant's name already.
@@ -172,13 +171,13 @@ def left_out(site: Site, variant: str) -> str:
 
 
 def _named(block: str) -> str:
-    """A block with what it means, if that is known here."""
+    """Return a block's name, with its meaning if that is known here."""
     meaning = block_meaning(block)
     return block if meaning == UNKNOWN else f"{block}: {meaning}"
 
 
 def discordant_page(site: Site, asked: Mapping[str, str]) -> str:
-    """The pairs of trials that ended otherwise with a variant than with the baseline."""
+    """Return the pairs of trials that ended otherwise with a variant than with the baseline."""
     driver, variant = asked.get("model", ""), asked.get("variant", "")
     if not driver or not variant:
         raise NotThere("/discordant needs model=MODEL and variant=VARIANT")

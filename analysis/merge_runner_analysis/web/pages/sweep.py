@@ -46,12 +46,12 @@ TRUST = [
     )
 ]  # fmt: skip
 
-# What the list of runs always shows; the other rates where there is any such case.
+# Rates that the list of runs always shows; others appear where there is any such case.
 ALWAYS = ("collided", "failed", "invalid", "faults")
 
 
 def sweeps_page(site: Site, asked: Mapping[str, str]) -> str:
-    """The runs of a scope; raises NotThere, and NothingNew where they are as they were ``seen``."""
+    """Return the runs of a scope; raises NotThere, and NothingNew where they are as ``seen``."""
     bar, part = scope_of(site, asked, any_prompt=True), carried(asked)
     runs = list_runs(site.catalogue)
     counted = numbers_of(site.catalogue, bar.scope.wanted)
@@ -71,7 +71,7 @@ def sweeps_page(site: Site, asked: Mapping[str, str]) -> str:
 
 
 def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
-    """One run; raises NotThere, and NothingNew as ``seen``."""
+    """Return the page of a run; raises NotThere, and NothingNew where it is as ``seen``."""
     seen = asked.get("seen", "")
     found = [run for run in list_runs(site.catalogue) if run["sweep_id"] == sweep_id]
     if not found:
@@ -105,5 +105,5 @@ def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
 
 
 def audit_of(site: Site, runs: Sequence[Row]) -> Job | None:
-    """What the audit notes of each run; None while one goes on, which ends with an audit."""
+    """Return the audit's notes on each run; None while a run goes on, which ends with an audit."""
     return None if any(run["followed"] for run in runs) else computed(site, ("audit",))

@@ -30,7 +30,7 @@ from merge_runner_analysis.web.trial.sentences import (
     told,
 )
 
-# What is offered to lay beside a trial, and by what rule.
+# Offers of a trial to compare with, and their rules.
 HUMAN, REPETITION = "nearest human", "next repetition"
 OFFERS = {
     HUMAN: "the human trial of this condition, at such speeds, whose headway "
@@ -108,7 +108,7 @@ def _page(site: Site, row: Row, trial: Trial, template: str) -> str:
 
 
 def read(site: Site, rows: Sequence[Row]) -> list[Trial]:
-    """What was stored of trials."""
+    """Read the stored trials of these rows."""
     with site.catalogue.cursor() as connection:
         return read_trials(connection, [(row["trial_id"], row["spec_hash"]) for row in rows])
 
@@ -123,7 +123,7 @@ def panels(site: Site, row: Row, trial: Trial) -> list[Markup]:
 def decision_panel(
     site: Site, row: Row, trial: Trial, decision: Row, others: Sequence[Pair]
 ) -> Markup:
-    """What a driver was told, said, planned and did; ``others`` are answers of another model."""
+    """Return a decision's observation, reply, plan and action; ``others``: served models."""
     named = {"side": decision["side"], "decision": decision["decision"]}
     query = REPLY.format(decision["call_key"])
     raw = site.at.to("sql.csv", q=query) if site.at.served else ""
@@ -156,7 +156,7 @@ def decision_panel(
 
 
 def _older_s(decision: Row, trial: Trial) -> float | None:
-    """When the plan was made that a decision without one fell back on; None where none was left."""
+    """Return the time of the older plan that a fallback drove on; None where none was left."""
     pace, before = trial.paces[decision["side"]], decision["before"]
     while before and not before["plan"]:
         before = before["before"]
@@ -168,7 +168,7 @@ def _older_s(decision: Row, trial: Trial) -> float | None:
 
 
 def others(site: Site, trial_id: str, asked: Mapping[str, str]) -> dict[str, Any] | str | None:
-    """What a trial's page asks about others: one to lay beside it, one that is offered, or several.
+    """Return other trials for a trial's page: one to compare, one on offer, or several.
 
     ``compare=KEY`` gives what a replay draws of it, ``offer=KIND`` a key; None where there is none.
     ``q=WORDS`` gives the first trials that have the words, those of the same condition before
@@ -196,7 +196,7 @@ def others(site: Site, trial_id: str, asked: Mapping[str, str]) -> dict[str, Any
 
 
 def named(site: Site, key: str) -> Row | None:
-    """The trial that a key stands for; a name with several specs stands for the first of them."""
+    """Return the trial of a key; a name with several specs stands for the first of them."""
     name, _, spec = key.rpartition("@")
     return site.catalogue.find(key) or (site.catalogue.find(name, spec) if name else None)
 

@@ -22,7 +22,7 @@ MOST = 4  # drivers whose sums stand above a list
 
 
 def trials_page(site: Site, asked: Mapping[str, str]) -> str:
-    """One page of the trials that an address asks for; raises NothingNew as it was ``seen``."""
+    """Return a page of the trials in an address; raises NothingNew where it is as ``seen``."""
     state = site.catalogue.state
     seen = news_of(state, asked.get("seen", ""))
     news = site.at.to("trials", **{**asked, "seen": seen})
@@ -77,7 +77,7 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
 
 
 def _factors(row: Row) -> str:
-    """The levels of a trial's study that its driver does not name already."""
+    """Return a trial's levels, without those that its driver's name has."""
     levels = [*(row["levels"] or ())]
     return ", ".join(
         level
@@ -87,7 +87,7 @@ def _factors(row: Row) -> str:
 
 
 def _unknown(site: Site, chosen: Wanted) -> list[tuple[str, str, list[str]]]:
-    """Facets, as they are called, with a chosen value that no trial has, and the values there."""
+    """Return facets, by heading, with a chosen value that no trial has, and the known values."""
     known = site.catalogue.facets({})
     return [
         (HEADINGS.get(name, name.removeprefix(FACTOR)), value, [there for there, _ in values])
@@ -97,7 +97,7 @@ def _unknown(site: Site, chosen: Wanted) -> list[tuple[str, str, list[str]]]:
 
 
 def export_filter(site: Site, asked: Mapping[str, str]) -> Wanted:
-    """The filter in an address, whose cell may have to be computed.
+    """Return the filter in an address, whose cell may have to be computed.
 
     Raises NotThere, StoreError and TooMuch.
     """
@@ -106,12 +106,12 @@ def export_filter(site: Site, asked: Mapping[str, str]) -> Wanted:
 
 
 def cell_of(asked: Mapping[str, str]) -> dict[str, str]:
-    """The cell that an address names, with the part of the trials that it is of; empty for none."""
+    """Return the cell in an address, with its part of the trials; empty for none."""
     return {name: asked[name] for name in CELL if asked.get(name)} if asked.get("cell") else {}
 
 
 def cell_request(cell: Mapping[str, str]) -> tuple[str, ...]:
-    """What is asked for a cell, ``TABLE/ROW:COLUMN``; raises NotThere."""
+    """Return the request for a cell, ``TABLE/ROW:COLUMN``; raises NotThere."""
     table, _, rest = cell["cell"].partition("/")
     row, _, column = rest.rpartition(":")
     if table not in TABLES or not row:

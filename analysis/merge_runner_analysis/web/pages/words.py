@@ -1,4 +1,4 @@
-"""What drivers said, searched: decisions whose words hold those of a query."""
+"""Search in drivers' words: decisions whose words hold those of a query."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LIMIT = re.compile(r"-?(0?\.\d{1,6}|[01](\.0{1,6})?)")
 
 
 def words_page(site: Site, asked: Mapping[str, str]) -> str:
-    """A page of the decisions that an address asks for."""
+    """Return a page of the decisions that match an address."""
     query = asked.get("q", "")
     wanted = filter_of(asked) | {name: asked.get(name, "") for name in FACETS}
     wanted = {name: value for name, value in wanted.items() if value and name != "q"}

@@ -67,7 +67,7 @@ class Trial:
         }
 
     def interval_s(self, side: Side) -> float:
-        """How long a decision of a side is driven."""
+        """Return how long a decision of a side is driven."""
         return self.paces[side].interval_steps * self.scenario.step_s
 
 
@@ -136,11 +136,11 @@ def _trial(
 
 
 def scenario_of(source: str, spec: Mapping[str, Any] | None) -> ScenarioConfig:
-    """The task of a trial, as its spec tells it, or as it usually is."""
+    """Return the task of a trial from its spec, or the usual one."""
     usual = HUMAN_TASK if source == "human" else {}
     return ScenarioConfig.model_validate(usual if spec is None else spec)
 
 
 def controlled(samples: Row, name: str) -> list[float]:
-    """The samples of a vehicle from the start of control on; in the tunnels nobody controls it."""
+    """Return a vehicle's samples from the start of control on; in the tunnels it has none."""
     return [x for t, x in zip(samples["time_s"], samples[name], strict=True) if t >= 0]
