@@ -18,6 +18,7 @@ SOURCES = (
 CHECKED = (
     *(f"merge_runner/{name}" for name in ("audit", "prompts", "results", "scenarios", "study")),
     *(f"merge_runner/{name}" for name in ("drivers", "emulator")),
+    "analysis/merge_runner_analysis/web",
     *(
         f"merge_runner/{name}.py"
         for name in (

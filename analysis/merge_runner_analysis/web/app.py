@@ -151,7 +151,7 @@ def explorer(site: Site) -> Starlette:
 
 def _page(site: Site, render: Callable[..., str | Response], asked: Request) -> Response:
     if site.beginning:
-        text = site.render("message.html", heading="Reading the trials", text=FIRST_TIME, here="")
+        text = site.render("message.html", heading="Reading the trials", text=FIRST_TIME, view="")
         return HTMLResponse(text, headers={"refresh": "1"})  # in s
     site.refresh()
     rendered = render(site, *asked.path_params.values(), asked.query_params)
@@ -166,8 +166,8 @@ def _redirect(asked: Request) -> Response:
 
 
 def _trials_csv(site: Site, asked: Mapping[str, str]) -> Response:
-    wanted = trials.export_filter(site, asked)
-    return download(site.catalogue.export(wanted, sort_of(asked)), "trials.csv")
+    filters = trials.export_filter(site, asked)
+    return download(site.catalogue.export(filters, sort_of(asked)), "trials.csv")
 
 
 # What renders each page, of what its address names and asks for.
@@ -183,7 +183,7 @@ PAGES: dict[str, Callable[..., str | Response]] = {
     "/trials.csv": _trials_csv,
     "/trials/{name:path}": trial.trial_page,
     "/others/{name:path}": lambda *asked: JSONResponse(trial.others(*asked)),
-    "/glossary": lambda site, _: site.render("glossary.html", here="glossary", glossary=sections()),
+    "/glossary": lambda site, _: site.render("glossary.html", view="glossary", glossary=sections()),
     "/tables": tables.tables_page,
     "/tables/{name}.{suffix}": tables.table_file,
     "/tables/{name}": tables.table_page,
@@ -220,7 +220,7 @@ async def _noted(site: Site, request: Request) -> Response:
 def _errors(site: Site) -> dict[Any, Callable[[Request, Exception], Response]]:
     """Return the error page of each exception."""
 
-    def said(heading: str, code: int, request: Request, exc: Exception) -> Response:
+    def error_page(heading: str, code: int, request: Request, exc: Exception) -> Response:
         text = str(exc)
         if isinstance(exc, HTTPException):
             text = f"there is no page {request.url.path}"
@@ -228,15 +228,15 @@ def _errors(site: Site) -> dict[Any, Callable[[Request, Exception], Response]]:
             LOG.error("%s: a fault of the explorer: %r", request.url.path, exc)
             LOG.debug("where it happened", exc_info=exc)
             text = f"A fault of the explorer: {exc!r}. The other pages go on."
-        return HTMLResponse(site.render("message.html", heading=heading, text=text, here=""), code)
+        return HTMLResponse(site.render("message.html", heading=heading, text=text, view=""), code)
 
     return {
         NothingNew: lambda *_: Response(status_code=204),
-        NotThere: partial(said, "Not there", 404),
-        TooMuch: partial(said, "Too much", 400),
+        NotThere: partial(error_page, "Not there", 404),
+        TooMuch: partial(error_page, "Too much", 400),
         # Nobody reads an answer to a browser that has left.
         ClientDisconnect: lambda *_: Response(status_code=400),
-        404: partial(said, "Not there", 404),
-        MergeRunnerError: partial(said, "Not now", 503),
-        Exception: partial(said, "A fault", 500),
+        404: partial(error_page, "Not there", 404),
+        MergeRunnerError: partial(error_page, "Not now", 503),
+        Exception: partial(error_page, "A fault", 500),
     }

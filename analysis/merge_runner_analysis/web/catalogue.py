@@ -28,7 +28,7 @@ PAGE = 100
 # half a second, at most every so many seconds.
 MANY, STANDS_S = 3_000, 20.0
 MOST_COUNTED = 50  # filters whose counts are remembered
-Wanted = Mapping[str, Any]
+TrialFilter = Mapping[str, Any]
 """A filter of trials by facet or column: an empty value admits all, a list any of its values.
 
 ``who`` is a kind of driver, ``q`` has parts of a name, and ``trials`` are the (trial, spec) behind
@@ -100,10 +100,10 @@ EXPORTED = (
 MEMBERS = " JOIN (SELECT number, value AS sweep FROM several WHERE facet = 'sweep') USING (number)"
 
 
-def where_of(wanted: Wanted, leave_out: str = "") -> tuple[str, list[Any]]:
+def where_of(filters: TrialFilter, leave_out: str = "") -> tuple[str, list[Any]]:
     """Return a filter as an SQL condition with its values; ``leave_out`` drops a facet."""
     parts, values = ["true"], list[Any]()
-    for name, value in wanted.items():
+    for name, value in filters.items():
         if name == leave_out or value in ("", (), None):
             continue
         if name == "q":
@@ -164,9 +164,9 @@ class Catalogue:
             return True
 
     @property
-    def held(self) -> bool:
+    def is_locked(self) -> bool:
         """Return whether another program holds the database, so that the list may be old."""
-        return self.copies.held
+        return self.copies.is_locked
 
     @property
     def state(self) -> Row:
@@ -214,34 +214,34 @@ class Catalogue:
         names = [row["facet"].removeprefix(FACTOR) for row in rows]
         return names if names != ["model"] else []
 
-    def facets(self, wanted: Wanted) -> Facets:
+    def facets(self, filters: TrialFilter) -> Facets:
         """Return each facet's values with the number of trials left under the other filters."""
 
         def count() -> Facets:
             names = (*FACETS, *(f"{FACTOR}{name}" for name in self.factors()))
-            return facets_of(self._listing.connection, "listed", names, wanted)
+            return facets_of(self._listing.connection, "listed", names, filters)
 
-        return self._once(("facets", wanted), count)
+        return self._once(("facets", filters), count)
 
-    def counts(self, wanted: Wanted, *columns: str) -> list[Row]:
+    def counts(self, filters: TrialFilter, *columns: str) -> list[Row]:
         """Return a filter's trials grouped by columns: counts of all, means of those with a value.
 
         Without columns it is one row. A trial counts in each ``sweep`` of which it is a member.
         """
-        where, values = where_of(wanted)
+        where, values = where_of(filters)
         table = f"listed{MEMBERS}" if "sweep" in columns else "listed"
         named = "".join(f"{name}, " for name in columns)
         sql = (
             f"SELECT * EXCLUDE (every, once) FROM (SELECT {named}{COUNTS} FROM {table} "  # noqa: S608 # constants
             f"WHERE {where} GROUP BY ALL) ORDER BY ALL"
         )
-        return self._once((columns, wanted), lambda: self.ask(sql, *values))
+        return self._once((columns, filters), lambda: self.ask(sql, *values))
 
-    def totals(self, wanted: Wanted) -> list[Row]:
+    def totals(self, filters: TrialFilter) -> list[Row]:
         """Return a filter's totals by model, for the line above the list."""
-        where, values = where_of(wanted)
+        where, values = where_of(filters)
         sql = f"SELECT model, {TOTALS} FROM listed WHERE {where} GROUP BY ALL ORDER BY model"  # noqa: S608 # constants
-        return self._once(("totals", wanted), lambda: self.ask(sql, *values))
+        return self._once(("totals", filters), lambda: self.ask(sql, *values))
 
     def _once(self, of: object, count: Callable[[], Counted]) -> Counted:
         """Return a count of the present list, from memory after the first call."""
@@ -251,65 +251,65 @@ class Catalogue:
             name = repr(of)
             if name not in self._counted:
                 self._counted[name] = count()
-            found: Counted = self._counted[name]
-            return found
+            counted: Counted = self._counted[name]
+            return counted
 
-    def every(self, wanted: Wanted, sort: str = "trial") -> list[Row]:
+    def every(self, filters: TrialFilter, sort: str = "trial") -> list[Row]:
         """Return all trials of a filter; ``-gap`` sorts largest first, missing ones last."""
-        where, values = where_of(wanted)
+        where, values = where_of(filters)
         return self.ask(
             f"SELECT {UNDRAWN} FROM listed WHERE {where} ORDER BY {_order_of(sort)}",  # noqa: S608 # constants
             *values,
         )
 
-    def page(self, wanted: Wanted, sort: str, number: int) -> list[Row]:
+    def page(self, filters: TrialFilter, sort: str, number: int) -> list[Row]:
         """Return the trials of a page from 1, with their speeds and the ``causes`` of errors."""
-        where, values = where_of(wanted)
+        where, values = where_of(filters)
         order = _order_of(sort)
         sql = (
             f"SELECT {SHOWN} FROM listed SEMI JOIN (SELECT number FROM listed WHERE {where} "  # noqa: S608 # constants
             f"ORDER BY {order} LIMIT {PAGE} OFFSET {PAGE * (number - 1)}) USING (number) "
             f"LEFT JOIN ({CAUSES}) USING (number) ORDER BY {order}"
         )
-        return self._once((sort, number, wanted), lambda: self.ask(sql, *values))
+        return self._once((sort, number, filters), lambda: self.ask(sql, *values))
 
     def find(self, trial_id: str, spec_hash: str = "") -> Row | None:
         """Return a trial; of several with its name the one of that spec, or any."""
-        found = self.ask(
+        rows = self.ask(
             f"SELECT {UNDRAWN} FROM listed WHERE trial_id = ? AND spec_hash LIKE ? "  # noqa: S608 # constants
             "ORDER BY spec_hash LIMIT 1",
             *(trial_id, spec_hash or "%"),
         )
-        return next(iter(found), None)
+        return next(iter(rows), None)
 
     def condition_texts(self) -> dict[str, str]:
         """Return the conditions in words: those that humans drove, and those of all trials."""
         numbers = "condition, projected_headway_m, relative_velocity_mps"
         played = self.ask(f"SELECT DISTINCT {numbers} FROM listed")  # noqa: S608 # constants
         return {
-            name: condition_text(one.projected_headway_m, one.relative_velocity_mps)
-            for name, one in HUMAN_CONDITIONS.items()
+            name: condition_text(condition.projected_headway_m, condition.relative_velocity_mps)
+            for name, condition in HUMAN_CONDITIONS.items()
         } | {name: condition_text(*of) for name, *of in map(dict.values, played)}
 
-    def export(self, wanted: Wanted, sort: str) -> str:
+    def export(self, filters: TrialFilter, sort: str) -> str:
         """Return all trials of a filter as CSV, with a column for each factor but the model."""
         factors = [name for name in self.factors() if name != "model"]
         names, lines = EXPORTED.split(), io.StringIO()
         writer = csv_writer(lines)
         writer.writerow(map(csv_cell, [*names, *(f"{FACTOR}{name}" for name in factors)]))
-        for row in self.every(wanted, sort):
+        for row in self.every(filters, sort):
             levels = dict(level.split("=", 1) for level in row["levels"] or ())
             writer.writerow(map(csv_cell, [*map(row.get, names), *map(levels.get, factors)]))
         return lines.getvalue()
 
 
 def facets_of(
-    cursor: duckdb.DuckDBPyConnection, listed: str, names: Sequence[str], wanted: Wanted
+    cursor: duckdb.DuckDBPyConnection, listed: str, names: Sequence[str], filters: TrialFilter
 ) -> Facets:
     """Return each facet's values with the number of rows left under the other filters."""
     counts, values = [], list[Any]()
     for name in names:
-        where, wants = where_of(wanted, leave_out=name)
+        where, wants = where_of(filters, leave_out=name)
         table, value = listed, name
         if name in SEVERAL or name.startswith(FACTOR):
             table, value = f"{listed} JOIN (FROM several WHERE facet = ?) USING (number)", "value"
@@ -319,9 +319,9 @@ def facets_of(
             f"WHERE {where} AND {value} IS NOT NULL GROUP BY ALL"
         )
         values += [name, *wants]
-    found: Facets = {name: [] for name in names}
+    facets: Facets = {name: [] for name in names}
     for facet, value, times in cursor.execute(
         f"{' UNION ALL '.join(counts)} ORDER BY ALL", values
     ).fetchall():
-        found[facet].append((value, times))
-    return found
+        facets[facet].append((value, times))
+    return facets

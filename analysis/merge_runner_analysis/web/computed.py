@@ -29,13 +29,13 @@ def computed_table(
     site: Site, name: str, sweep: str = "", condition: str = ""
 ) -> tuple[Job, Table | None]:
     """Return the job of a table, of all trials or of a part, and the table once it is there."""
-    found = computed(site, ("table", name, sweep, condition))
-    return found, from_text(found.content["table"]) if found.content else None
+    job = computed(site, ("table", name, sweep, condition))
+    return job, from_text(job.content["table"]) if job.content else None
 
 
 def awaited(site: Site, request: Request) -> dict[str, Any]:
     """Return the answer of a computation in FILE_WAIT_S; raises NotThere and StoreError."""
-    found = computed(site, request, FILE_WAIT_S)
-    if found.content is None:
-        raise StoreError(found.failure or "it is still being computed: ask again in a minute")
-    return found.content
+    job = computed(site, request, FILE_WAIT_S)
+    if job.content is None:
+        raise StoreError(job.failure or "it is still being computed: ask again in a minute")
+    return job.content

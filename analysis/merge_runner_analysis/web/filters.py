@@ -28,24 +28,24 @@ HEADINGS = {
 
 def filter_of(asked: Mapping[str, str]) -> dict[str, str]:
     """Return the filter in an address; raises TooMuch."""
-    wanted = {
+    filters = {
         name: value
         for name, value in asked.items()
         if value and (name in {*FACETS, "q"} or name.startswith(FACTOR))
     }
-    words = wanted.get("q", "")
+    words = filters.get("q", "")
     if len(words) > LONGEST_QUERY or len(words.split()) > MOST_TERMS:
         raise TooMuch(
             f"a search has up to {MOST_TERMS} words and {LONGEST_QUERY} characters, this one "
             f"{len(words.split()):,} and {len(words):,}"
         )
     longest = max(map(len, asked.values()), default=0)
-    if len(wanted) > MOST_CHOSEN or longest > LONGEST_VALUE:
+    if len(filters) > MOST_CHOSEN or longest > LONGEST_VALUE:
         raise TooMuch(
             f"a filter has up to {MOST_CHOSEN} parts of up to {LONGEST_VALUE:,} characters, this "
-            f"one {len(wanted):,} of up to {longest:,}"
+            f"one {len(filters):,} of up to {longest:,}"
         )
-    return wanted
+    return filters
 
 
 def sort_of(asked: Mapping[str, str]) -> str:

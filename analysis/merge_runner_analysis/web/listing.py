@@ -186,7 +186,7 @@ def list_trials(copy: Copy) -> Listing:
     connection.execute(f"ATTACH {copy.file} AS results (READ_ONLY); {BOTH}")
     connection.execute(JUDGED, columns_of(judged_collisions(connection), 3))
     connection.execute(POSED)
-    connection.execute(SAID, columns_of(map(_said, records(connection, DRIVERS, ())), 3))
+    connection.execute(SAID, columns_of(map(_labels, records(connection, DRIVERS, ())), 3))
     others = other_models(connection)
     connection.execute((LISTED + ";" + OF_TRIALS).format(others=sql_of(others)))
     (state,) = records(connection, STATE, ())
@@ -208,7 +208,7 @@ def columns_of(rows: Iterable[Sequence[object]], number: int) -> list[list[objec
     return [list(column) for column in zip(*rows, strict=True)] or [[] for _ in range(number)]
 
 
-def _said(row: Row) -> tuple[int, str | None, str | None]:
+def _labels(row: Row) -> tuple[int, str | None, str | None]:
     """Return the place of a spec, its trials' mock model, and their drivers that cannot react."""
     spec = json.loads(row["spec"])
     models = language_models({side: row[side] for side in SIDES}, spec)

@@ -81,9 +81,9 @@ def band(measure: Measure, human: Values) -> Mark:
     value, (low, high) = human.get("estimate"), measure.ends
     if measure.margin is not None and human.get("ci") is None and value is not None:
         human = {**human, "ci": (value - measure.margin, value + measure.margin)}
-    placed = mark(measure, human) or Mark("", None, None)
+    human_mark = mark(measure, human) or Mark("", None, None)
     zero = place(measure, 0.0) if low < 0 < high else None
-    return replace(placed, zero=zero)
+    return replace(human_mark, zero=zero)
 
 
 def measures_of(rows: Iterable[Row]) -> dict[str, Measure]:
@@ -109,7 +109,7 @@ def _cell(measure: Measure, values: Values) -> Cell:
     value, ci = values.get("estimate"), values.get("ci")
     word = verdict_word(values) if values.get("kind") != "humans" else ""
     whole = share(values) if values.get("undecided") else with_interval(value, ci)
-    said = [f"{whole} {measure.unit}", word, f"n = {values['n']}", values["note"]]
+    parts = [f"{whole} {measure.unit}", word, f"n = {values['n']}", values["note"]]
     return Cell(
         measure,
         values,
@@ -117,5 +117,5 @@ def _cell(measure: Measure, values: Values) -> Cell:
         share(values) if values.get("undecided") else number(value),
         brackets(ci),
         word,
-        "; ".join(filter(None, said)),
+        "; ".join(filter(None, parts)),
     )

@@ -55,8 +55,8 @@ def program_text(name: str, based_on: str | None = None) -> str:
     """Describe a program, as far as its plug-in is loaded here."""
     if (program := PROGRAMS.get(name)) is not None:
         doc = (getdoc(program.driver) or "").partition("\n")[0].rstrip(".")
-        said = program.meaning or doc or "a driver of a plug-in, which does not say what it does"
-        return f"a program: {said}"
+        text = program.meaning or doc or "a driver of a plug-in, which does not say what it does"
+        return f"a program: {text}"
     if based_on and based_on in PROGRAMS:
         return f"a program, otherwise set than usual: {PROGRAMS[based_on].meaning}"
     return f"{based_on} otherwise set" if based_on else "a driver of this study's own plug-in"

@@ -91,17 +91,17 @@ def plain(value: str) -> str:
 
 def causes_text(causes: Iterable[tuple[str, int]]) -> str:
     """Return causes of errors with counts: ``2 replies without a valid plan: ...; ...``."""
-    plans, said = dict[str, int](), []
+    plans, texts = dict[str, int](), []
     for value, times in causes:
         if value.startswith("plan: "):
             plans[plain(value)] = times
         else:
-            said.append(plain(value) if times == 1 else f"{plain(value)}, {times} times")
+            texts.append(plain(value) if times == 1 else f"{plain(value)}, {times} times")
     if plans:
         count = sum(plans.values())
         replies = "reply" if count == 1 else "replies"
-        said.insert(0, f"{count} {replies} without a valid plan: {', '.join(plans)}")
-    return "; ".join(said)
+        texts.insert(0, f"{count} {replies} without a valid plan: {', '.join(plans)}")
+    return "; ".join(texts)
 
 
 def clock(time_s: float) -> str:

@@ -55,10 +55,10 @@ class Queries:
     def result(self, sql: str) -> QueryResult:
         """Return the result of a query, as much of it as is shown; raises UsageError."""
         began, size, rows = time.monotonic(), 0, list[list[Cell]]()
-        with self._answering(sql) as found:
-            columns = [(name, str(kind)) for name, kind, *_ in found.description]
+        with self._answering(sql) as cursor:
+            columns = [(name, str(kind)) for name, kind, *_ in cursor.description]
             more = False
-            for row in fetched(found):
+            for row in fetched(cursor):
                 texts = map(text_of, row)
                 cells = [t if t is None else (t[:TEXT], max(0, len(t) - TEXT)) for t in texts]
                 size += sum(CELL_COSTS + len(cell[0] if cell else "") for cell in cells)
@@ -75,9 +75,9 @@ class Queries:
         """
         lines = io.StringIO()
         writer = csv_writer(lines)
-        with self._answering(sql) as found:
-            writer.writerow(in_spreadsheet(name) for name, *_ in found.description)
-            for number, row in enumerate(fetched(found), start=1):
+        with self._answering(sql) as cursor:
+            writer.writerow(in_spreadsheet(name) for name, *_ in cursor.description)
+            for number, row in enumerate(fetched(cursor), start=1):
                 writer.writerow(map(csv_cell, row))
                 if number > DOWNLOADED_ROWS or lines.tell() > DOWNLOADED:
                     raise UsageError(
@@ -109,17 +109,17 @@ class Queries:
 
             threading.Thread(target=stop, daemon=True).start()
             try:
-                with answering(connection, sql) as found:
-                    yield found
+                with answering(connection, sql) as cursor:
+                    yield cursor
             # Python has no values for some of DuckDB's, such as intervals of millions of years.
             except (MergeRunnerError, duckdb.Error, OverflowError, ValueError) as exc:
                 # With the candidates and the place that DuckDB names, without its stack trace.
-                said = str(exc).partition("\n\nStack Trace")[0].strip()
+                message = str(exc).partition("\n\nStack Trace")[0].strip()
                 if isinstance(exc.__cause__ or exc, duckdb.OutOfMemoryException):
-                    said = f"the query needed more than {MEMORY_MB} MB"
+                    message = f"the query needed more than {MEMORY_MB} MB"
                 if late.is_set():
-                    said = f"stopped after {self.longest_s:g} s"
-                raise UsageError(said) from exc
+                    message = f"stopped after {self.longest_s:g} s"
+                raise UsageError(message) from exc
             finally:
                 ended.set()
 

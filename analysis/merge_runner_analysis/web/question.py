@@ -75,7 +75,7 @@ class Change:
     """An effect as a table shows it; ``mark`` is on an axis that ends at ``end`` on both sides."""
 
     name: str
-    said: str
+    detail: str
     reference: Side | None
     level: Side | None
     difference: str
@@ -128,7 +128,7 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
     asked = [row for row in effects.rows if row.values.get("primary")]
     primary = min(asked, key=lambda row: value_of(row, "p") if is_tested(row) else 1.0)
     metric = metric_of(primary)
-    own = [row for row in effects.rows if metric_of(row) == metric]
+    of_metric = [row for row in effects.rows if metric_of(row) == metric]
     named = {LEFT_FIRST.name, COLLISIONS.name, GAP.name, RMSE.name}
     others = [
         row
@@ -149,7 +149,7 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
             _crossing_of(shown), [r for r in shown if len(factors_of(r)) > 1], shapes, metric
         ),
     ]
-    tested = [row for row in own if is_tested(row)]
+    tested = [row for row in of_metric if is_tested(row)]
     names = _factors(asked)
     return Answer(
         f"{'Does' if len(names) == 1 else 'Do'} {joined(names)} change {_changed(primary)}?",
@@ -211,7 +211,7 @@ def answered(rows: Sequence[Row]) -> tuple[str, str]:
     unshown = [row for row in primary if row not in sure]
     rest += _not_shown(unshown)
     rest += [UNCORRECTED] * any(map(is_uncorrected, unshown[:FEW]))
-    rest += [f"{capital(said)}." for said in copied]
+    rest += [f"{capital(text)}." for text in copied]
     if not sure:
         rest.append(_seen(primary))
     crossed = [
@@ -249,12 +249,12 @@ def _not_shown(rows: Sequence[Row]) -> Iterator[str]:
 def _interactions(rows: Sequence[Row], drawn: set[str]) -> str:
     """Describe the interactions of factors whose combinations are drawn."""
     crossed = {name for names in drawn if TIMES in names for name in names.split(TIMES)}
-    said = []
+    texts = []
     for row in rows:
         if is_interaction(row) and crossed >= {*str(row.values["factor"]).split(TIMES)}:
             what = "they interact" if is_shown(row) else "no interaction is shown"
-            said.append(f"{row.values['factor']}: {what}, {test_text(row)}.")
-    return " ".join(said)
+            texts.append(f"{row.values['factor']}: {what}, {test_text(row)}.")
+    return " ".join(texts)
 
 
 def _could(rows: Sequence[Row]) -> str:
@@ -342,18 +342,21 @@ def _change(row: Row, sides: dict[str, Row], end: float, primary: str) -> Change
         )
         for name, side in (("estimate_reference", f"{base}{mark}"), ("estimate", of))
     )
-    said = ""
-    if is_interaction(row):  # whose id has the level of the other factor, too
-        one, other = factor.split(TIMES)
+    detail = ""
+    if is_interaction(row):  # whose id has the level of the second factor, too
+        first, second = factor.split(TIMES)
         level_name, at = str(of).split(TIMES)
         otherwise = str(base).split(TIMES)[1]
-        said = f"effect of {one}={level_name} with {other}={at}, less that with {other}={otherwise}"
-    said = said or (_called(factor, of) if is_own else f"{factor}: {_called(factor, of)}")
+        detail = (
+            f"effect of {first}={level_name} with {second}={at}, less that with "
+            f"{second}={otherwise}"
+        )
+    detail = detail or (_called(factor, of) if is_own else f"{factor}: {_called(factor, of)}")
     if is_own and row.values.get("primary"):
-        said += ", primary test"
+        detail += ", primary test"
     return Change(
         capital(factor) if is_own else capital(name_of(row)),
-        said,
+        detail,
         reference,
         level,
         f"{difference_text(row)} {unit_of(row)}",

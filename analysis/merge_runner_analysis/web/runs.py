@@ -13,7 +13,7 @@ from merge_runner.audit.checks import not_judged
 from merge_runner.driver_names import both_sides, pair_name
 from merge_runner.paths import DEFAULT_DB, command_at
 from merge_runner.run.progress_file import ProgressSnapshot, read_snapshot
-from merge_runner_analysis.web.catalogue import Catalogue, Wanted
+from merge_runner_analysis.web.catalogue import Catalogue, TrialFilter
 from merge_runner_analysis.web.phrases import called
 from merge_runner_analysis.web.reading import Row
 
@@ -57,13 +57,13 @@ def list_runs(catalogue: Catalogue) -> list[Row]:
     return runs
 
 
-def numbers_of(catalogue: Catalogue, wanted: Wanted) -> Mapping[str, Row]:
+def numbers_of(catalogue: Catalogue, filters: TrialFilter) -> Mapping[str, Row]:
     """Return counts of a filter's trials by run; the empty id has those of all together.
 
     Whatever several runs or trials share counts once. A run may have begun since: it has none.
     """
-    (total,) = catalogue.counts({**wanted, "who": ["drivers", "stand-ins"]})
-    counted = {row["sweep"]: row for row in catalogue.counts(wanted, "sweep")}
+    (total,) = catalogue.counts({**filters, "who": ["drivers", "stand-ins"]})
+    counted = {row["sweep"]: row for row in catalogue.counts(filters, "sweep")}
     return defaultdict(lambda: dict.fromkeys(total, 0), {"": total} | counted)
 
 

@@ -40,7 +40,7 @@ class Scope:
     condition: str = ""
 
     @property
-    def wanted(self) -> dict[str, Any]:
+    def filters(self) -> dict[str, Any]:
         """The trials of all its drivers, as a filter."""
         return {**self.trials(prompt=self.prompt), "model": self.drivers}
 
@@ -82,9 +82,9 @@ def scope_of(
         "SELECT DISTINCT model, variant, condition FROM listed WHERE who <> 'humans' ORDER BY ALL"
     )
     drivers = list(dict.fromkeys(row["model"] for row in rows))
-    own = [row for row in rows if not driver or row["model"] == unmarked(driver)]
-    prompts = list(dict.fromkeys(row["variant"] for row in own))
-    conditions = ordered({row["condition"] for row in own})
+    of_driver = [row for row in rows if not driver or row["model"] == unmarked(driver)]
+    prompts = list(dict.fromkeys(row["variant"] for row in of_driver))
+    conditions = ordered({row["condition"] for row in of_driver})
     sweeps = runs_of(site)
     usual = "" if any_prompt else next(iter(prompts), BASELINE)
     usual = BASELINE if usual and BASELINE in prompts else usual

@@ -60,7 +60,7 @@ class Words:
 
     def search(
         self,
-        wanted: Mapping[str, str],
+        filters: Mapping[str, str],
         terms: Sequence[str] = (),
         limits: Mapping[str, str] | None = None,
         page: int = 1,
@@ -75,22 +75,22 @@ class Words:
         if terms:
             holding = " AND ".join([f"contains({FOLDED}, lower(?))"] * len(terms))
             conditions.append(f"place IN (SELECT rowid FROM decisions WHERE {holding})")  # noqa: S608 # constants
-        where, values = where_of(wanted)
-        found = f"FROM {FOUND} WHERE {where}"
+        where, values = where_of(filters)
+        matches = f"FROM {FOUND} WHERE {where}"
         with self._lock, self.catalogue.cursor() as connection:
             connection.execute(HITS.format(" AND ".join(conditions)), [*limits.values(), *terms])
             (totals,) = records(
                 connection,
                 "SELECT count(*) AS decisions, count(DISTINCT number) AS trials, "
                 "histogram(planned) FILTER (tactical = 'M') AS \"M\", "
-                f"histogram(planned) FILTER (tactical = 'Y') AS \"Y\" {found}",
+                f"histogram(planned) FILTER (tactical = 'Y') AS \"Y\" {matches}",
                 values,
             )
             last_page = max(1, -(-totals["decisions"] // PAGE))
             page = min(page, last_page)
             rows = records(
                 connection,
-                f"SELECT trial_id, spec_hash, outcome, hits.* {found} "
+                f"SELECT trial_id, spec_hash, outcome, hits.* {matches} "
                 "ORDER BY who, trial_id, spec_hash, hits.decision, hits.side "
                 f"LIMIT {PAGE} OFFSET ?",
                 [*values, PAGE * (page - 1)],
@@ -102,7 +102,7 @@ class Words:
                     [[row["place"] for row in rows]],
                 ).fetchall()
             )
-            facets = facets_of(connection, FOUND, FACETS, wanted)
+            facets = facets_of(connection, FOUND, FACETS, filters)
         crossed = {letter: counts for letter in "MY" if (counts := totals.pop(letter))}
         for row in rows:
             text = texts.get(row["place"])

@@ -167,8 +167,8 @@ class Site:
 
     def render(self, template: str, **values: object) -> str:
         """Return a page, or a part of one."""
-        found = self._environment.get_template(template)
-        return found.render({"held": self.catalogue.held, **values})
+        values = {"is_locked": self.catalogue.is_locked, **values}
+        return self._environment.get_template(template).render(values)
 
     def close(self) -> None:
         """Leave nothing behind."""

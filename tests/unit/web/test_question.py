@@ -191,8 +191,8 @@ def test_an_interaction_names_the_levels_of_both_factors():
     crossed = {"level": "taxi × yes", "reference": "none × no"}
     made = answer([effect(), effect("persona × hurry", 0.4, **crossed)], levels_of("hurry"))
     main, interaction = made.changes
-    assert main.said == "yes, primary test"
-    assert interaction.said == "effect of persona=taxi with hurry=yes, less that with hurry=no"
+    assert main.detail == "yes, primary test"
+    assert interaction.detail == "effect of persona=taxi with hurry=yes, less that with hurry=no"
     assert (interaction.reference, interaction.level) == (None, None)
 
 

@@ -79,8 +79,8 @@ def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     if not site.in_words(name):
         raise NotThere(f"there is no condition {name!r} here")
     bar = scope_of(site, asked, any_prompt=True)
-    wanted = {**bar.scope.wanted, "condition": name, "who": ["drivers", "stand-ins"]}
-    rows = site.catalogue.every(wanted)
+    filters = {**bar.scope.filters, "condition": name, "who": ["drivers", "stand-ins"]}
+    rows = site.catalogue.every(filters)
     humans = site.catalogue.every({"condition": name, "who": "humans"})
     chosen = [rows[i * len(rows) // MOST] for i in range(MOST)] if len(rows) > MOST else rows
     traces = {(row["trial_id"], row["spec_hash"]): row for row in _read(site, TRACES, chosen)}
@@ -90,13 +90,13 @@ def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     band = _read(site, BAND, humans)
     return site.render(
         "condition.html",
-        here="",
+        view="",
         name=name,
         bar=bar,
         carried={key: kept for key, kept in carried(asked).items() if key != "condition"},
         sweep=bar.scope.sweep,
         state=state,
-        groups=site.catalogue.counts(wanted, "model", "variant"),
+        groups=site.catalogue.counts(filters, "model", "variant"),
         trials=len(rows),
         drawn=len(drawn),
         sampled=len(rows) > MOST,

@@ -19,7 +19,7 @@ def notes_page(site: Site, _: Mapping[str, str]) -> str:
         row = site.catalogue.find(note.trial_id, note.spec_hash)
         at = {"side": note.side, "decision": note.decision}
         shown.append((note, row and site.at.trial(row, **at)))
-    return site.render("notes.html", here="notes", kept=kept, shown=shown)
+    return site.render("notes.html", view="notes", kept=kept, shown=shown)
 
 
 def add_note(site: Site, given: Mapping[str, str]) -> Row:

@@ -72,48 +72,48 @@ def prompts_page(site: Site, asked: Mapping[str, str]) -> str:
     """Return all prompts side by side, and the differences that they make."""
     bar = scope_of(site, asked)
     chosen = bar.scope.drivers or bar.drivers
-    found, contrasts = computed_table(site, "contrasts", bar.scope.sweep, bar.scope.condition)
+    job, contrasts = computed_table(site, "contrasts", bar.scope.sweep, bar.scope.condition)
     played, values = judged(site, bar, asked)
     driven: dict[str, list[Driver]] = {}
-    for one in played:
-        if unmarked(one.name) in chosen:
-            driven.setdefault(one.name, []).append(one)
+    for driver in played:
+        if unmarked(driver.name) in chosen:
+            driven.setdefault(driver.name, []).append(driver)
     drivers, ends = differences(contrasts, chosen) if contrasts else ({}, {})
     return site.render(
         "prompts.html",
-        here="prompts",
+        view="prompts",
         **values | {"headings": {}},
-        found=found,
+        job=job,
         contrasts=contrasts,
-        prompts=_told(site),
+        prompts=_first_prompts(site),
         left_out=partial(left_out, site),
         drivers=drivers,
         ends=ends,
         middle=MIDDLE,
         collisions=COLLISIONS.name,
         baseline=BASELINE,
-        reworded=any(one.prompt != BASELINE for played in driven.values() for one in played),
+        reworded=any(driver.prompt != BASELINE for played in driven.values() for driver in played),
         # Those that were played with several prompts, the baseline first.
         kinds={
-            name: sorted(prompts, key=lambda one: one.prompt != BASELINE)
+            name: sorted(prompts, key=lambda driver: driver.prompt != BASELINE)
             for name, prompts in sorted(driven.items())
             if len(prompts) > 1
         },
     )
 
 
-def _told(site: Site) -> dict[str, dict[str, list[Part]]]:
+def _first_prompts(site: Site) -> dict[str, dict[str, list[Part]]]:
     """Return the first prompt's parts, by variant and reader: two readers where theirs differ."""
-    told: dict[str, dict[str, list[Part]]] = {}
+    by_variant: dict[str, dict[str, list[Part]]] = {}
     seen: dict[str, list[list[Part]]] = {}
     for row in site.catalogue.ask(FIRST, BASELINE):
         variant, digests = row["variant"], digests_of(json.loads(row["blocks"]), row["side"])
         parts = parts_of(row["prompt"], row["baseline"], digests)
-        said = [part for part in parts if part.changed or row["baseline"] is None]
-        if said not in seen.setdefault(variant, []):
-            seen[variant].append(said)
-            told.setdefault(variant, {})[row["reader"]] = parts
-    return told
+        changes = [part for part in parts if part.changed or row["baseline"] is None]
+        if changes not in seen.setdefault(variant, []):
+            seen[variant].append(changes)
+            by_variant.setdefault(variant, {})[row["reader"]] = parts
+    return by_variant
 
 
 def differences(
@@ -163,11 +163,13 @@ def left_out(site: Site, variant: str) -> str:
     baseline = frozenset(blocks_of(BASELINE))
     # A block of one driver's prompt alone has its side behind its name; a baseline's block is then
     # left out of the other driver's.
-    own = frozenset(level_of(name.partition("@")[0]) for name in names) - baseline
-    own |= baseline & frozenset(names)
+    blocks = frozenset(level_of(name.partition("@")[0]) for name in names) - baseline
+    blocks |= baseline & frozenset(names)
     # The levels of words are in the variant's name already.
-    changes = Variant(removes=baseline - own, adds=own - baseline - frozenset(variant.split(" ")))
-    return changes_text(changes, _named) or ("the whole prompt" if own == baseline else "")
+    changes = Variant(
+        removes=baseline - blocks, adds=blocks - baseline - frozenset(variant.split(" "))
+    )
+    return changes_text(changes, _named) or ("the whole prompt" if blocks == baseline else "")
 
 
 def _named(block: str) -> str:
@@ -186,7 +188,7 @@ def discordant_page(site: Site, asked: Mapping[str, str]) -> str:
     kinds = Counter((pair["base_outcome"], pair["outcome"]) for pair in differing)
     return site.render(
         "discordant.html",
-        here="prompts",
+        view="prompts",
         model=driver,
         variant=variant,
         left_out=left_out(site, variant),

@@ -66,7 +66,7 @@ def sql_page(site: Site, asked: Mapping[str, str]) -> str:
         schema = tables()
     return site.render(
         "sql.html",
-        here="sql",
+        view="sql",
         bar=scope_of(site, asked, any_prompt=True),
         carried=carried(asked),
         query=query if is_asked else scoped_query(carried(asked)),

@@ -54,11 +54,11 @@ def sweeps_page(site: Site, asked: Mapping[str, str]) -> str:
     """Return the runs of a scope; raises NotThere, and NothingNew where they are as ``seen``."""
     bar, part = scope_of(site, asked, any_prompt=True), carried(asked)
     runs = list_runs(site.catalogue)
-    counted = numbers_of(site.catalogue, bar.scope.wanted)
+    counted = numbers_of(site.catalogue, bar.scope.filters)
     rare = counted[""] | {"fallbacks": 0}  # each follows an invalid reply
     return site.render(
         "sweeps.html",
-        here="sweeps",
+        view="sweeps",
         bar=bar,
         carried=part,
         runs=[run for run in runs if not part or counted[run["sweep_id"]]["trials"]],
@@ -73,25 +73,25 @@ def sweeps_page(site: Site, asked: Mapping[str, str]) -> str:
 def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
     """Return the page of a run; raises NotThere, and NothingNew where it is as ``seen``."""
     seen = asked.get("seen", "")
-    found = [run for run in list_runs(site.catalogue) if run["sweep_id"] == sweep_id]
-    if not found:
+    matching = [run for run in list_runs(site.catalogue) if run["sweep_id"] == sweep_id]
+    if not matching:
         raise NotThere(f"the database holds no run {sweep_id}")
-    (run,) = found
+    (run,) = matching
     state = run["state"]
-    if seen and state == "lost" and site.catalogue.held:
+    if seen and state == "lost" and site.catalogue.is_locked:
         raise NothingNew  # how it ended cannot be read yet
     return site.render(
         "sweep.html",
-        here="sweeps",
+        view="sweeps",
         entry=run,
         audit=audit_of(site, [run]),
         arms=site.catalogue.counts({"sweep": sweep_id}, "model", "variant"),
         trust=TRUST,
         task=", ".join(
             dict.fromkeys(
-                one
+                setting
                 for arm in run["config"].get("arms") or ()
-                for one in task_settings(arm.get("scenario") or {})
+                for setting in task_settings(arm.get("scenario") or {})
             )
         ),
         sums_apart=APART,

@@ -42,7 +42,7 @@ def tables_page(site: Site, _: Mapping[str, str]) -> str:
     others = [name for name in TABLES if name not in grouped]
     groups = {of: [name for name in names if name in TABLES] for of, names in GROUPS.items()}
     groups["More"] += others
-    return site.render("tables.html", here="tables", tables=TABLES, figures=FIGURES, groups=groups)
+    return site.render("tables.html", view="tables", tables=TABLES, figures=FIGURES, groups=groups)
 
 
 def table_file(site: Site, name: str, suffix: str, _: Mapping[str, str]) -> Response:
@@ -62,14 +62,14 @@ def figure_file(site: Site, name: str, suffix: str, _: Mapping[str, str]) -> Res
 def figure_page(site: Site, name: str, _: Mapping[str, str]) -> str:
     """Return a figure with its caption, its files and its citation; raises NotThere."""
     about = FIGURES[_known(name, FIGURES, "figure")]
-    found = computed(site, ("figure", name, "svg"))
+    job = computed(site, ("figure", name, "svg"))
     return site.render(
         "figure.html",
-        here="tables",
+        view="tables",
         name=name,
         about=about,
-        computed=found,
-        image=b64encode(found.content["file"]).decode() if found.content else "",
+        computed=job,
+        image=b64encode(job.content["file"]).decode() if job.content else "",
         descriptions=descriptions_of(site),
         version=metadata.version("merge-runner"),
     )
@@ -79,7 +79,7 @@ def cite_page(site: Site, _: Mapping[str, str]) -> str:
     """Return the page that says how to cite the results of a study."""
     return site.render(
         "cite.html",
-        here="cite",
+        view="cite",
         computed=computed(site, ("digest",)),
         cited_as="Results",
         descriptions=descriptions_of(site),
@@ -89,15 +89,15 @@ def cite_page(site: Site, _: Mapping[str, str]) -> str:
 
 def table_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     """Return the page of a table; raises NotThere."""
-    found, table = computed_table(site, _known(name, TABLES, "table"))
+    job, table = computed_table(site, _known(name, TABLES, "table"))
     without = every(asked, "without")
     columns = shown_columns(table) if table else []
     return site.render(
         "table.html",
-        here="tables",
+        view="tables",
         name=name,
         about=TABLES[name].about,
-        computed=found,
+        computed=job,
         table=table
         and table_view(
             table, lambda table, row, column: site.at.cell(table.name, row.id, column.name)

@@ -26,8 +26,8 @@ from merge_runner_analysis.web.trial.sentences import (
     facts,
     judged_text,
     outcome_text,
+    study_words,
     summary,
-    told,
 )
 
 # Offers of a trial to compare with, and their rules.
@@ -87,13 +87,13 @@ def _page(site: Site, row: Row, trial: Trial, template: str) -> str:
     account = account_of(row, trial)
     return site.render(
         template,
-        here="trials",
+        view="trials",
         scripts=REPLAY,
         panels=panels(site, row, trial),
         row=row,
         outcome=outcome_text(row),
         facts=facts(row),
-        told=told(row, trial),
+        study_words=study_words(row, trial),
         judged=judged_text(trial.scenario),
         view_box=VIEW_BOX,
         data=replay_data(row, trial, account) if trial.states else None,
@@ -116,7 +116,7 @@ def read(site: Site, rows: Sequence[Row]) -> list[Trial]:
 def panels(site: Site, row: Row, trial: Trial) -> list[Markup]:
     """Return the panels of all decisions of a trial, in the order of its ribbons."""
     others = site.catalogue.others
-    decisions = (d for mine in trial.by_side.values() for d in mine)
+    decisions = (d for of_side in trial.by_side.values() for d in of_side)
     return [decision_panel(site, row, trial, d, others) for d in decisions]
 
 

@@ -63,7 +63,7 @@ class Trial:
         """The decisions of each side that has any."""
         decisions = self.decisions
         return {
-            side: mine for side in SIDES if (mine := [d for d in decisions if d["side"] == side])
+            side: rows for side in SIDES if (rows := [d for d in decisions if d["side"] == side])
         }
 
     def interval_s(self, side: Side) -> float:
@@ -73,16 +73,16 @@ class Trial:
 
 def read_trials(connection: DuckDBPyConnection, keys: Sequence[Key]) -> list[Trial]:
     """Read trials that are known to be there, by their names and specs."""
-    wanted = {"trials": [name for name, _ in keys], "specs": [spec for _, spec in keys]}
+    parameters = {"trials": [name for name, _ in keys], "specs": [spec for _, spec in keys]}
     states, calls, tasks = (
-        _by_trial(records(connection, sql, wanted)) for sql in (STATES, CALLS, TASKS)
+        _by_trial(records(connection, sql, parameters)) for sql in (STATES, CALLS, TASKS)
     )
-    result = connection.execute(DECISIONS, wanted)
+    result = connection.execute(DECISIONS, parameters)
     lost = dict.fromkeys(names_of(result)) | {"valid": False, "fallback": False, "lost": True}
     rows = list(by_name(result))
-    is_told = any(row["other_seen"] is not None for row in rows)
+    is_noisy = any(row["other_seen"] is not None for row in rows)
     decisions = _by_trial(rows)
-    perceived = _by_trial(records(connection, PERCEIVED, wanted) if is_told else ())
+    perceived = _by_trial(records(connection, PERCEIVED, parameters) if is_noisy else ())
     return [
         _trial(tasks[key][0], states[key], decisions[key], calls[key], perceived[key], lost)
         for key in keys

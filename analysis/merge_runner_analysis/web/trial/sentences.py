@@ -58,7 +58,7 @@ def facts(row: Row) -> list[str]:
     return [f"{text}." for text in texts if text]
 
 
-def told(row: Row, trial: Trial) -> list[tuple[str, list[tuple[str, str]]]]:
+def study_words(row: Row, trial: Trial) -> list[tuple[str, list[tuple[str, str]]]]:
     """Return the words of a study by driver: a heading, and the levels with their text.
 
     Empty where neither prompt has any.
