@@ -92,7 +92,7 @@ def serve(db: Path, port: int, say: Callable[[str], None], reader: str, study: s
     ``study`` is the file of the study whose parts are in use, empty without one.
     """
     typed = sys.argv[0]
-    # What to type to run this: its path where the shell does not find it, as under ``make``.
+    # The command that runs this: a path where the shell does not find it, as under ``make``.
     plain = Path(typed).name != "merge-runner" or shutil.which("merge-runner") == typed
     site = Site(db, program="merge-runner" if plain else typed, reader=reader, study=study)
     with reading(db):
@@ -170,7 +170,7 @@ def _trials_csv(site: Site, asked: Mapping[str, str]) -> Response:
     return download(site.catalogue.export(filters, sort_of(asked)), "trials.csv")
 
 
-# What renders each page, of what its address names and asks for.
+# Functions that render the pages, from the names and the query of an address.
 PAGES: dict[str, Callable[..., str | Response]] = {
     "/": home.home_page,
     "/drivers": drivers.drivers_page,

@@ -24,8 +24,8 @@ from merge_runner_analysis.web.phrases import condition_text
 from merge_runner_analysis.web.reading import Row, records
 
 PAGE = 100
-# While a run goes on the database changes all the time: so many trials are listed anew, which takes
-# half a second, at most every so many seconds.
+# While a run goes on the database changes all the time: a list of MANY trials, which takes half a
+# second, is read anew at most every STANDS_S seconds.
 MANY, STANDS_S = 3_000, 20.0
 MOST_COUNTED = 50  # filters whose counts are remembered
 TrialFilter = Mapping[str, Any]
@@ -75,7 +75,7 @@ coalesce(sum(attempts), 0)::BIGINT - coalesce(len(every), 0) + coalesce(len(once
 round(coalesce(sum(cost_usd), 0) - coalesce(list_sum([reply.usd FOR reply IN every]), 0)
     + coalesce(list_sum([reply.usd FOR reply IN once]), 0), 9) AS cost_usd
 """
-# What stands above a list: a fourth of the time of all counts.
+# Totals above a list: a fourth of the time of all counts.
 TOTALS = """
 count(*) AS trials, count(*) FILTER (status = 'failed') AS failed,
 count(*) FILTER (status = 'collided') AS collided, round(avg(gap_m), 9) AS gap_m,

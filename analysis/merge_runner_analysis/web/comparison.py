@@ -30,7 +30,7 @@ from merge_runner_analysis.wording import UNCORRECTED, apart, capital, number, p
 # The trials behind a count, as a filter of their list; None where no filter keeps just these.
 Filter = dict[str, Any] | None
 TrialsOf = Callable[[str, int], Filter]
-"""By a metric, of which a driver has so many trials that count, or by ``k METRIC``."""
+"""From a metric, or ``k METRIC``, and its number of trials to their filter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +94,7 @@ def comparison_of(
     """Return the comparison of two drivers; None where one of them is not judged."""
     if not table.rows:
         return None
-    # What a person sees at once comes first.
+    # The most visible measure is the first.
     rows = sorted(table.rows, key=lambda row: metric_of(row) != COLLISIONS.name)
     claim, rest = apart(*names, {metric_of(row): row.values for row in rows})
     seen = [

@@ -11,7 +11,7 @@ from merge_runner_analysis.web.answers import Request
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.site import NotThere, Site
 
-# What is kept comes within this time; what takes longer is asked for again.
+# Cached answers come within this time; a page asks again for others.
 AT_ONCE_S = 0.3
 FILE_WAIT_S = 300.0
 

@@ -143,7 +143,7 @@ class Computing:
 
 
 def processes(number: int = 1) -> ProcessPoolExecutor:
-    """Return so many processes, with the same study's plug-ins as this one."""
+    """Return a pool of processes with the same study's plug-ins as this one."""
     return ProcessPoolExecutor(
         max_workers=number,
         mp_context=multiprocessing.get_context("spawn"),

@@ -9,10 +9,10 @@ from merge_runner_analysis.web.listing import FACTOR
 from merge_runner_analysis.web.search import LONGEST_QUERY, MOST_TERMS
 from merge_runner_analysis.web.site import TooMuch
 
-# So many facets may be chosen at once, each by a value of up to so many characters. What is longer
-# is a fault within DuckDB, or the end of the process.
+# Facets that may be chosen at once, and characters of their values. A longer filter is a fault
+# within DuckDB, or the end of the process.
 MOST_CHOSEN, LONGEST_VALUE = 30, 1_000
-# What facets are called that have another name in an address.
+# Labels of facets that have another name in an address.
 HEADINGS = {
     "sweep": "run",
     "run": "name of run",

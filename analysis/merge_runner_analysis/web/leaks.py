@@ -10,8 +10,8 @@ from pathlib import Path
 from merge_runner.errors import UsageError
 from merge_runner.paths import PROJECT
 
-# What looks like a key, wherever it is from, by what it begins with: to look for words is far
-# quicker than to look for a pattern. The values of this machine's keys are looked for too.
+# Texts that look like a key, by their beginnings: a search for words is far quicker than one for a
+# pattern. The values of this machine's keys are looked for too.
 _KEYS = {
     "sk-": r"[A-Za-z0-9_-]{16}",
     "AIza": r"[A-Za-z0-9_-]{30}",

@@ -15,7 +15,7 @@ from merge_runner_analysis.wording import TIMES, brackets, number
 
 # The shapes that tell drivers apart in a chart, and more of them are not drawn.
 SHAPES = ("dot", "square", "ring", "triangle")
-# Of a chart, in units of its drawing: its parts, and a letter of a name.
+# Parts of a chart, and a letter of a name, in units of its drawing.
 LEFT, WIDTH, HEAD, ROW, APART, INDENT, LETTER = 90.0, 480.0, 12, 20, 14, 84.0, 7.5
 
 

@@ -9,7 +9,7 @@ from merge_runner.prompts.blocks import BLOCKS, Variant
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 UNKNOWN = "no meaning is known here"
-# What is stored, in the words of a page; what is not here is shown as it is.
+# Stored names in the words of a page; other names are shown as they are.
 PLAIN = {
     "collided": "crashed",
     "timeout": "timed out",

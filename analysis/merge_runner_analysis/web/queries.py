@@ -44,7 +44,7 @@ class QueryResult:
 
 
 class Queries:
-    """Runs queries on one database, each for so many seconds at most."""
+    """Runner of queries on one database, each for ``longest_s`` at most."""
 
     def __init__(self, copies: Copies, longest_s: float = LONGEST_S) -> None:
         self._copies = copies

@@ -119,7 +119,7 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
     """Return the answer; None without a table, or where the study asks about no factor."""
     if effects is None or levels is None:
         return None
-    # Of a driver that is not judged there is a row without values.
+    # A driver that is not judged has a row without values.
     known = [row for row in levels.rows if row.values.get("factor")]
     sides = {row.id: row for row in known}
     claim, rest = answered(effects.rows)

@@ -48,16 +48,16 @@ from merge_runner_analysis.web.scope import DESCRIPTIONS
 from merge_runner_analysis.web.urls import Links
 from merge_runner_analysis.wording import HUMANS, LANGUAGE_MODEL, TABLE, number, sentences
 
-# What each variant asks first: of all of them in the same condition, as far as that was played.
+# The first prompt of each variant, all of the same condition as far as that was played.
 PROMPTS = """
 SELECT variant, spec_hash, arg_min(prompt, (condition, decisions.side, trial_id)) AS prompt
 FROM decisions JOIN trials USING (trial_id, spec_hash)
 WHERE decision = 0 AND prompt IS NOT NULL GROUP BY variant, spec_hash
 ORDER BY min((condition, decisions.side, trial_id)) DESC
 """
-# At most so many trials are listed for a row: a page with all of them would be unwieldy.
+# Trials listed for a row: a page with all of them would be unwieldy.
 LISTED = 300
-# Of each alarm so many findings stand open, and these tables of a study with factors.
+# Findings of an alarm that stand open, and the open tables of a study with factors.
 FEW, ANSWERING = 3, ("effects", "levels")
 # The share of a group's decisions above which an alarm is raised: a convention.
 MANY_FALLBACKS = 0.05

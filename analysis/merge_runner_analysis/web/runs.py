@@ -18,7 +18,7 @@ from merge_runner_analysis.web.phrases import called
 from merge_runner_analysis.web.reading import Row
 
 REFUSED = 2
-# Why a run ended early, by its exit code.
+# Reasons for an early end of a run, by exit code.
 REASONS = {
     REFUSED: "the service refused the key or the model, or a setting was wrong",
     3: "the account's quota or --max-cost was used up",

@@ -28,7 +28,7 @@ from merge_runner_analysis.web.search import Words
 from merge_runner_analysis.web.urls import HOME, Links
 from merge_runner_analysis.wording import MEASURES, TABLE
 
-# What draws and moves a trial, in the order in which it is loaded.
+# Scripts that draw and move a trial, in the order of loading.
 _PARTS = "moment track charts ribbons panel clock comparison start"
 REPLAY = [f"replay/{part}.js" for part in _PARTS.split()]
 PAGES = {

@@ -7,7 +7,7 @@ from functools import partialmethod
 from typing import Any
 from urllib.parse import quote, urlencode
 
-# What an address says of a cell: which it is, and the run and condition that its table is of.
+# Parts of a cell's address: the cell, and the run and condition of its table.
 CELL = ("cell", "of_run", "of_condition")
 # The page to begin at.
 HOME = "index"

@@ -12,7 +12,7 @@ from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.scope import carried, scope_of
 from merge_runner_analysis.web.site import NotThere, Site, news_of
 
-# So many trials are drawn: a browser can still show them, and more would be one dark spot.
+# Drawn trials: a browser can still show them, and more would be one dark spot.
 MOST = 500
 # Sizes in the picture, in its units.
 WIDTH, LEFT, RIGHT, PANEL, BETWEEN, TOP, FOOT = 1000, 42, 8, 170, 34, 24, 42

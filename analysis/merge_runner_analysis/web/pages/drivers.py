@@ -27,7 +27,7 @@ from merge_runner_analysis.web.scope import Scope, scope_of, unmarked
 from merge_runner_analysis.web.site import NotThere, Site
 from merge_runner_analysis.wording import DIFFERS, OPEN, SHOWN, UNLIKE, shown_state
 
-# How attempts of a driver's trials with a prompt ended, and which model answered.
+# Outcomes and served models of the attempts of a driver's trials with a prompt.
 ATTEMPTS = """
 SELECT model_served AS served, outcome, count(*) AS times
 FROM calls SEMI JOIN (FROM listed WHERE model = ? AND variant = ?) USING (trial_id, spec_hash)
@@ -65,7 +65,7 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         job, is_awaited, apart = compared(site, driver, other_driver, scope)
     both = [shown for shown in (driver, other_driver) if shown]
     conditions = by_condition(site, scope, both)
-    # Of each condition, the humans' and the drivers' share of trials in which left goes first.
+    # The humans' and the drivers' share of trials in which left goes first, by condition.
     shares = (
         [rate(cell["left_first"], cell["merged"]) if cell else rate(0, 0) for cell in cells]
         for cells in (conditions["humans"], *(cells for _, cells in conditions["rows"]))

@@ -21,7 +21,7 @@ LISTING = threading.Lock()
 # Types of which values stand to the right.
 NUMBER = re.compile(r"U?(TINY|SMALL|BIG|HUGE)?INT(EGER)?|FLOAT|DOUBLE|BIGNUM|DECIMAL\(.*\)")
 
-# What holds of the trials of each part of a scope.
+# SQL conditions for each part of a scope.
 SCOPED = {
     "sweep": "(trial_id, spec_hash) in (select trial_id, spec_hash from sweep_trials\n"
     "    where sweep_id in ({}))",

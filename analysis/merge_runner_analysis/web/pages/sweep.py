@@ -21,7 +21,7 @@ WHERE facet = 'cause' GROUP BY ALL ORDER BY trials DESC, cause
 """
 
 
-# How often things happened that may cost trust: ``count`` of ``of`` are columns of a run, and
+# Rates of events that may cost trust: ``count`` of ``of`` are columns of a run, and
 # ``state`` filters the trials behind the count.
 TRUST = [
     dict(zip(("name", "count", "of", "things", "meaning", "state"), rate, strict=True))

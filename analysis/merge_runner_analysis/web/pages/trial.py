@@ -1,4 +1,4 @@
-"""One trial, one decision of it, and the trials to lay beside it: found by words, or offered."""
+"""One trial, one decision of it, and other trials to compare: a search by words, or an offer."""
 
 from __future__ import annotations
 

@@ -121,10 +121,10 @@ time-based analysis of road user behaviour in normal and critical encounters (TU
 NEAR_GAP_M = 1.0
 """A gap that is as good as none: ours. The humans' mean is 3.85 m."""
 LONG_WAIT_TIMES = 2.0
-"""A wait is long where it takes so many times as long as at the initial speeds: ours."""
+"""A wait is long from this multiple of the time at the initial speeds on: ours."""
 
-# Of trials that did not collide, by their columns and ``alone_s``: when the first vehicle would
-# have been at the merge point if both had kept their initial speeds.
+# Classes of trials without a collision, by their columns and ``alone_s``: the time at which the
+# first vehicle would have been at the merge point if both had kept their initial speeds.
 OTHER_ACCOUNTS = f"""
 CASE WHEN status = 'finished' AND (gap_m < {NEAR_GAP_M} OR min_ttc_s < {NEAR_TTC_S})
     THEN '{NEAR_MISS}'
