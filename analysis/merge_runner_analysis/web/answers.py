@@ -1,4 +1,4 @@
-"""What pages show of the analysis of one state of a database, made once and kept beside it."""
+"""Analysis results for the pages, from one state of a database: computed once, then cached."""
 
 from __future__ import annotations
 
@@ -60,7 +60,6 @@ def kept_answer(db: Path, request: Request) -> dict[str, Any] | None:
 
 
 def _name_of(first: str, second: str) -> str:
-    """Return by what name a comparison of two drivers is kept."""
     return f"comparison {first} {second}"
 
 
@@ -157,7 +156,7 @@ class Numbers:
         return base64.b64decode(self._kept(f"{name}.{form}", draw))
 
     def _audit(self) -> str:
-        """Return what the audit of each run found and notes, by its id; nothing is replayed."""
+        """Return findings and notes of the audit by run id, as JSON; nothing is replayed."""
         from merge_runner.audit.checks import audited_database, check_sweep
 
         notes = {}
@@ -171,7 +170,7 @@ class Numbers:
     def _cell(
         self, name: str, row: str, column: str, sweep: str = "", condition: str = ""
     ) -> dict[str, Any]:
-        """Return what a cell is and its trials; with OF behind it those that it counts of."""
+        """Return a cell's explanation and trials; a column that ends in OF has its denominator."""
         from merge_runner_analysis.explain import explain
 
         table = from_text(self._table(name, sweep, condition))
@@ -197,5 +196,5 @@ class Numbers:
 
 @lru_cache(1)
 def numbers(db: Path, _: tuple[int, ...]) -> Numbers:
-    """Return the numbers of a database with a stamp: what was read is read once."""
+    """Return the numbers of a database with this stamp, from memory after the first call."""
     return Numbers(db)

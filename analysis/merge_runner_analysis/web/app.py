@@ -92,7 +92,7 @@ def serve(db: Path, port: int, say: Callable[[str], None], reader: str, study: s
     ``study`` is the file of the study whose parts are in use, empty without one.
     """
     typed = sys.argv[0]
-    # What to type to run this: its path where the shell does not find it, as under ``make``.
+    # The command that runs this: a path where the shell does not find it, as under ``make``.
     plain = Path(typed).name != "merge-runner" or shutil.which("merge-runner") == typed
     site = Site(db, program="merge-runner" if plain else typed, reader=reader, study=study)
     with reading(db):
@@ -125,7 +125,7 @@ def explorer(site: Site) -> Starlette:
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
         yield
-        site.close()  # a server that is told to end is killed after this
+        site.close()  # a server that gets a signal to end is killed after this
 
     return Starlette(
         routes=[
@@ -150,9 +150,8 @@ def explorer(site: Site) -> Starlette:
 
 
 def _page(site: Site, render: Callable[..., str | Response], asked: Request) -> Response:
-    """A page, of what the database holds now."""
     if site.beginning:
-        text = site.render("message.html", heading="Reading the trials", text=FIRST_TIME, here="")
+        text = site.render("message.html", heading="Reading the trials", text=FIRST_TIME, view="")
         return HTMLResponse(text, headers={"refresh": "1"})  # in s
     site.refresh()
     rendered = render(site, *asked.path_params.values(), asked.query_params)
@@ -167,11 +166,11 @@ def _redirect(asked: Request) -> Response:
 
 
 def _trials_csv(site: Site, asked: Mapping[str, str]) -> Response:
-    wanted = trials.export_filter(site, asked)
-    return download(site.catalogue.export(wanted, sort_of(asked)), "trials.csv")
+    filters = trials.export_filter(site, asked)
+    return download(site.catalogue.export(filters, sort_of(asked)), "trials.csv")
 
 
-# What renders each page, of what its address names and asks for.
+# Functions that render the pages, from the names and the query of an address.
 PAGES: dict[str, Callable[..., str | Response]] = {
     "/": home.home_page,
     "/drivers": drivers.drivers_page,
@@ -184,7 +183,7 @@ PAGES: dict[str, Callable[..., str | Response]] = {
     "/trials.csv": _trials_csv,
     "/trials/{name:path}": trial.trial_page,
     "/others/{name:path}": lambda *asked: JSONResponse(trial.others(*asked)),
-    "/glossary": lambda site, _: site.render("glossary.html", here="glossary", glossary=sections()),
+    "/glossary": lambda site, _: site.render("glossary.html", view="glossary", glossary=sections()),
     "/tables": tables.tables_page,
     "/tables/{name}.{suffix}": tables.table_file,
     "/tables/{name}": tables.table_page,
@@ -219,9 +218,9 @@ async def _noted(site: Site, request: Request) -> Response:
 
 
 def _errors(site: Site) -> dict[Any, Callable[[Request, Exception], Response]]:
-    """The pages that say why there is no other."""
+    """Return the error page of each exception."""
 
-    def said(heading: str, code: int, request: Request, exc: Exception) -> Response:
+    def error_page(heading: str, code: int, request: Request, exc: Exception) -> Response:
         text = str(exc)
         if isinstance(exc, HTTPException):
             text = f"there is no page {request.url.path}"
@@ -229,15 +228,15 @@ def _errors(site: Site) -> dict[Any, Callable[[Request, Exception], Response]]:
             LOG.error("%s: a fault of the explorer: %r", request.url.path, exc)
             LOG.debug("where it happened", exc_info=exc)
             text = f"A fault of the explorer: {exc!r}. The other pages go on."
-        return HTMLResponse(site.render("message.html", heading=heading, text=text, here=""), code)
+        return HTMLResponse(site.render("message.html", heading=heading, text=text, view=""), code)
 
     return {
         NothingNew: lambda *_: Response(status_code=204),
-        NotThere: partial(said, "Not there", 404),
-        TooMuch: partial(said, "Too much", 400),
-        # Nobody reads what is answered to a browser that has left.
+        NotThere: partial(error_page, "Not there", 404),
+        TooMuch: partial(error_page, "Too much", 400),
+        # Nobody reads an answer to a browser that has left.
         ClientDisconnect: lambda *_: Response(status_code=400),
-        404: partial(said, "Not there", 404),
-        MergeRunnerError: partial(said, "Not now", 503),
-        Exception: partial(said, "A fault", 500),
+        404: partial(error_page, "Not there", 404),
+        MergeRunnerError: partial(error_page, "Not now", 503),
+        Exception: partial(error_page, "A fault", 500),
     }

@@ -1,4 +1,4 @@
-"""The list of all trials of a database as it is now, and what its trials come to together."""
+"""List of all trials of a database in its present state, with counts and means over them."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from merge_runner_analysis.web.phrases import condition_text
 from merge_runner_analysis.web.reading import Row, records
 
 PAGE = 100
-# While a run goes on the database changes all the time: so many trials are listed anew, which takes
-# half a second, at most every so many seconds.
+# While a run goes on the database changes all the time: a list of MANY trials, which takes half a
+# second, is read anew at most every STANDS_S seconds.
 MANY, STANDS_S = 3_000, 20.0
 MOST_COUNTED = 50  # filters whose counts are remembered
-Wanted = Mapping[str, Any]
-"""Which trials are wanted, by facet or column; an empty value wants all, and of a list one must be.
+TrialFilter = Mapping[str, Any]
+"""A filter of trials by facet or column: an empty value admits all, a list any of its values.
 
-``who`` is ``drivers``, ``humans`` or ``stand-ins``, and ``q`` are parts of a name. ``trials`` are
-(trial, spec), where those behind a cell of a table are wanted.
+``who`` is a kind of driver, ``q`` has parts of a name, and ``trials`` are the (trial, spec) behind
+a cell of a table.
 """
 Facets = dict[str, list[tuple[str, int]]]
 Counted = TypeVar("Counted")
@@ -75,7 +75,7 @@ coalesce(sum(attempts), 0)::BIGINT - coalesce(len(every), 0) + coalesce(len(once
 round(coalesce(sum(cost_usd), 0) - coalesce(list_sum([reply.usd FOR reply IN every]), 0)
     + coalesce(list_sum([reply.usd FOR reply IN once]), 0), 9) AS cost_usd
 """
-# What stands above a list: a fourth of the time of all counts.
+# Totals above a list: a fourth of the time of all counts.
 TOTALS = """
 count(*) AS trials, count(*) FILTER (status = 'failed') AS failed,
 count(*) FILTER (status = 'collided') AS collided, round(avg(gap_m), 9) AS gap_m,
@@ -100,10 +100,10 @@ EXPORTED = (
 MEMBERS = " JOIN (SELECT number, value AS sweep FROM several WHERE facet = 'sweep') USING (number)"
 
 
-def where_of(wanted: Wanted, leave_out: str = "") -> tuple[str, list[Any]]:
-    """A filter as SQL with its values; without one facet, to count its alternatives."""
+def where_of(filters: TrialFilter, leave_out: str = "") -> tuple[str, list[Any]]:
+    """Return a filter as an SQL condition with its values; ``leave_out`` drops a facet."""
     parts, values = ["true"], list[Any]()
-    for name, value in wanted.items():
+    for name, value in filters.items():
         if name == leave_out or value in ("", (), None):
             continue
         if name == "q":
@@ -164,32 +164,32 @@ class Catalogue:
             return True
 
     @property
-    def held(self) -> bool:
-        """Whether another program holds the database, and what is listed may be old."""
-        return self.copies.held
+    def is_locked(self) -> bool:
+        """Return whether another program holds the database, so that the list may be old."""
+        return self.copies.is_locked
 
     @property
     def state(self) -> Row:
-        """What differs where other ``trials`` are listed, or the same otherwise."""
+        """State of the list, which differs wherever the listed ``trials`` or their values do."""
         return self._listing.state
 
     @property
     def others(self) -> list[Pair]:
-        """Which model was asked for where another one answered, and which."""
+        """Pairs of the requested and the served model that differ."""
         return self._listing.others
 
     @property
     def has_humans(self) -> bool:
-        """Whether any human trial is listed."""
+        """Return whether any human trial is listed."""
         return bool(self.ask("SELECT 1 FROM listed WHERE who = 'humans' LIMIT 1"))
 
     def ask(self, sql: str, *values: object) -> list[Row]:
-        """Rows of a query of ours."""
+        """Return the rows of a query of ours."""
         with self._lock:
             return records(self._listing.connection, sql, values)
 
     def cursor(self) -> duckdb.DuckDBPyConnection:
-        """Another connection: its queries keep no page waiting."""
+        """Return another connection: its queries keep no page waiting."""
         with self._lock:
             return self._listing.cursor()
 
@@ -207,109 +207,109 @@ class Catalogue:
                 self._tags, self._counted = tags, {}
 
     def factors(self) -> list[str]:
-        """The factors of the listed studies, with ``model`` where there is any, but no prompt."""
+        """Return the factors of the listed studies but the prompt; none if only models differ."""
         rows = self.ask(
             f"SELECT DISTINCT facet FROM several WHERE facet LIKE '{FACTOR}%' ORDER BY ALL"  # noqa: S608 # constants
         )
         names = [row["facet"].removeprefix(FACTOR) for row in rows]
         return names if names != ["model"] else []
 
-    def facets(self, wanted: Wanted) -> Facets:
-        """Each facet's values with how many trials they would leave, the other facets as wanted."""
+    def facets(self, filters: TrialFilter) -> Facets:
+        """Return each facet's values with the number of trials left under the other filters."""
 
         def count() -> Facets:
             names = (*FACETS, *(f"{FACTOR}{name}" for name in self.factors()))
-            return facets_of(self._listing.connection, "listed", names, wanted)
+            return facets_of(self._listing.connection, "listed", names, filters)
 
-        return self._once(("facets", wanted), count)
+        return self._once(("facets", filters), count)
 
-    def counts(self, wanted: Wanted, *columns: str) -> list[Row]:
-        """What a filter's trials come to by columns: counts of all, means of those with a value.
+    def counts(self, filters: TrialFilter, *columns: str) -> list[Row]:
+        """Return a filter's trials grouped by columns: counts of all, means of those with a value.
 
         Without columns it is one row. A trial counts in each ``sweep`` of which it is a member.
         """
-        where, values = where_of(wanted)
+        where, values = where_of(filters)
         table = f"listed{MEMBERS}" if "sweep" in columns else "listed"
         named = "".join(f"{name}, " for name in columns)
         sql = (
             f"SELECT * EXCLUDE (every, once) FROM (SELECT {named}{COUNTS} FROM {table} "  # noqa: S608 # constants
             f"WHERE {where} GROUP BY ALL) ORDER BY ALL"
         )
-        return self._once((columns, wanted), lambda: self.ask(sql, *values))
+        return self._once((columns, filters), lambda: self.ask(sql, *values))
 
-    def totals(self, wanted: Wanted) -> list[Row]:
-        """What a filter's trials come to by model, as it stands above their list."""
-        where, values = where_of(wanted)
+    def totals(self, filters: TrialFilter) -> list[Row]:
+        """Return a filter's totals by model, for the line above the list."""
+        where, values = where_of(filters)
         sql = f"SELECT model, {TOTALS} FROM listed WHERE {where} GROUP BY ALL ORDER BY model"  # noqa: S608 # constants
-        return self._once(("totals", wanted), lambda: self.ask(sql, *values))
+        return self._once(("totals", filters), lambda: self.ask(sql, *values))
 
     def _once(self, of: object, count: Callable[[], Counted]) -> Counted:
-        """Count something of the present list, or give what was counted of it before."""
+        """Return a count of the present list, from memory after the first call."""
         with self._lock:
             if len(self._counted) > MOST_COUNTED:
                 self._counted.clear()
             name = repr(of)
             if name not in self._counted:
                 self._counted[name] = count()
-            found: Counted = self._counted[name]
-            return found
+            counted: Counted = self._counted[name]
+            return counted
 
-    def every(self, wanted: Wanted, sort: str = "trial") -> list[Row]:
-        """All trials of a filter; ``-gap`` sorts the largest gap first, what has none last."""
-        where, values = where_of(wanted)
+    def every(self, filters: TrialFilter, sort: str = "trial") -> list[Row]:
+        """Return all trials of a filter; ``-gap`` sorts largest first, missing ones last."""
+        where, values = where_of(filters)
         return self.ask(
             f"SELECT {UNDRAWN} FROM listed WHERE {where} ORDER BY {_order_of(sort)}",  # noqa: S608 # constants
             *values,
         )
 
-    def page(self, wanted: Wanted, sort: str, number: int) -> list[Row]:
-        """The trials of a page from 1, with their speeds and the ``causes`` of their errors."""
-        where, values = where_of(wanted)
+    def page(self, filters: TrialFilter, sort: str, number: int) -> list[Row]:
+        """Return the trials of a page from 1, with their speeds and the ``causes`` of errors."""
+        where, values = where_of(filters)
         order = _order_of(sort)
         sql = (
             f"SELECT {SHOWN} FROM listed SEMI JOIN (SELECT number FROM listed WHERE {where} "  # noqa: S608 # constants
             f"ORDER BY {order} LIMIT {PAGE} OFFSET {PAGE * (number - 1)}) USING (number) "
             f"LEFT JOIN ({CAUSES}) USING (number) ORDER BY {order}"
         )
-        return self._once((sort, number, wanted), lambda: self.ask(sql, *values))
+        return self._once((sort, number, filters), lambda: self.ask(sql, *values))
 
     def find(self, trial_id: str, spec_hash: str = "") -> Row | None:
-        """One trial; where its name stands for several, the one of that spec, or any."""
-        found = self.ask(
+        """Return a trial; of several with its name the one of that spec, or any."""
+        rows = self.ask(
             f"SELECT {UNDRAWN} FROM listed WHERE trial_id = ? AND spec_hash LIKE ? "  # noqa: S608 # constants
             "ORDER BY spec_hash LIMIT 1",
             *(trial_id, spec_hash or "%"),
         )
-        return next(iter(found), None)
+        return next(iter(rows), None)
 
     def condition_texts(self) -> dict[str, str]:
-        """In words: the conditions that humans drove, and those of all trials."""
+        """Return the conditions in words: those that humans drove, and those of all trials."""
         numbers = "condition, projected_headway_m, relative_velocity_mps"
         played = self.ask(f"SELECT DISTINCT {numbers} FROM listed")  # noqa: S608 # constants
         return {
-            name: condition_text(one.projected_headway_m, one.relative_velocity_mps)
-            for name, one in HUMAN_CONDITIONS.items()
+            name: condition_text(condition.projected_headway_m, condition.relative_velocity_mps)
+            for name, condition in HUMAN_CONDITIONS.items()
         } | {name: condition_text(*of) for name, *of in map(dict.values, played)}
 
-    def export(self, wanted: Wanted, sort: str) -> str:
-        """All trials of a filter as CSV, with a column for each factor but the model."""
+    def export(self, filters: TrialFilter, sort: str) -> str:
+        """Return all trials of a filter as CSV, with a column for each factor but the model."""
         factors = [name for name in self.factors() if name != "model"]
         names, lines = EXPORTED.split(), io.StringIO()
         writer = csv_writer(lines)
         writer.writerow(map(csv_cell, [*names, *(f"{FACTOR}{name}" for name in factors)]))
-        for row in self.every(wanted, sort):
+        for row in self.every(filters, sort):
             levels = dict(level.split("=", 1) for level in row["levels"] or ())
             writer.writerow(map(csv_cell, [*map(row.get, names), *map(levels.get, factors)]))
         return lines.getvalue()
 
 
 def facets_of(
-    cursor: duckdb.DuckDBPyConnection, listed: str, names: Sequence[str], wanted: Wanted
+    cursor: duckdb.DuckDBPyConnection, listed: str, names: Sequence[str], filters: TrialFilter
 ) -> Facets:
-    """The values of facets with how many rows of a table they would leave, the others as wanted."""
+    """Return each facet's values with the number of rows left under the other filters."""
     counts, values = [], list[Any]()
     for name in names:
-        where, wants = where_of(wanted, leave_out=name)
+        where, wants = where_of(filters, leave_out=name)
         table, value = listed, name
         if name in SEVERAL or name.startswith(FACTOR):
             table, value = f"{listed} JOIN (FROM several WHERE facet = ?) USING (number)", "value"
@@ -319,9 +319,9 @@ def facets_of(
             f"WHERE {where} AND {value} IS NOT NULL GROUP BY ALL"
         )
         values += [name, *wants]
-    found: Facets = {name: [] for name in names}
+    facets: Facets = {name: [] for name in names}
     for facet, value, times in cursor.execute(
         f"{' UNION ALL '.join(counts)} ORDER BY ALL", values
     ).fetchall():
-        found[facet].append((value, times))
-    return found
+        facets[facet].append((value, times))
+    return facets

@@ -30,7 +30,7 @@ from merge_runner_analysis.wording import UNCORRECTED, apart, capital, number, p
 # The trials behind a count, as a filter of their list; None where no filter keeps just these.
 Filter = dict[str, Any] | None
 TrialsOf = Callable[[str, int], Filter]
-"""By a metric, of which a driver has so many trials that count, or by ``k METRIC``."""
+"""From a metric, or ``k METRIC``, and its number of trials to their filter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,29 +72,29 @@ class Comparison:
 
 
 def compared(
-    site: Site, own: Driver, other: Driver, scope: Scope
+    site: Site, first: Driver, second: Driver, scope: Scope
 ) -> tuple[Job, bool, Comparison | None]:
-    """One driver less another, each with its prompt: the computation, if it is awaited, the result.
+    """Compare two drivers: return the job, whether to wait for it, and the result.
 
-    The computation may end meanwhile: whether it is awaited is what was found.
+    A job without a result is waited for, even if it ends meanwhile.
     """
-    groups = (f"{one.name}/{one.prompt}" for one in (own, other))
-    named = short_names([own.name, other.name])
+    groups = (f"{driver.name}/{driver.prompt}" for driver in (first, second))
+    named = short_names([first.name, second.name])
     job = computed(site, ("comparison", *groups, scope.sweep, scope.condition))
     if (content := job.content) is None:
         return job, True, None
-    trials = trials_of(own, scope), trials_of(other, scope)
+    trials = trials_of(first, scope), trials_of(second, scope)
     table = from_text(content["table"])
-    return job, False, comparison_of(table, (named[own.name], named[other.name]), trials)
+    return job, False, comparison_of(table, (named[first.name], named[second.name]), trials)
 
 
 def comparison_of(
     table: Table, names: tuple[str, str], trials: tuple[TrialsOf, TrialsOf]
 ) -> Comparison | None:
-    """The comparison of two drivers; None where one of them is not judged."""
+    """Return the comparison of two drivers; None where one of them is not judged."""
     if not table.rows:
         return None
-    # What a person sees at once comes first.
+    # The most visible measure is the first.
     rows = sorted(table.rows, key=lambda row: metric_of(row) != COLLISIONS.name)
     claim, rest = apart(*names, {metric_of(row): row.values for row in rows})
     seen = [
@@ -113,19 +113,20 @@ def comparison_of(
 
 
 def _corrected(rows: Sequence[Row]) -> str:
-    """How the p of these rows are corrected."""
+    """Describe the correction of these rows' p."""
     tested = [row for row in rows if row.values["p_corrected"] is not None]
-    own = [name_of(row) for row in tested if row.values["primary"]]
-    others = f"for the number of {'other ' * bool(own)}comparisons, {len(tested) - len(own)} (Holm)"
-    alone = f"; {own[0]}, the primary measure, is tested by itself" if own else ""
+    primary = [name_of(row) for row in tested if row.values["primary"]]
+    count = len(tested) - len(primary)
+    others = f"for the number of {'other ' * bool(primary)}comparisons, {count} (Holm)"
+    alone = f"; {primary[0]}, the primary measure, is tested by itself" if primary else ""
     return f"{others}{alone}. {UNCORRECTED * any(map(is_uncorrected, tested))}".rstrip()
 
 
-def trials_of(own: Driver, scope: Scope) -> TrialsOf:
-    """The filters of a driver's trials, of those that keep just as many as are counted."""
-    every, facts = scope.trials(own.name, own.prompt), own.facts or {}
+def trials_of(driver: Driver, scope: Scope) -> TrialsOf:
+    """Return a function from a count to the filter that keeps exactly its trials."""
+    every, facts = scope.trials(driver.name, driver.prompt), driver.facts or {}
 
-    def behind(what: str, count: int) -> Filter:
+    def filter_of(what: str, count: int) -> Filter:
         named = {
             f"k {COLLISIONS.name}": ("collided", {"outcome": "collided"}),
             f"k {LEFT_FIRST.name}": ("left_first", {"outcome": "left first"}),
@@ -134,16 +135,16 @@ def trials_of(own: Driver, scope: Scope) -> TrialsOf:
         if facts.get(field) == count:
             return every | more
         # A finished trial has a gap, and an ended one is in the row of crashes.
-        for cell in own.cells.values():
+        for cell in driver.cells.values():
             if what[:2] != "k " and cell.values["n"] == count and cell.measure.name == "gap":
                 return {"cell": f"verdicts/{cell.values['row']}:n", **scope.part}
         return None
 
-    return behind
+    return filter_of
 
 
 def no_trials(_what: str, _count: int) -> Filter:
-    """No filter: a report has no list of trials."""
+    """Return no filter: a report has no list of trials."""
     return None
 
 
@@ -151,12 +152,12 @@ def _difference(row: Row, trials: tuple[TrialsOf, TrialsOf]) -> Difference:
     values: Any = row.values
     ci, is_tested = values["ci"], values["difference"] is not None
     end = max(map(abs, (values["difference"], *(ci or ())))) if is_tested else 0.0
-    one, other = (
-        _side(row, of, behind) for of, behind in zip(("", "_reference"), trials, strict=True)
+    first, second = (
+        _side(row, of, filter_of) for of, filter_of in zip(("", "_reference"), trials, strict=True)
     )
     return Difference(
         capital(name_of(row)),
-        (one, other),
+        (first, second),
         unbroken(_with_unit(row, "difference", sign="+")) if is_tested else "–",
         unbroken(interval_text(row)),
         difference_mark(row, end) if is_tested and values["p_corrected"] is not None else None,
@@ -167,14 +168,14 @@ def _difference(row: Row, trials: tuple[TrialsOf, TrialsOf]) -> Difference:
     )
 
 
-def _side(row: Row, of: str, behind: TrialsOf) -> Side:
+def _side(row: Row, of: str, filter_of: TrialsOf) -> Side:
     values: Any = row.values
     metric, k, n = metric_of(row), values[f"k{of}"], values[f"n{of}"]
     unit = unit_of(row).replace("points", "%")
     value = values[f"value{of}"]
     text = number(None) if value is None else unbroken(f"{amount(row, value)} {unit}")
-    k_trials = None if k is None else behind(f"k {metric}", k)
-    return Side(text, k, n, k_trials, behind(metric, n))
+    k_trials = None if k is None else filter_of(f"k {metric}", k)
+    return Side(text, k, n, k_trials, filter_of(metric, n))
 
 
 def _with_unit(row: Row, name: str, sign: str = "") -> str:

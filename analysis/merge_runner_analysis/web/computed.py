@@ -1,4 +1,4 @@
-"""What pages show of a computation: its result, that it takes a while, or why there is none."""
+"""Computations as pages show them: a result, a wait, or the reason why there is none."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from merge_runner_analysis.web.answers import Request
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.site import NotThere, Site
 
-# What is kept comes within this time; what takes longer is asked for again.
+# Cached answers come within this time; a page asks again for others.
 AT_ONCE_S = 0.3
 FILE_WAIT_S = 300.0
 
 
 def computed(site: Site, request: Request, wait_s: float = AT_ONCE_S) -> Job:
     """Ask for something, and wait for it for a moment; raises NotThere where no table holds it."""
-    # What is written to files once waits for all of it.
+    # An export waits for every answer: its pages are written once.
     job = site.computing.ask(request, stamp_of(site.db), None if site.is_still else wait_s)
     if job.content is not None and "absent" in job.content:
         raise NotThere(job.content["absent"])
@@ -28,14 +28,14 @@ def computed(site: Site, request: Request, wait_s: float = AT_ONCE_S) -> Job:
 def computed_table(
     site: Site, name: str, sweep: str = "", condition: str = ""
 ) -> tuple[Job, Table | None]:
-    """A table, of all trials or of a part of them, once it is computed."""
-    found = computed(site, ("table", name, sweep, condition))
-    return found, from_text(found.content["table"]) if found.content else None
+    """Return the job of a table, of all trials or of a part, and the table once it is there."""
+    job = computed(site, ("table", name, sweep, condition))
+    return job, from_text(job.content["table"]) if job.content else None
 
 
 def awaited(site: Site, request: Request) -> dict[str, Any]:
-    """What a computation answers, however long that takes; raises NotThere and StoreError."""
-    found = computed(site, request, FILE_WAIT_S)
-    if found.content is None:
-        raise StoreError(found.failure or "it is still being computed: ask again in a minute")
-    return found.content
+    """Return the answer of a computation in FILE_WAIT_S; raises NotThere and StoreError."""
+    job = computed(site, request, FILE_WAIT_S)
+    if job.content is None:
+        raise StoreError(job.failure or "it is still being computed: ask again in a minute")
+    return job.content

@@ -51,12 +51,12 @@ class Job:
 
     @property
     def at(self) -> str:
-        """When it was begun, in local time with its zone."""
+        """Start time, in local time with its zone."""
         return f"{datetime.fromtimestamp(self.begun).astimezone():%Y-%m-%d %H:%M:%S %Z}"
 
     @property
     def elapsed_s(self) -> float:
-        """How long it takes so far."""
+        """Time since the start."""
         return time.time() - self.begun
 
     @property
@@ -67,7 +67,7 @@ class Job:
 
     @property
     def failure(self) -> str:
-        """Why there is no answer; empty while there may be one."""
+        """Reason for a missing answer; empty while there may be one."""
         exc = self.answer.exception() if self.answer.done() else None
         return BROKEN if isinstance(exc, BrokenProcessPool) else str(exc or "")
 
@@ -143,7 +143,7 @@ class Computing:
 
 
 def processes(number: int = 1) -> ProcessPoolExecutor:
-    """Return so many processes, with the same study's plug-ins as this one."""
+    """Return a pool of processes with the same study's plug-ins as this one."""
     return ProcessPoolExecutor(
         max_workers=number,
         mp_context=multiprocessing.get_context("spawn"),

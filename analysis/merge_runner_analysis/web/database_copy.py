@@ -53,12 +53,12 @@ class Copy:
 class Copies:
     """The present copy of a database.
 
-    ``held``: another program holds the database, and the copy is an earlier one.
+    ``is_locked``: another program holds the database, and the copy is an earlier one.
     """
 
     def __init__(self, db: Path) -> None:
         self.db = db
-        self.held = False
+        self.is_locked = False
         self._copy: Copy | None = None
         self._copying = threading.Lock()
 
@@ -70,17 +70,17 @@ class Copies:
         with self._copying:
             stamp, before = stamp_of(self.db), self._copy
             if before is not None and before.stamp == stamp:
-                self.held = False
+                self.is_locked = False
                 return before
             if before is not None and before.stamp[:1] != stamp[:1]:
                 before = None  # another file has taken the name
             self._copy = None  # nor is it shown instead of what cannot be read
             try:
                 # A reader that found it held once does not wait again.
-                self._copy = Copy(self.db, stamp, 0.0 if self.held else PATIENCE_S)
+                self._copy = Copy(self.db, stamp, 0.0 if self.is_locked else PATIENCE_S)
             except StoreLocked:
                 if before is None:
                     raise
                 self._copy = before
-            self.held = self._copy is before
+            self.is_locked = self._copy is before
             return self._copy

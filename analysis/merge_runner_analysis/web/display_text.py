@@ -24,12 +24,12 @@ _BLANK.update(range(0x180B, 0x1810), range(0xFE00, 0xFE10), range(0xE0100, 0xE01
 
 
 def with_minus(text: str) -> str:
-    """A text whose negative numbers have a true minus sign; hyphens stay, also those of names."""
+    """Return a text with true minus signs before negative numbers; hyphens stay, also in names."""
     return NEGATIVE.sub(MINUS, text)
 
 
 def visible(text: str) -> str:
-    """A text with every character that does not show as its code point: ``[U+202E]``."""
+    """Return a text with every invisible character as its code point: ``[U+202E]``."""
     if text.isascii() and text.isprintable():  # most texts, in a tenth of the time
         return text
     return _ODD.sub(lambda odd: odd[0] if _shows(odd[0]) else f"[U+{ord(odd[0]):04X}]", text)
@@ -42,24 +42,24 @@ def _shows(c: str) -> bool:
 
 
 def shortened(text: str) -> tuple[str, int]:
-    """The beginning of a text, and how many characters are left out."""
+    """Return the beginning of a text, and the number of characters left out."""
     return visible(text[:SHOWN]), max(0, len(text) - SHOWN)
 
 
 def clamped(text: str) -> tuple[str, str, int]:
-    """What a text begins with, as much more as is shown, and how many characters are left out."""
+    """Return a text's beginning, its shown continuation, and the number of characters left out."""
     shown, more = shortened(text[BEGINNING:])
     return visible(text[:BEGINNING]), shown, more
 
 
 def csv_cell(value: object) -> object:
-    """A value of any type for a cell of CSV."""
+    """Return a value of any type as a cell of CSV."""
     text = text_of(value)
     return text if isinstance(value, int | float | Decimal) else in_spreadsheet(text)
 
 
 def text_of(value: object) -> str | None:
-    """A value of any type as a text; None for NULL."""
+    """Return a value of any type as a text; None for NULL."""
     if value is None or isinstance(value, str):
         return value
     if isinstance(value, bool):

@@ -22,107 +22,107 @@ MIDDLE = Mark("", None, None, zero=50.0)  # no difference, on the axis of differ
 
 
 def unbroken(text: str) -> str:
-    """The text, of which no number stands apart from its unit or within its interval."""
+    """Return the text without line breaks between a number and its unit, or within intervals."""
     return re.sub(r"(?<=\d) (?=[%m]|points)|(?<=\d,) (?=[−\d])|(?<=[<=]) (?=\d)|^ ", NO_BREAK, text)
 
 
 def value_of(row: Row, name: str) -> float:
-    """A value that is there, as a number."""
+    """Return a value that is not NULL, as a number."""
     value: Any = row.values[name]
     return float(value)
 
 
 def count_of(row: Row, name: str) -> int:
-    """A count that is there."""
+    """Return a count that is not NULL."""
     return int(value_of(row, name))
 
 
 def interval_of(row: Row) -> tuple[float, float] | None:
-    """Both ends of the interval, if there is one."""
+    """Return both ends of the interval, if there is one."""
     ends = row.values.get("ci")
     return ends if isinstance(ends, tuple) else None
 
 
 def metric_of(row: Row) -> str:
-    """The metric of an effect, by its name."""
+    """Return the name of an effect's metric."""
     return row.id.rpartition("/")[2]
 
 
 def name_of(row: Row) -> str:
-    """What an effect's measure is called."""
+    """Return the label of an effect's measure."""
     return METRIC_NAMES.get(metric_of(row), str(row.values["measure"]).rpartition(" (")[0])
 
 
 def unit_of(row: Row) -> str:
-    """The unit of a difference."""
+    """Return the unit of a difference."""
     return str(row.values["measure"]).rpartition("(")[2].rstrip(")").replace("%", "points")
 
 
 def estimate_text(row: Row, name: str) -> str:
-    """``63.00 %``: the value of a level."""
+    """Return the value of a level: ``63.00 %``."""
     return f"{amount(row, value_of(row, name))} {unit_of(row).replace('points', '%')}"
 
 
 def amount(row: Row, value: float) -> str:
-    """A value of an effect's measure, without the unit."""
+    """Return a value of an effect's measure, without the unit."""
     return money(value) if unit_of(row) == "USD" else number(value)
 
 
 def interval_text(row: Row) -> str:
-    """``[6.06, 19.60]``, or nothing."""
+    """Return ``[6.06, 19.60]``, or nothing."""
     return brackets(interval_of(row), money if unit_of(row) == "USD" else number)
 
 
 def test_text(row: Row) -> str:
-    """``+12.84 points [6.06, 19.60], corrected p = 0.012``."""
+    """Return ``+12.84 points [6.06, 19.60], corrected p = 0.012``."""
     apart = f"{difference_text(row)} {unit_of(row)} {interval_text(row)}".rstrip()
     return f"{apart}, corrected p {equal_p(value_of(row, 'p_corrected'))}"
 
 
 def difference_text(row: Row) -> str:
-    """``+12.84``."""
+    """Return ``+12.84``."""
     value = value_of(row, "difference")
     return f"{'+' if value > 0 else ''}{amount(row, value)}"
 
 
 def level_text(row: Row) -> str:
-    """``hurry=yes``."""
+    """Return ``hurry=yes``."""
     return f"{row.values['factor']}={row.values['level']}"
 
 
 def is_interaction(row: Row) -> bool:
-    """Whether it is a difference of differences."""
+    """Return whether a row is a difference of differences."""
     return "/interaction/" in row.id
 
 
 def is_copied(row: Row) -> bool:
-    """Whether it is a test of the study's own that could not be made, of equal trials."""
+    """Return whether a row is a primary test that identical trials left untested."""
     return bool(row.values.get("primary")) and row.untested
 
 
 def is_tested(row: Row) -> bool:
-    """Whether it has a p."""
+    """Return whether a row has a p."""
     return row.values.get("p_corrected") is not None
 
 
 def is_shown(row: Row) -> bool:
-    """Whether its corrected p is below 5 %."""
+    """Return whether a row's corrected p is below 5 %."""
     return is_tested(row) and value_of(row, "p_corrected") < ALPHA
 
 
 def is_uncorrected(row: Row) -> bool:
-    """Whether its interval leaves out 0, and its corrected p shows no difference."""
+    """Return whether the interval leaves out 0 though the corrected p shows no difference."""
     ends = interval_of(row)
     return is_tested(row) and not is_shown(row) and ends is not None and ends[0] * ends[1] > 0
 
 
 def factors_of(row: Row) -> set[str]:
-    """The factor of a level, or those of a crossing."""
+    """Return the factor of a level, or those of a crossing."""
     return {*str(row.values["factor"]).split(TIMES)}
 
 
 def difference_mark(row: Row, end: float) -> Mark:
-    """A difference on an axis with 0 in its middle; filled where its corrected p is below 5 %."""
+    """Return a difference on an axis about 0; filled where its corrected p is below 5 %."""
     values = (value_of(row, "difference"), *(interval_of(row) or ()))
     at, *ends = (round(50 + 48 * value / (end or 1.0), 2) for value in values)
     shape = "like" if is_shown(row) else "open"

@@ -71,15 +71,15 @@ LONGEST_NAME = 120
 def export_folder(
     db: Path,
     folder: Path,
-    wanted: Sequence[str] = (),
+    patterns: Sequence[str] = (),
     progress: Callable[[int], object] = lambda _: None,
 ) -> Path:
     """Write the pages of a study into a folder; returns the first of them.
 
-    ``wanted`` are names of trials, in which * stands for anything: then it is their list and their
-    pages alone. ``progress`` gets the number of pages so far. An earlier export in the folder goes.
-    Raises UsageError; then, as where a page holds a key or a path of this machine, the folder stays
-    as it was.
+    ``patterns`` are names of trials, in which * stands for anything: then their list and their
+    pages alone are written. ``progress`` gets the number of pages so far. An earlier export in the
+    folder goes. Raises UsageError; then, as where a page holds a key or a path of this machine, the
+    folder stays as it was.
     """
     index, files = folder / INDEX, folder / FILES
     if folder.is_file():
@@ -87,10 +87,10 @@ def export_folder(
     refuse_another_kind(index, OURS, "exported study")
     if files.exists() and not index.exists():
         raise UsageError(f"{files} is there, and is no exported study's: name another folder")
-    begin, heads = ("/trials", OF_TRIALS) if wanted else ("/", tuple(FOLLOWED))
+    begin, heads = ("/trials", OF_TRIALS) if patterns else ("/", tuple(FOLLOWED))
     site = Site(db, _links(heads), policy=POLICY)
-    with _opened(site, wanted) as rows, _staged(folder) as stage:
-        if wanted:
+    with _opened(site, patterns) as rows, _staged(folder) as stage:
+        if patterns:
             site.catalogue.keep([row["number"] for row in rows])
         else:
             _begin_to_compute(site)
@@ -101,13 +101,13 @@ def export_folder(
     return index
 
 
-def export_page(db: Path, file: Path, wanted: Sequence[str]) -> Path:
-    """Write one page with the wanted trials; returns its path. Raises UsageError."""
+def export_page(db: Path, file: Path, patterns: Sequence[str]) -> Path:
+    """Write one page with the trials of these names; returns its path. Raises UsageError."""
     refuse_another_kind(file, HTML, "page of HTML")
-    held: set[tuple[str, str]] = set()
-    site = site_of_a_page(db, held)
-    with _opened(site, wanted) as rows, _staged(file.parent) as stage:
-        held.update((row["trial_id"], row["spec_hash"]) for row in rows)
+    trials: set[tuple[str, str]] = set()
+    site = site_of_a_page(db, trials)
+    with _opened(site, patterns) as rows, _staged(file.parent) as stage:
+        trials.update((row["trial_id"], row["spec_hash"]) for row in rows)
         (stage / file.name).write_text(page_of_trials(site, rows), encoding="utf-8")
     return file
 
@@ -258,18 +258,18 @@ def _name_of(page: str, taken: Collection[str]) -> str:
 
 
 @contextmanager
-def _opened(site: Site, wanted: Sequence[str]) -> Iterator[list[Row]]:
-    """Give the wanted trials of a site, by name; raises UsageError for none or too many."""
+def _opened(site: Site, patterns: Sequence[str]) -> Iterator[list[Row]]:
+    """Give the trials of these names; raises UsageError for none or too many."""
     db = site.db
     site.refresh()
     site.is_still = True  # so that all pages are of the same trials
     rows = [
         row
         for row in site.catalogue.every({})
-        if not wanted or any(fnmatchcase(row["trial_id"], pattern) for pattern in wanted)
+        if not patterns or any(fnmatchcase(row["trial_id"], pattern) for pattern in patterns)
     ]
     if not rows:
-        names = ", ".join(wanted) or "any name"
+        names = ", ".join(patterns) or "any name"
         raise UsageError(f"{db} holds no trial called {names}; `merge-runner view` lists them")
     if (number := sum(row["source"] != "human" for row in rows)) > MOST:
         raise UsageError(

@@ -22,22 +22,22 @@ _MARKED = (
 
 @cache
 def sections() -> dict[str, list[tuple[str, Markup]]]:
-    """All words by the headings that they stand under, each with what is meant by it.
+    """Return all terms by heading, each with its meaning.
 
     Links of the meanings lead nowhere from a page, and become their texts.
     """
-    found: dict[str, list[tuple[str, Markup]]] = {}
+    by_heading: dict[str, list[tuple[str, Markup]]] = {}
     for line in FILE.read_text(encoding="utf-8").splitlines():
         if line.startswith("## "):
-            words = found.setdefault(line[3:], [])
+            words = by_heading.setdefault(line[3:], [])
         elif (row := _ROW.fullmatch(line)) and row[1] not in {"term", "---"}:
             meaning = str(escape(row[2]))
             for pattern, html in _MARKED:
                 meaning = pattern.sub(html, meaning)
             words.append((row[1], Markup(meaning)))  # noqa: S704 # escaped above
-    return found
+    return by_heading
 
 
 def meaning(term: str) -> Markup:
-    """What a word means; raises KeyError for one that the glossary lacks."""
-    return {word: said for words in sections().values() for word, said in words}[term]
+    """Return the meaning of a term; raises KeyError for one that the glossary lacks."""
+    return {word: text for words in sections().values() for word, text in words}[term]

@@ -1,4 +1,4 @@
-"""The drivers of a scope: their verdicts beside the humans', and what their trials come to."""
+"""Drivers of a scope: their verdicts beside the humans', and counts of their trials."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ FROM listed JOIN specs USING (spec_hash) GROUP BY ALL
 
 @dataclass(frozen=True, slots=True)
 class Driver:
-    """A driver with a prompt: its verdicts, and what its trials come to.
+    """A driver with a prompt: its verdicts, and counts of its trials.
 
     ``facts`` are counts of the list of trials, None where it has none of them; ``parameters`` are
     those of the requests to its model.
@@ -58,7 +58,7 @@ class Driver:
 
 
 def judged(site: Site, bar: Bar, asked: Mapping[str, str]) -> tuple[list[Driver], dict[str, Any]]:
-    """The drivers of a scope, and the values of every page that shows their verdicts."""
+    """Return the drivers of a scope, and the values of every page that shows their verdicts."""
     job, table = computed_table(site, TABLE, bar.scope.sweep, bar.scope.condition)
     return drivers_of(site, table, bar.scope), {
         "bar": bar,
@@ -73,9 +73,9 @@ def judged(site: Site, bar: Bar, asked: Mapping[str, str]) -> tuple[list[Driver]
 
 
 def humans_of(table: Table | None, driver: Driver | None = None) -> dict[str, Any]:
-    """The humans' cells by measure, where their bands lie, and which humans they are.
+    """Return the humans' cells and bands by measure, and a label of their trials.
 
-    Beside a driver they are those that it is compared with, in its conditions.
+    With a driver, they are the humans in its conditions.
     """
     rows = table.rows if table else ()
     verdicts, measures = by_group(rows).get(HUMAN, {}), measures_of(rows)
@@ -93,7 +93,7 @@ def humans_of(table: Table | None, driver: Driver | None = None) -> dict[str, An
 
 
 def drivers_of(site: Site, table: Table | None, scope: Scope) -> list[Driver]:
-    """Every driver and prompt with trials in a scope; without a table their facts alone."""
+    """Return every driver and prompt with trials in a scope; without a table their facts alone."""
     counts = site.catalogue.counts(scope.trials(), "model", "variant", "who")
     facts = {(row["model"], row["variant"]): row for row in counts if row["who"] != "humans"}
     specs = {(row["model"], row["variant"]): row for row in site.catalogue.ask(ASKED)}
@@ -125,19 +125,18 @@ def drivers_of(site: Site, table: Table | None, scope: Scope) -> list[Driver]:
 
 
 def _kind(facts: Row | None) -> str:
-    """What kind of driver the list of trials tells."""
     if facts and facts["who"] == "stand-ins":
         return MOCK
     return LANGUAGE_MODEL if facts and facts["asked"] else PROGRAM
 
 
 def by_kind(drivers: Sequence[Driver]) -> dict[str, list[Driver]]:
-    """Drivers by their kinds."""
+    """Return drivers by kind."""
     return {kind: [driver for driver in drivers if driver.kind == kind] for kind in KINDS}
 
 
 def noted(drivers: Sequence[Driver]) -> list[tuple[str, str, str]]:
-    """What is to be known of a number: driver, measure and note, each at its cell (†)."""
+    """Return the notes on numbers: driver, measure and note, each marked † at its cell."""
     return [
         (driver.name, cell.measure.trait, capital(str(cell.values["note"])))
         for driver in drivers
@@ -147,7 +146,7 @@ def noted(drivers: Sequence[Driver]) -> list[tuple[str, str, str]]:
 
 
 def by_condition(site: Site, scope: Scope, drivers: Sequence[Driver]) -> dict[str, Any]:
-    """What drivers' trials, and the humans' as published, come to by condition.
+    """Return counts by condition, of the drivers' trials and of the humans' as published.
 
     None stands for a condition that somebody did not drive; without a driver they are the humans'.
     """
@@ -165,6 +164,6 @@ def by_condition(site: Site, scope: Scope, drivers: Sequence[Driver]) -> dict[st
 
 
 def _merged(row: Row) -> Row:
-    """Counts of trials with how many merged, and without other counts how many ended."""
+    """Add to counts of trials how many merged, and where it is missing how many ended."""
     merged = row["left_first"] + row["right_first"]
     return {"ended": merged + row["collided"], **row, "merged": merged}

@@ -1,4 +1,4 @@
-"""What must not leave this machine: its keys, and paths that name its folders."""
+"""Refusal of files that hold keys of this machine, or paths that name its folders."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pathlib import Path
 from merge_runner.errors import UsageError
 from merge_runner.paths import PROJECT
 
-# What looks like a key, wherever it is from, by what it begins with: to look for words is far
-# quicker than to look for a pattern. The values of this machine's keys are looked for too.
+# Texts that look like a key, by their beginnings: a search for words is far quicker than one for a
+# pattern. The values of this machine's keys are looked for too.
 _KEYS = {
     "sk-": r"[A-Za-z0-9_-]{16}",
     "AIza": r"[A-Za-z0-9_-]{30}",
@@ -28,7 +28,7 @@ _HOMES = re.compile(r"(?<![\w.])(?:/home|/Users|[A-Z]:\\+Users)[/\\]+[\w.-]+[/\\
 
 
 def refuse_leaks(db: Path, where: str, text: str) -> None:
-    """Raises UsageError where a text holds a key, or a path of this machine."""
+    """Raise UsageError where a text holds a key, or a path of this machine."""
     for name in filter(lambda name: name.endswith(_SECRET_NAMES), os.environ):
         if len(os.environ[name]) >= SHORTEST_SECRET and os.environ[name] in text:
             raise UsageError(f"nothing was written: {where} holds the value of {name}")

@@ -15,7 +15,7 @@ from merge_runner_analysis.wording import TIMES, brackets, number
 
 # The shapes that tell drivers apart in a chart, and more of them are not drawn.
 SHAPES = ("dot", "square", "ring", "triangle")
-# Of a chart, in units of its drawing: its parts, and a letter of a name.
+# Parts of a chart, and a letter of a name, in units of its drawing.
 LEFT, WIDTH, HEAD, ROW, APART, INDENT, LETTER = 90.0, 480.0, 12, 20, 14, 84.0, 7.5
 
 
@@ -56,7 +56,7 @@ class Chart:
 def level_chart(
     title: str, rows: Sequence[Row], shapes: dict[str, str], metric: str
 ) -> Chart | None:
-    """The levels of these rows, each with a point for each driver, on one axis from the data."""
+    """Return a chart of the levels of these rows, a point for each driver, on one axis."""
     of_model = [row for row in rows if row.values["factor"] != MODEL]
     drawn = [
         row
@@ -121,7 +121,7 @@ def level_chart(
 
 
 def _axis(low: float, high: float) -> tuple[float, float, float]:
-    """Round ends around these values, and the step of four or so ticks between."""
+    """Return round ends around these values, and the step of four or so ticks between."""
     width = (high - low) or 1.0
     power = 10 ** floor(log10(width / 4))
     step = next(power * of for of in (1, 2, 5, 10) if power * of >= width / 5)

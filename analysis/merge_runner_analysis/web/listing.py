@@ -1,6 +1,6 @@
-"""How the list of all trials is made of a copy of the database, in an instance of its own.
+"""List of all trials from a copy of the database, in an instance of its own.
 
-There queries find the tables of the copy beside the list.
+Its queries find the tables of the copy as well as the list.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ BOTH = "SET search_path = 'memory.main,results.main'"
 MISSING = "decision: missing"
 # Before the name of a factor: its facet.
 FACTOR = "factor."
-# What SQL cannot judge: of collisions both courses and, after a fallback, the decisions; of the
-# others who drove by their specs, and on which sides a stand-in ``posed``.
+# Inputs of judgements that SQL cannot make: of collisions both courses and, after a fallback, the
+# decisions; of all specs the drivers, and on which sides a mock model ``posed``.
 COLLIDED = """
 SELECT trial_id, spec_hash, source, coalesce(spec::VARCHAR, '{}') AS spec, made, times_s,
     left_m, right_m, left_mps, right_mps
@@ -186,7 +186,7 @@ def list_trials(copy: Copy) -> Listing:
     connection.execute(f"ATTACH {copy.file} AS results (READ_ONLY); {BOTH}")
     connection.execute(JUDGED, columns_of(judged_collisions(connection), 3))
     connection.execute(POSED)
-    connection.execute(SAID, columns_of(map(_said, records(connection, DRIVERS, ())), 3))
+    connection.execute(SAID, columns_of(map(_labels, records(connection, DRIVERS, ())), 3))
     others = other_models(connection)
     connection.execute((LISTED + ";" + OF_TRIALS).format(others=sql_of(others)))
     (state,) = records(connection, STATE, ())
@@ -196,7 +196,7 @@ def list_trials(copy: Copy) -> Listing:
 def judged_collisions(
     connection: duckdb.DuckDBPyConnection,
 ) -> list[tuple[str, str, str | None]]:
-    """Each trial that collided, with its spec and how it did."""
+    """Return each trial that collided, with its spec and the class of the collision."""
     return [
         (row["trial_id"], row["spec_hash"], _collision(row))
         for row in records(connection, COLLIDED, ())
@@ -204,12 +204,12 @@ def judged_collisions(
 
 
 def columns_of(rows: Iterable[Sequence[object]], number: int) -> list[list[object]]:
-    """The columns of rows, also where there are none."""
+    """Return the columns of rows, also where there are no rows."""
     return [list(column) for column in zip(*rows, strict=True)] or [[] for _ in range(number)]
 
 
-def _said(row: Row) -> tuple[int, str | None, str | None]:
-    """Who answered instead of a model, and who cannot react, of trials of one spec."""
+def _labels(row: Row) -> tuple[int, str | None, str | None]:
+    """Return the place of a spec, its trials' mock model, and their drivers that cannot react."""
     spec = json.loads(row["spec"])
     models = language_models({side: row[side] for side in SIDES}, spec)
     posed = stand_in(models, row["sides"]) if row["sides"] else None
@@ -217,7 +217,7 @@ def _said(row: Row) -> tuple[int, str | None, str | None]:
 
 
 def _collision(row: Row) -> str | None:
-    """How a trial collided; None where its spec cannot be read, which the audit tells."""
+    """Return the class of a collision; None where its spec cannot be read, an audit finding."""
     with suppress(ValidationError):
         course = Course(
             _task(row["source"], row["spec"]),
@@ -232,5 +232,5 @@ def _collision(row: Row) -> str | None:
 
 @lru_cache
 def _task(source: str, spec: str) -> ScenarioConfig:
-    """What the trials of a spec were driven by: there are few specs, and many trials."""
+    """Return the scenario of a spec; cached, since there are few specs and many trials."""
     return scenario_of(source, json.loads(spec).get("scenario"))

@@ -29,7 +29,7 @@ SHAPES = {SHOWN: "like", WEAKER: "weaker", STRONGER: "stronger", UNLIKE: "unlike
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """Where a value, its interval and 0 lie, and a shape; one outside the axis is an arrow."""
+    """A value on an axis with its shape, its interval and 0; outside the axis it is an arrow."""
 
     shape: str
     at: float | None
@@ -40,7 +40,7 @@ class Mark:
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """One verdict as a page shows it; ``words`` is it in full, with what is to be known of it."""
+    """A verdict as a page shows it; ``words`` has it in full, with its note."""
 
     measure: Measure
     values: Values
@@ -52,13 +52,13 @@ class Cell:
 
 
 def place(measure: Measure, value: float) -> float:
-    """The place of a value on a measure's axis in percent; beyond it is its end."""
+    """Return the place of a value on a measure's axis in percent; values beyond lie at its end."""
     low, high = measure.ends
     return round(min(max(100 * (value - low) / (high - low), 0.0), 100.0), 2)
 
 
 def mark(measure: Measure, values: Values) -> Mark | None:
-    """The mark of a verdict; None without a value or an interval."""
+    """Return the mark of a verdict; None without a value or an interval."""
     value, ci, (low, high) = values.get("estimate"), values.get("ci"), measure.ends
     ends = None if ci is None else (place(measure, ci[0]), place(measure, ci[1]))
     if value is None:
@@ -69,7 +69,7 @@ def mark(measure: Measure, values: Values) -> Mark | None:
 
 
 def rate(count: int, of: int) -> Mark:
-    """The mark of a share on an axis from 0 to 100 %, with its score interval; empty of none."""
+    """Return the mark of a share from 0 to 100 %, with its score interval; empty for 0 trials."""
     if not of:
         return Mark("", None, None)
     low, high = wilson(count / of, of)
@@ -77,17 +77,17 @@ def rate(count: int, of: int) -> Mark:
 
 
 def band(measure: Measure, human: Values) -> Mark:
-    """The humans' interval and value on the axis, and 0 where the axis has it inside."""
+    """Return the humans' value and interval on the axis, and 0 where it lies inside."""
     value, (low, high) = human.get("estimate"), measure.ends
     if measure.margin is not None and human.get("ci") is None and value is not None:
         human = {**human, "ci": (value - measure.margin, value + measure.margin)}
-    placed = mark(measure, human) or Mark("", None, None)
+    human_mark = mark(measure, human) or Mark("", None, None)
     zero = place(measure, 0.0) if low < 0 < high else None
-    return replace(placed, zero=zero)
+    return replace(human_mark, zero=zero)
 
 
 def measures_of(rows: Iterable[Row]) -> dict[str, Measure]:
-    """The measures of these verdicts: the axis of a share that goes beyond its end is all of it."""
+    """Return the measures of these verdicts; a share beyond its axis gets one up to 100 %."""
     measures = dict(MEASURES)
     for row in rows:
         measure, value = measures.get(str(row.values.get("measure"))), row.values.get("estimate")
@@ -99,7 +99,7 @@ def measures_of(rows: Iterable[Row]) -> dict[str, Measure]:
 
 
 def cells(verdicts: dict[str, Values], measures: Mapping[str, Measure]) -> dict[str, Cell]:
-    """The verdicts of a driver and prompt by measure; empty where it is not judged."""
+    """Return the verdicts of a driver and prompt by measure; empty where it is not judged."""
     if "" in verdicts:
         return {}
     return {name: _cell(measures[name], values) for name, values in verdicts.items()}
@@ -109,7 +109,7 @@ def _cell(measure: Measure, values: Values) -> Cell:
     value, ci = values.get("estimate"), values.get("ci")
     word = verdict_word(values) if values.get("kind") != "humans" else ""
     whole = share(values) if values.get("undecided") else with_interval(value, ci)
-    said = [f"{whole} {measure.unit}", word, f"n = {values['n']}", values["note"]]
+    parts = [f"{whole} {measure.unit}", word, f"n = {values['n']}", values["note"]]
     return Cell(
         measure,
         values,
@@ -117,5 +117,5 @@ def _cell(measure: Measure, values: Values) -> Cell:
         share(values) if values.get("undecided") else number(value),
         brackets(ci),
         word,
-        "; ".join(filter(None, said)),
+        "; ".join(filter(None, parts)),
     )

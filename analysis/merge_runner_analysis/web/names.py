@@ -1,4 +1,4 @@
-"""What the names on a page mean: of programs, servers, pairs, settings and sample sets."""
+"""Meanings of the names on a page: programs, servers, pairs, settings, sample sets."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ PARTS = (
 
 
 def programs_of(specs: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """The programs that drive in trials of these specs, as ``PLAYED`` has them."""
+    """Return the programs that drive in trials of these specs, as ``PLAYED`` has them."""
     sides = (spec.get(side) or {} for spec in specs for side in SIDES)
     return [side for side in sides if "program" in side]
 
 
 def short_names(names: Sequence[str]) -> dict[str, str]:
-    """Each name as it is shown: without its server where no other one is then called so."""
+    """Return each name as it is shown: without its server where that stays unique."""
     short = [*map(without_endpoint, names)]
     return {
         name: brief if short.count(brief) == 1 else name
@@ -44,7 +44,7 @@ def short_names(names: Sequence[str]) -> dict[str, str]:
 
 
 def names_mean(programs: Iterable[Mapping[str, Any]], drivers: Iterable[str]) -> dict[str, str]:
-    """What programs do, by name, and what the parts of the drivers' names say."""
+    """Return the meanings of programs, and of the parts of drivers' names."""
     meanings = {of["program"]: program_text(of["program"], of.get("based_on")) for of in programs}
     for name in drivers:
         for pattern, meaning in PARTS:
@@ -53,11 +53,11 @@ def names_mean(programs: Iterable[Mapping[str, Any]], drivers: Iterable[str]) ->
 
 
 def program_text(name: str, based_on: str | None = None) -> str:
-    """What a program does, as far as what registers it is loaded here."""
+    """Describe a program, as far as its plug-in is loaded here."""
     if (program := PROGRAMS.get(name)) is not None:
         doc = (getdoc(program.driver) or "").partition("\n")[0].rstrip(".")
-        said = program.meaning or doc or "a driver of a plug-in, which does not say what it does"
-        return f"a program: {said}"
+        text = program.meaning or doc or "a driver of a plug-in, which does not say what it does"
+        return f"a program: {text}"
     if based_on and based_on in PROGRAMS:
         return f"a program, otherwise set than usual: {PROGRAMS[based_on].meaning}"
     return f"{based_on} otherwise set" if based_on else "a driver of this study's own plug-in"

@@ -1,4 +1,4 @@
-"""What readers note of trials and decisions: lines of a file beside the database, never in it.
+"""Notes on trials and decisions: lines of a file beside the database, never in it.
 
 Lines are only added, so that two explorers may write at once and nothing is lost.
 """
@@ -26,7 +26,7 @@ TAG = re.compile(r"(?<!\w)#(\w[\w-]*)")
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """What a reader noted, of a trial or, with ``side`` and ``decision``, of a decision.
+    """A reader's note on a trial or, with ``side`` and ``decision``, on a decision.
 
     The spec says which trial is meant in a copy of the study, too. ``#words`` of the text are tags.
     """
@@ -54,7 +54,7 @@ class Kept:
     notes: tuple[Note, ...] = ()
     damage: tuple[str, ...] = ()
     tags: tuple[tuple[str, str, str], ...] = ()
-    """Of each trial and its decisions: (trial, spec, tag), each once."""
+    """(trial, spec, tag) of each trial and its decisions, each once."""
 
 
 class Notes:
@@ -65,7 +65,7 @@ class Notes:
         self.reader = reader
 
     def kept(self) -> Kept:
-        """What the file holds now: the same object while the file is the same."""
+        """Return the content of the file: the same object while the file is the same."""
         try:
             stat = self.path.stat()
             return _parsed(self.path, (stat.st_ino, stat.st_mtime_ns, stat.st_size))
@@ -75,7 +75,7 @@ class Notes:
             return Kept(damage=(f"{self.path.name} cannot be read: {exc.strerror}",))
 
     def of(self, trial_id: str, spec_hash: str) -> list[Note]:
-        """The notes of a trial."""
+        """Return the notes of a trial."""
         at = trial_id, spec_hash
         return [note for note in self.kept().notes if (note.trial_id, note.spec_hash) == at]
 
@@ -106,7 +106,7 @@ class Notes:
 
 @lru_cache(1)
 def _parsed(path: Path, _: tuple[int, ...]) -> Kept:
-    """What a file with this stamp holds; raises OSError."""
+    """Return the content of a file with this stamp; raises OSError."""
     notes, damage = [], []
     for number, line in enumerate(path.read_bytes().splitlines(), 1):
         try:
@@ -121,7 +121,7 @@ def _parsed(path: Path, _: tuple[int, ...]) -> Kept:
 
 
 def reader_of(given: str | None) -> str:
-    """Who writes: the name that is given, or the system's; raises UsageError."""
+    """Return the reader's name: the given one, or the system's; raises UsageError."""
     try:
         name = " ".join((getpass.getuser() if given is None else given).split())
     except (KeyError, OSError):  # the system knows no name, as in some containers

@@ -23,13 +23,13 @@ def linked(page: str) -> str:
     return page.replace(' href=""', "")
 
 
-def site_of_a_page(db: Path, held: Collection[tuple[str, str]]) -> Site:
+def site_of_a_page(db: Path, trials: Collection[tuple[str, str]]) -> Site:
     """Return a site for one page, which links to those trials alone that it holds: name, spec."""
 
     def leads(address: str) -> str:
         parts = urlsplit(address)
         trial, asked = unquote(parts.path.removeprefix("/trials/")), dict(parse_qsl(parts.query))
-        is_there = (trial, asked.get("spec", "")) in held
+        is_there = (trial, asked.get("spec", "")) in trials
         return query_of({"trial": trial, **asked}) if is_there else ""
 
     inlined = inlined_texts([STYLE, *SCRIPTS])
@@ -45,7 +45,7 @@ def page_of_trials(site: Site, rows: Sequence[Row]) -> str:
         # Rendered by templates of ours.
         trials = zip(rows, map(Markup, pages), strict=True)
         page = site.render(
-            "several.html", here="trials", held=list(trials), scripts=[*REPLAY, "single.js"]
+            "several.html", view="trials", trials=list(trials), scripts=[*REPLAY, "single.js"]
         )
     refuse_leaks(site.db, "the page", page)
     return linked(page)

@@ -48,7 +48,7 @@ class Likeness:
 
 
 def likeness_of(driver: Driver) -> dict[str, Likeness]:
-    """The likeness of a driver by measure; empty where it is not judged."""
+    """Return the likeness of a driver by measure; empty where it is not judged."""
     return {name: _likeness(driver.cells[name]) for name in HEADINGS if name in driver.cells}
 
 
@@ -80,7 +80,7 @@ def _likeness(cell: Cell) -> Likeness:
 
 
 def people_of(conditions: Mapping[str, Any], human: Mapping[str, Any]) -> dict[str, str]:
-    """What people did in these conditions, by measure: counts with share and 95 % interval."""
+    """Return people's results in these conditions, by measure: k of n, share, 95 % interval."""
     rows = [
         (HUMAN_CONDITIONS[name], cell)
         for name, cell in zip(conditions["names"], conditions["humans"], strict=True)

@@ -9,7 +9,7 @@ from merge_runner.prompts.blocks import BLOCKS, Variant
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 UNKNOWN = "no meaning is known here"
-# What is stored, in the words of a page; what is not here is shown as it is.
+# Stored names in the words of a page; other names are shown as they are.
 PLAIN = {
     "collided": "crashed",
     "timeout": "timed out",
@@ -38,13 +38,13 @@ PLAIN = {
 
 
 def called(study: str, config: Mapping[str, Any]) -> str:
-    """A run of a study by the name that its user gave it, and that of the study."""
+    """Return a run's title: the name that its user gave it, and its study's."""
     run_name = config.get("run_name")
     return f"{run_name} ({study})" if run_name else study
 
 
 def condition_text(headway: float, velocity: float) -> str:
-    """A condition in words, from its projected headway in m and its relative velocity in m/s."""
+    """Describe a condition by its projected headway in m and its relative velocity in m/s."""
     if headway == 0:
         ahead = "both would reach the merge point together"
     else:
@@ -57,13 +57,13 @@ def condition_text(headway: float, velocity: float) -> str:
 
 
 def ordered(names: Iterable[str]) -> list[str]:
-    """Conditions in their usual order, those that no human drove last."""
+    """Return conditions in their usual order, those without human data last."""
     places = {name: place for place, name in enumerate(HUMAN_CONDITIONS)}
     return sorted(names, key=lambda name: (places.get(name, len(places)), name))
 
 
 def changes_text(variant: Variant, shown: Callable[[str], str]) -> str:
-    """What a variant's prompt leaves out and adds, each block as it is to be shown."""
+    """Describe the blocks that a variant's prompt leaves out and adds, each as ``shown``."""
     return " and ".join(
         f"{word} {', '.join(shown(name) for name in sorted(names))}"
         for word, names in (("without", variant.removes), ("with", variant.adds))
@@ -72,7 +72,7 @@ def changes_text(variant: Variant, shown: Callable[[str], str]) -> str:
 
 
 def block_meaning(name: str) -> str:
-    """What a block of a prompt is for."""
+    """Return the purpose of a block of a prompt."""
     block = BLOCKS.get(name)
     if block is None and "=" in name:
         return "words of the study"
@@ -80,7 +80,7 @@ def block_meaning(name: str) -> str:
 
 
 def plain(value: str) -> str:
-    """A stored name in the words of a page; of a cause what it is of, and why."""
+    """Return a stored name in the words of a page; for a cause its kind and reason."""
     kind, _, name = value.partition(": ")
     if kind == "plan":
         return PLAIN.get(name, name)
@@ -90,20 +90,20 @@ def plain(value: str) -> str:
 
 
 def causes_text(causes: Iterable[tuple[str, int]]) -> str:
-    """Causes of errors and how many times each: ``2 replies without a valid plan: ...; ...``."""
-    plans, said = dict[str, int](), []
+    """Return causes of errors with counts: ``2 replies without a valid plan: ...; ...``."""
+    plans, texts = dict[str, int](), []
     for value, times in causes:
         if value.startswith("plan: "):
             plans[plain(value)] = times
         else:
-            said.append(plain(value) if times == 1 else f"{plain(value)}, {times} times")
+            texts.append(plain(value) if times == 1 else f"{plain(value)}, {times} times")
     if plans:
         count = sum(plans.values())
         replies = "reply" if count == 1 else "replies"
-        said.insert(0, f"{count} {replies} without a valid plan: {', '.join(plans)}")
-    return "; ".join(said)
+        texts.insert(0, f"{count} {replies} without a valid plan: {', '.join(plans)}")
+    return "; ".join(texts)
 
 
 def clock(time_s: float) -> str:
-    """A time in seconds, to a tenth or, where that is not exact, a hundredth."""
+    """Return a time in seconds, to a tenth or, where that is not exact, a hundredth."""
     return f"{time_s:.1f}" if abs(time_s - round(time_s, 1)) < 1e-6 else f"{time_s:.2f}"

@@ -19,9 +19,9 @@ SPARK_WIDTH, SPARK_HEIGHT = 96.0, 22.0
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Where values lie in a picture: ``low`` at ``from_``, ``high`` at ``to``, others between.
+    """A linear scale of a picture: ``low`` at ``from_``, ``high`` at ``to``.
 
-    What lies beyond is drawn at the edge.
+    Values beyond are drawn at the edge.
     """
 
     low: float
@@ -30,13 +30,13 @@ class Scale:
     to: float
 
     def __call__(self, value: float) -> float:
-        """The place of a value."""
+        """Return the place of a value."""
         inside = min(max(value, self.low), self.high)
         return self.from_ + (self.to - self.from_) * (inside - self.low) / (self.high - self.low)
 
 
 def speed_range(rows: Sequence[Row]) -> tuple[int, int]:
-    """The whole m/s at the bottom and the top of all sparklines of these trials."""
+    """Return the whole m/s at the bottom and the top of all sparklines of these trials."""
     every = [end for row in rows for side in SIDES for end in row[f"{side}_range_mps"] or ()]
     ends = [end for end in every if end is not None]  # a vehicle may have no samples
     low = floor(min(ends, default=0.0))
@@ -44,7 +44,7 @@ def speed_range(rows: Sequence[Row]) -> tuple[int, int]:
 
 
 def sparkline(row: Row, speeds: tuple[int, int]) -> dict[str, str] | None:
-    """The speeds of both vehicles: points of two lines, and in words.
+    """Return the speeds of both vehicles: points of two lines, and in words.
 
     None where a vehicle has none.
     """
@@ -67,13 +67,13 @@ def _spark_points(values: Sequence[float], speeds: tuple[int, int]) -> str:
 
 @lru_cache(64)
 def _spark_pattern(points: int) -> str:
-    """So many points with their places across, to be filled with those down."""
+    """Return a pattern of points with their places across, to be filled with those down."""
     across = SPARK_WIDTH / max(points - 1, 1)
     return " ".join(f"{i * across:.0f},%.1f" for i in range(points))
 
 
 def step_points(values: Sequence[float], width: float, height: float, steps: int) -> str:
-    """Points of a step line from -1 to 1, ``steps`` across the width."""
+    """Return the points of a step line from -1 to 1, ``steps`` across the width."""
     across = _steps_across(len(values), width, steps)
     down = [f"{height - height * (min(max(v, -1), 1) + 1) / 2:.1f}" for v in values]
     return " ".join([f"{across[i]},{y} {across[i + 1]},{y}" for i, y in enumerate(down)])
@@ -85,5 +85,5 @@ def _steps_across(values: int, width: float, steps: int) -> list[str]:
 
 
 def accelerations(values: Sequence[float], most_mps2: float) -> str:
-    """The accelerations of a plan in m/s², one after another."""
+    """Return the accelerations of a plan in m/s², one after another."""
     return "".join([f"{value * most_mps2:+.2f} " for value in values]).replace("-", MINUS)

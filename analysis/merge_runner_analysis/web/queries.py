@@ -20,11 +20,11 @@ from merge_runner_analysis.web.database_copy import Copies
 from merge_runner_analysis.web.display_text import csv_cell, text_of
 
 AT_ONCE = 2
-WAITING = 8  # beside those that run: each keeps a thread of the server
+WAITING = 8  # in addition to those that run: each keeps a thread of the server
 LONGEST_S = 10.0
 LONGEST = 10_000  # characters of a query
 MEMORY_MB = 512
-# What is shown of a result: rows, characters of a cell, and of all cells with what each costs.
+# Shown of a result: rows, characters of a cell, and of all cells with what each costs.
 ROWS, TEXT, SIZE, CELL_COSTS = 1_000, 2_000, 5_000_000, 30
 DOWNLOADED_ROWS, DOWNLOADED = 100_000, 50_000_000  # the second are characters
 AGAIN_S = 0.1  # a query that is about to begin forgets that it was to end
@@ -35,7 +35,7 @@ Cell = tuple[str, int] | None
 
 @dataclass(frozen=True, slots=True)
 class QueryResult:
-    """What a query found: names and types of columns, and rows; with ``more`` there are others."""
+    """Result of a query: names and types of columns, and rows; with ``more`` it is cut."""
 
     columns: list[tuple[str, str]]
     rows: list[list[Cell]]
@@ -44,7 +44,7 @@ class QueryResult:
 
 
 class Queries:
-    """Runs queries on one database, each for so many seconds at most."""
+    """Runner of queries on one database, each for ``longest_s`` at most."""
 
     def __init__(self, copies: Copies, longest_s: float = LONGEST_S) -> None:
         self._copies = copies
@@ -53,12 +53,12 @@ class Queries:
         self._places = threading.Semaphore(AT_ONCE + WAITING)
 
     def result(self, sql: str) -> QueryResult:
-        """What a query finds, as much of it as is shown; raises UsageError."""
+        """Return the result of a query, as much of it as is shown; raises UsageError."""
         began, size, rows = time.monotonic(), 0, list[list[Cell]]()
-        with self._answering(sql) as found:
-            columns = [(name, str(kind)) for name, kind, *_ in found.description]
+        with self._answering(sql) as cursor:
+            columns = [(name, str(kind)) for name, kind, *_ in cursor.description]
             more = False
-            for row in fetched(found):
+            for row in fetched(cursor):
                 texts = map(text_of, row)
                 cells = [t if t is None else (t[:TEXT], max(0, len(t) - TEXT)) for t in texts]
                 size += sum(CELL_COSTS + len(cell[0] if cell else "") for cell in cells)
@@ -69,15 +69,15 @@ class Queries:
         return QueryResult(columns, rows, more, time.monotonic() - began)
 
     def csv(self, sql: str) -> str:
-        """All that a query finds; raises UsageError, also where it is more than a download holds.
+        """Return the whole result of a query; raises UsageError, also where it is too large.
 
         A file that ended early would be taken for the whole.
         """
         lines = io.StringIO()
         writer = csv_writer(lines)
-        with self._answering(sql) as found:
-            writer.writerow(in_spreadsheet(name) for name, *_ in found.description)
-            for number, row in enumerate(fetched(found), start=1):
+        with self._answering(sql) as cursor:
+            writer.writerow(in_spreadsheet(name) for name, *_ in cursor.description)
+            for number, row in enumerate(fetched(cursor), start=1):
                 writer.writerow(map(csv_cell, row))
                 if number > DOWNLOADED_ROWS or lines.tell() > DOWNLOADED:
                     raise UsageError(
@@ -109,17 +109,17 @@ class Queries:
 
             threading.Thread(target=stop, daemon=True).start()
             try:
-                with answering(connection, sql) as found:
-                    yield found
+                with answering(connection, sql) as cursor:
+                    yield cursor
             # Python has no values for some of DuckDB's, such as intervals of millions of years.
             except (MergeRunnerError, duckdb.Error, OverflowError, ValueError) as exc:
                 # With the candidates and the place that DuckDB names, without its stack trace.
-                said = str(exc).partition("\n\nStack Trace")[0].strip()
+                message = str(exc).partition("\n\nStack Trace")[0].strip()
                 if isinstance(exc.__cause__ or exc, duckdb.OutOfMemoryException):
-                    said = f"the query needed more than {MEMORY_MB} MB"
+                    message = f"the query needed more than {MEMORY_MB} MB"
                 if late.is_set():
-                    said = f"stopped after {self.longest_s:g} s"
-                raise UsageError(said) from exc
+                    message = f"stopped after {self.longest_s:g} s"
+                raise UsageError(message) from exc
             finally:
                 ended.set()
 

@@ -52,7 +52,7 @@ from merge_runner_analysis.wording import (
     p_value,
 )
 
-# Of a scripted stand-in, why both levels have the same trials.
+# Reason for equal trials at both levels with a mock model.
 UNREAD = "not tested: the scripted stand-in does not read it, and no effect is planted for it"
 PLANTED = "Words act on the stand-in only by effects that the study plants in it."
 # More levels that show nothing are counted, not listed.
@@ -76,7 +76,7 @@ class Change:
     """An effect as a table shows it; ``mark`` is on an axis that ends at ``end`` on both sides."""
 
     name: str
-    said: str
+    detail: str
     reference: Side | None
     level: Side | None
     difference: str
@@ -117,10 +117,10 @@ class Answer:
 
 
 def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
-    """The answer; None where no table is there, or the study asks about no factor."""
+    """Return the answer; None without a table, or where the study asks about no factor."""
     if effects is None or levels is None:
         return None
-    # Of a driver that is not judged there is a row without values.
+    # A driver that is not judged has a row without values.
     known = [row for row in levels.rows if row.values.get("factor")]
     sides = {row.id: row for row in known}
     claim, rest = answered(effects.rows)
@@ -129,7 +129,7 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
     asked = [row for row in effects.rows if row.values.get("primary")]
     primary = min(asked, key=lambda row: value_of(row, "p") if is_tested(row) else 1.0)
     metric = metric_of(primary)
-    own = [row for row in effects.rows if metric_of(row) == metric]
+    of_metric = [row for row in effects.rows if metric_of(row) == metric]
     named = {LEFT_FIRST.name, COLLISIONS.name, GAP.name, RMSE.name}
     others = [
         row
@@ -150,7 +150,7 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
             _crossing_of(shown), [r for r in shown if len(factors_of(r)) > 1], shapes, metric
         ),
     ]
-    tested = [row for row in own if is_tested(row)]
+    tested = [row for row in of_metric if is_tested(row)]
     names = _factors(asked)
     return Answer(
         f"{'Does' if len(names) == 1 else 'Do'} {joined(names)} change {_changed(primary)}?",
@@ -173,11 +173,11 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
 
 
 def answered(rows: Sequence[Row]) -> tuple[str, str]:
-    """The answer in a sentence, and the rest; empty where no primary test was made.
+    """Return the answer in a sentence, and the rest; empty where no primary test was made.
 
     The claim is the surest of the primary tests whose corrected p is below 5 %; where there is
-    none it says so, and the rest what could have been seen. It is of scripted stand-ins only where
-    there is no other driver, and then says so.
+    none it says so, and the rest what could have been seen. It is of mock models only where there
+    is no other driver, and then says so.
     """
     # Where models alone vary, their comparison answers.
     rows = [row for row in rows if not (row.values["factor"] == MODEL and row.values["primary"])]
@@ -213,7 +213,7 @@ def answered(rows: Sequence[Row]) -> tuple[str, str]:
     unshown = [row for row in primary if row not in sure]
     rest += _not_shown(unshown)
     rest += [UNCORRECTED] * any(map(is_uncorrected, unshown[:FEW]))
-    rest += [f"{capital(said)}." for said in copied]
+    rest += [f"{capital(text)}." for text in copied]
     if not sure:
         rest.append(_seen(primary))
     crossed = [
@@ -231,13 +231,13 @@ def answered(rows: Sequence[Row]) -> tuple[str, str]:
 
 
 def _seen_first(row: Row) -> int:
-    """The place of an effect's measure: what a person sees at once comes first."""
+    """Return the rank of an effect's measure: the most visible one is the first."""
     seen = (COLLISIONS.name, GAP.name, RMSE.name)
     return seen.index(metric_of(row)) if metric_of(row) in seen else len(seen)
 
 
 def _not_shown(rows: Sequence[Row]) -> Iterator[str]:
-    """The primary tests that show nothing, by their p; of more than FEW the first one alone."""
+    """Yield sentences on primary tests without an effect; of more than FEW the first alone."""
     if len(rows) > FEW:
         yield (
             f"{len(rows)} levels are not shown to change it; {level_text(rows[0])} comes nearest: "
@@ -249,25 +249,25 @@ def _not_shown(rows: Sequence[Row]) -> Iterator[str]:
 
 
 def _interactions(rows: Sequence[Row], drawn: set[str]) -> str:
-    """Of two factors whose combinations are drawn, whether they interact."""
+    """Describe the interactions of factors whose combinations are drawn."""
     crossed = {name for names in drawn if TIMES in names for name in names.split(TIMES)}
-    said = []
+    texts = []
     for row in rows:
         if is_interaction(row) and crossed >= {*str(row.values["factor"]).split(TIMES)}:
             what = "they interact" if is_shown(row) else "no interaction is shown"
-            said.append(f"{row.values['factor']}: {what}, {test_text(row)}.")
-    return " ".join(said)
+            texts.append(f"{row.values['factor']}: {what}, {test_text(row)}.")
+    return " ".join(texts)
 
 
 def _could(rows: Sequence[Row]) -> str:
-    """What the tests of the primary measure could have seen, of factors and of interactions."""
+    """Return the minimum detectable effects of the primary measure, in sentences."""
     main = [row for row in rows if row.values.get("primary")]
     crossed = [row for row in rows if is_interaction(row)]
     return " ".join(filter(None, (_seen(main), _seen(crossed, "An interaction"))))
 
 
 def _seen(rows: Sequence[Row], what: str = "A change") -> str:
-    """``A change of 4.26 points by hurry, 5.05 by opponent or more would have been seen ...``.
+    """Return ``A change of 4.26 points by hurry, 5.05 by opponent or more would have been ...``.
 
     Of a factor with several levels it is the largest, and of more than FEW factors, too.
     """
@@ -290,7 +290,7 @@ def _factors(rows: Iterable[Row]) -> list[str]:
 
 
 def _both(row: Row) -> str:
-    """``in the same situations, the driver goes first in 63.00 % with hurry=yes and ...``."""
+    """Return ``in the same situations, the driver goes first in 63.00 % with hurry=yes ...``."""
     factor, level, base = (row.values[name] for name in ("factor", "level", "reference"))
     of, reference = (estimate_text(row, name) for name in ("estimate", "estimate_reference"))
     if metric_of(row) == LEFT_FIRST.name:
@@ -302,14 +302,14 @@ def _both(row: Row) -> str:
 
 
 def _called(factor: object, level: object) -> str:
-    """A level as a reader knows it: ``self`` is another copy of the same driver."""
+    """Return a level as a page names it: ``self`` is another copy of the same driver."""
     if factor == OPPONENT and level == SELF:
         return f"{SELF} (another copy of the same driver)"
     return title_of(str(level)) if factor == PROMPT else str(level)
 
 
 def _changed(row: Row) -> str:
-    """``who goes first``: an effect's measure as a claim names it."""
+    """Return an effect's measure as a claim names it: ``who goes first``."""
     return CHANGED.get(metric_of(row), name_of(row))
 
 
@@ -318,7 +318,7 @@ def _named(row: Row) -> str:
 
 
 def _changes(rows: Sequence[Row], sides: dict[str, Row], primary: str) -> list[Change]:
-    """The effects with both sides of each; those of a measure have one axis."""
+    """Return the effects with both sides of each; those of a measure have one axis."""
     ends: dict[str, float] = {}
     for row in rows:
         values = (value_of(row, "difference"), *(interval_of(row) or ()))
@@ -344,18 +344,21 @@ def _change(row: Row, sides: dict[str, Row], end: float, primary: str) -> Change
         )
         for name, side in (("estimate_reference", f"{base}{mark}"), ("estimate", of))
     )
-    said = ""
-    if is_interaction(row):  # whose id has the level of the other factor, too
-        one, other = factor.split(TIMES)
+    detail = ""
+    if is_interaction(row):  # whose id has the level of the second factor, too
+        first, second = factor.split(TIMES)
         level_name, at = str(of).split(TIMES)
         otherwise = str(base).split(TIMES)[1]
-        said = f"effect of {one}={level_name} with {other}={at}, less that with {other}={otherwise}"
-    said = said or (_called(factor, of) if is_own else f"{factor}: {_called(factor, of)}")
+        detail = (
+            f"effect of {first}={level_name} with {second}={at}, less that with "
+            f"{second}={otherwise}"
+        )
+    detail = detail or (_called(factor, of) if is_own else f"{factor}: {_called(factor, of)}")
     if is_own and row.values.get("primary"):
-        said += ", primary test"
+        detail += ", primary test"
     return Change(
         capital(factor) if is_own else capital(name_of(row)),
-        said,
+        detail,
         reference,
         level,
         f"{difference_text(row)} {unit_of(row)}",
@@ -369,7 +372,7 @@ def _change(row: Row, sides: dict[str, Row], end: float, primary: str) -> Change
 
 
 def _side(side: Side, counts: Row | None, is_own: bool, metric: str) -> Side:
-    """One side of an effect, with its counts by a row of ``levels``."""
+    """Return one side of an effect, with its counts by a row of ``levels``."""
     columns = ("k", "n") if is_own else ("crashed", "ended")
     if counts is None or not (is_own or metric == COLLISIONS.name):
         return side
@@ -378,13 +381,13 @@ def _side(side: Side, counts: Row | None, is_own: bool, metric: str) -> Side:
 
 
 def _untested(effects: Sequence[Row]) -> set[str]:
-    """The factors of which every level has the trials of its reference."""
+    """Return the factors of which every level has the trials of its reference."""
     asked = [row for row in effects if row.values.get("primary")]
     return {*_factors(asked)} - {*_factors(row for row in asked if not is_copied(row))}
 
 
 def _crossing_of(levels: Sequence[Row]) -> str:
-    """``In combination: hurry, persona``."""
+    """Return ``In combination: hurry, persona``."""
     crossed = [str(row.values["factor"]) for row in levels if len(factors_of(row)) > 1]
     return f"In combination: {', '.join(crossed[0].split(TIMES))}" if crossed else ""
 
@@ -403,7 +406,7 @@ def _counted(levels: Sequence[Row], metric: str) -> str:
 
 
 def _of_one_factor(levels: Sequence[Row], drivers: Sequence[str]) -> list[Row]:
-    """The rows of the first drawn factor's levels, of all ``drivers``: every trial once."""
+    """Return the rows of the first drawn factor's levels, of all ``drivers``: every trial once."""
     drawn = [
         row
         for row in levels

@@ -41,5 +41,5 @@ def reading(db: Path, patience_s: float = PATIENCE_S) -> Iterator[duckdb.DuckDBP
 def records(
     connection: duckdb.DuckDBPyConnection, sql: str, values: Mapping[str, object] | Sequence[object]
 ) -> list[Row]:
-    """The rows of a query, by the names of their columns."""
+    """Return the rows of a query, by the names of their columns."""
     return list(by_name(connection.execute(sql, values)))

@@ -30,8 +30,8 @@ from merge_runner_analysis.wording import (
 
 TEMPLATES, STATIC = (Path(__file__).with_name(name) for name in ("templates", "static"))
 STYLE = "style.css"
-# What all templates call, without a word of where it is.
 METHODS = frozenset(dir(dict))
+# Templates whose macros every template may call, without an import.
 MACROS = ("scope", "words", "computed", "mark", "conditions", "trust", "notes", "table")
 
 

@@ -48,16 +48,16 @@ from merge_runner_analysis.web.scope import DESCRIPTIONS
 from merge_runner_analysis.web.urls import Links
 from merge_runner_analysis.wording import HUMANS, LANGUAGE_MODEL, TABLE, number, sentences
 
-# What each variant asks first: of all of them in the same condition, as far as that was played.
+# The first prompt of each variant, all of the same condition as far as that was played.
 PROMPTS = """
 SELECT variant, spec_hash, arg_min(prompt, (condition, decisions.side, trial_id)) AS prompt
 FROM decisions JOIN trials USING (trial_id, spec_hash)
 WHERE decision = 0 AND prompt IS NOT NULL GROUP BY variant, spec_hash
 ORDER BY min((condition, decisions.side, trial_id)) DESC
 """
-# At most so many trials are listed for a row: a page with all of them would be unwieldy.
+# Trials listed for a row: a page with all of them would be unwieldy.
 LISTED = 300
-# Of each alarm so many findings stand open, and these tables of a study with factors.
+# Findings of an alarm that stand open, and the open tables of a study with factors.
 FEW, ANSWERING = 3, ("effects", "levels")
 # The share of a group's decisions above which an alarm is raised: a convention.
 MANY_FALLBACKS = 0.05
@@ -110,7 +110,7 @@ def write_report(
 
 
 def finished_figures(study: Study, say: Callable[[str], object] = str) -> dict[str, str]:
-    """Every figure by name as SVG in Base64: read from the database where stored, else drawn."""
+    """Return every figure by name as SVG in Base64: the stored one, else a new drawing."""
     files = {f"{name}.svg": name for name in FIGURES}  # a table may have the name alone
     stored = finished(study.db, study.state, study.options, list(files))
     drawn = {}
@@ -124,7 +124,7 @@ def finished_figures(study: Study, say: Callable[[str], object] = str) -> dict[s
 
 
 def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> str:
-    """The report as one HTML document; ``figures`` maps names to SVG in Base64."""
+    """Return the report as one HTML document; ``figures`` maps names to SVG in Base64."""
     # Rows with equal sources share a number.
     numbers: dict[tuple[Source, ...], int] = {}
     links: dict[tuple[str, str], str] = {}
@@ -192,7 +192,7 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
 
 
 def _apart(study: Study) -> Comparison | None:
-    """How two drivers differ, where just two are judged that had the prompt all are compared by."""
+    """Return the comparison of two drivers, where just two had the reference prompt."""
     groups = [group for group in study.models if group.setting == study.reference]
     if len(groups) != 2:
         return None
@@ -203,7 +203,7 @@ def _apart(study: Study) -> Comparison | None:
 
 
 def _once(tables: Iterable[Mapping[str, Any]]) -> dict[str, list[str]]:
-    """The notes of each table by its name, without those of a table before it."""
+    """Return the notes of each table by its name, without those of a table before it."""
     earlier: dict[str, None] = {}
     notes = {}
     for table in tables:
@@ -246,7 +246,7 @@ def design(study: Study) -> tuple[list[str], dict[str, list[str]], dict[str, str
 
 
 def _changes(baseline: str, prompt: str) -> str:
-    """The lines that were taken out (-) and put in (+)."""
+    """Return the lines that were taken out (-) and put in (+)."""
     lines = unified_diff(baseline.splitlines(), prompt.splitlines(), lineterm="", n=0)
     return "\n".join(line for line in lines if not line.startswith(("---", "+++", "@@")))
 
@@ -276,9 +276,9 @@ def _shown(value: object) -> str:
 
 
 def alarms(study: Study, origin: Provenance) -> dict[str, tuple[list[str], str]]:
-    """What casts doubt on the results of a study by title, the worst first.
+    """Return the reasons to doubt the results of a study by title, the worst first.
 
-    Of each the findings, one for each group or run, and what they mean.
+    Each has its findings, one for each group or run, and their meaning.
     """
     findings: dict[str, list[str]] = {title: [] for title in MEANINGS}
     for title, text in _found(study, origin):
@@ -287,7 +287,7 @@ def alarms(study: Study, origin: Provenance) -> dict[str, tuple[list[str], str]]
 
 
 def crashes(study: Study) -> dict[str, dict[str, int]]:
-    """Why the trials of each driver and prompt crashed: how many, by cause, the most first."""
+    """Return the number of crashes of each driver and prompt by cause, the most first."""
     with read_database(study.db) as connection:
         causes = {(name, spec): cause for name, spec, cause in judged_collisions(connection)}
     counted: dict[str, dict[str, int]] = {}
@@ -301,7 +301,7 @@ def crashes(study: Study) -> dict[str, dict[str, int]]:
 
 
 def _repeats(study: Study) -> Iterator[str]:
-    """Which drivers have equal trials, at one level of their factors or at several."""
+    """Yield findings on identical trials, at one level of a driver's factors or at several."""
     by_name: dict[str, list[pd.DataFrame]] = {}
     for group in study.played:
         if not group.scripted:

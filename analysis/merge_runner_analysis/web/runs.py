@@ -1,4 +1,4 @@
-"""The runs of a database: how far each is, whether it can be trusted, what its trials come to."""
+"""Runs of a database: their progress, whether they can be trusted, and their counts."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from merge_runner.audit.checks import not_judged
 from merge_runner.driver_names import both_sides, pair_name
 from merge_runner.paths import DEFAULT_DB, command_at
 from merge_runner.run.progress_file import ProgressSnapshot, read_snapshot
-from merge_runner_analysis.web.catalogue import Catalogue, Wanted
+from merge_runner_analysis.web.catalogue import Catalogue, TrialFilter
 from merge_runner_analysis.web.phrases import called
 from merge_runner_analysis.web.reading import Row
 
 REFUSED = 2
-# Why a run ended early, by its exit code.
+# Reasons for an early end of a run, by exit code.
 REASONS = {
     REFUSED: "the service refused the key or the model, or a setting was wrong",
     3: "the account's quota or --max-cost was used up",
@@ -37,7 +37,7 @@ ENDED_AS = {
 
 
 def list_runs(catalogue: Catalogue) -> list[Row]:
-    """All runs, the newest first; see ``run_of``. Raises what ``Catalogue.refresh`` does."""
+    """Return all runs, the newest first. Raises what ``Catalogue.refresh`` does."""
     runs: list[Row] = []
     # A run notes its end in the database before its file goes: one that seems to be lost may have
     # ended since the rows were read, by whoever refreshed the catalogue since.
@@ -57,18 +57,18 @@ def list_runs(catalogue: Catalogue) -> list[Row]:
     return runs
 
 
-def numbers_of(catalogue: Catalogue, wanted: Wanted) -> Mapping[str, Row]:
-    """What the wanted trials of each run come to, and, without an id, those of all together.
+def numbers_of(catalogue: Catalogue, filters: TrialFilter) -> Mapping[str, Row]:
+    """Return counts of a filter's trials by run; the empty id has those of all together.
 
     Whatever several runs or trials share counts once. A run may have begun since: it has none.
     """
-    (total,) = catalogue.counts({**wanted, "who": ["drivers", "stand-ins"]})
-    counted = {row["sweep"]: row for row in catalogue.counts(wanted, "sweep")}
+    (total,) = catalogue.counts({**filters, "who": ["drivers", "stand-ins"]})
+    counted = {row["sweep"]: row for row in catalogue.counts(filters, "sweep")}
     return defaultdict(lambda: dict.fromkeys(total, 0), {"": total} | counted)
 
 
 def standing_of(catalogue: Catalogue) -> list[Row]:
-    """The runs that go on, or ended early and nobody went on with them; else the newest one.
+    """Return the runs that go on, or ended early without a later run; else the newest one.
 
     One that was refused is no news once its models were asked in a later run of its study. The
     newest come first. Raises what ``Catalogue.refresh`` does.
@@ -86,10 +86,10 @@ def standing_of(catalogue: Catalogue) -> list[Row]:
 
 
 def run_of(row: Row, config: Row, snapshot: ProgressSnapshot | None, later: str = "") -> Row:
-    """A run of a sweep: how far it is, and in a ``text`` whether it can be trusted.
+    """Return a run of a sweep: its progress, and in a ``text`` whether it can be trusted.
 
-    ``row`` has what is stored of it and what its trials come to, ``config`` what it planned, and
-    ``snapshot`` what its process says, None: no file does. It is ``running``, ``checking`` what is
+    ``row`` has its stored values and its counts, ``config`` its plan, and ``snapshot`` the report
+    of its process, None without a file. It is ``running``, ``checking`` what is
     stored, ``lost``, ``finished`` or ``stopped``. ``command``, as it was typed, goes on with it,
     unless a ``later`` run already did. One that is ``followed`` may have news: it may have slept,
     and go on.
@@ -135,7 +135,7 @@ def run_of(row: Row, config: Row, snapshot: ProgressSnapshot | None, later: str 
 
 
 def ended_as(run: Row) -> str:
-    """How a run ended, in a word or two."""
+    """Return how a run ended, in a word or two."""
     if run["state"] == "lost":
         return "cut off"
     if run["state"] != "stopped":
@@ -191,7 +191,7 @@ def assessment_of(run: Row) -> tuple[str, str]:
 
 
 def duration(seconds: float) -> str:
-    """A time span as a reader says it."""
+    """Return a time span in s, min or h."""
     if seconds < 5_400:
         return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
     return f"{seconds / 3600:.1f} h"

@@ -1,4 +1,4 @@
-"""What the numbers of a page are of: a sweep, drivers, a prompt and conditions, in its address."""
+"""Scope of a page's numbers: a sweep, drivers, a prompt and conditions, in its address."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from merge_runner_analysis.web.catalogue import Facets
 from merge_runner_analysis.web.phrases import called, ordered
 from merge_runner_analysis.web.site import SCOPE, NotThere, Site
 
-# What the analysis adds to the names of drivers that have several tasks, prompts or stand-ins.
+# Marks that the analysis adds to names of drivers with several tasks, prompts or mock models.
 MARKS = re.compile(r"( \[([0-9a-f]{8}|scripted)\])+$")
 
-# Of each study that a database holds, the question that it asks.
+# The question of each study in a database.
 DESCRIPTIONS = """
 SELECT config->>'$.description' AS description FROM sweeps
 WHERE description <> '' GROUP BY ALL ORDER BY min(started_at)
@@ -26,7 +26,7 @@ WHERE description <> '' GROUP BY ALL ORDER BY min(started_at)
 
 
 def descriptions_of(site: Site) -> list[str]:
-    """What the studies that were played ask, each once, the first one first."""
+    """Return the questions of the studies that were played, each once, the first one first."""
     return [row["description"] for row in site.catalogue.ask(DESCRIPTIONS)]
 
 
@@ -40,7 +40,7 @@ class Scope:
     condition: str = ""
 
     @property
-    def wanted(self) -> dict[str, Any]:
+    def filters(self) -> dict[str, Any]:
         """The trials of all its drivers, as a filter."""
         return {**self.trials(prompt=self.prompt), "model": self.drivers}
 
@@ -51,7 +51,7 @@ class Scope:
         return {name: value for name, value in part.items() if value}
 
     def trials(self, driver: str = "", prompt: str = "") -> dict[str, Any]:
-        """Its trials of a driver and a prompt, or of all: a filter, and the address of a list."""
+        """Return the filter of its trials, of a driver and a prompt or of all."""
         return {"model": unmarked(driver), "variant": prompt,
                 "sweep": self.sweep, "condition": self.condition}  # fmt: skip
 
@@ -74,7 +74,7 @@ class Bar:
 def scope_of(
     site: Site, asked: Mapping[str, str], driver: str = "", *, any_prompt: bool = False
 ) -> Bar:
-    """The scope that an address names, with what may be chosen; raises NotThere.
+    """Return the scope in an address, with the choices of its form; raises NotThere.
 
     ``driver``: of this one alone. Unless it may be of ``any_prompt``, it has one.
     """
@@ -82,9 +82,9 @@ def scope_of(
         "SELECT DISTINCT model, variant, condition FROM listed WHERE who <> 'humans' ORDER BY ALL"
     )
     drivers = list(dict.fromkeys(row["model"] for row in rows))
-    own = [row for row in rows if not driver or row["model"] == unmarked(driver)]
-    prompts = list(dict.fromkeys(row["variant"] for row in own))
-    conditions = ordered({row["condition"] for row in own})
+    of_driver = [row for row in rows if not driver or row["model"] == unmarked(driver)]
+    prompts = list(dict.fromkeys(row["variant"] for row in of_driver))
+    conditions = ordered({row["condition"] for row in of_driver})
     sweeps = runs_of(site)
     usual = "" if any_prompt else next(iter(prompts), BASELINE)
     usual = BASELINE if usual and BASELINE in prompts else usual
@@ -105,7 +105,7 @@ def scope_of(
 
 
 def runs_of(site: Site) -> dict[str, str]:
-    """What each run is called in a list to choose from, the newest first."""
+    """Return the title of each run in a list to choose from, the newest first."""
     return {
         row["sweep_id"]: f"{called(row['name'], json.loads(row['config']))}, "
         f"{row['started_at']:%Y-%m-%d %H:%M} UTC"
@@ -114,19 +114,19 @@ def runs_of(site: Site) -> dict[str, str]:
 
 
 def facets_shown(site: Site, facets: Facets) -> dict[str, list[tuple[str, Any]]]:
-    """The values of facets to choose from, of which runs have their names."""
+    """Return the values of facets to choose from, runs with their titles."""
     times = dict(facets["sweep"])
     runs = [(run, f"{text} ({times[run]})") for run, text in runs_of(site).items() if run in times]
     return {**facets, "sweep": runs}
 
 
 def carried(asked: Mapping[str, str]) -> dict[str, list[str]]:
-    """The scope in an address, as the addresses of other pages take it on."""
+    """Return the scope in an address, as the addresses of other pages take it on."""
     return {name: values for name in SCOPE if (values := every(asked, name))}
 
 
 def unmarked(driver: str) -> str:
-    """The name by which the list of trials knows a driver, without the marks of a group.
+    """Return a driver's name in the list of trials, without the marks of a group.
 
     The levels of a study's factors, which stand in brackets too, are part of both names.
     """
@@ -134,7 +134,7 @@ def unmarked(driver: str) -> str:
 
 
 def every(asked: Mapping[str, str], name: str) -> list[str]:
-    """All values of one name in an address."""
+    """Return all values of one name in an address."""
     several = asked.getlist(name) if isinstance(asked, QueryParams) else [asked.get(name, "")]
     return [value for value in several if value]
 

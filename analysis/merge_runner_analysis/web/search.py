@@ -53,46 +53,44 @@ FOUND = "hits JOIN listed USING (number)"
 
 @dataclass(slots=True)
 class Words:
-    """What the drivers of a database said. One search goes on at a time."""
+    """Search in the words of a database's drivers, one query at a time."""
 
     catalogue: Catalogue
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def search(
         self,
-        wanted: Mapping[str, str],
+        filters: Mapping[str, str],
         terms: Sequence[str] = (),
         limits: Mapping[str, str] | None = None,
         page: int = 1,
     ) -> dict[str, Any]:
-        """Decisions with all ``terms`` within ``limits``, of which ``hits`` are those of a page.
+        """Return decisions with all ``terms`` within ``limits``; ``hits`` are those of a page.
 
-        Those of scripted stand-ins come last.
-
-        Each has the ``pieces`` of its words. ``crossed`` counts all of them by what was said, M or
-        Y, and by what was planned.
+        Those of mock models are the last. Each has the ``pieces`` of its words. ``crossed`` counts
+        all of them by intention, M or Y, and by plan.
         """
         limits = limits or {}
         conditions = ["true", *(LIMITS[name] for name in limits)]
         if terms:
             holding = " AND ".join([f"contains({FOLDED}, lower(?))"] * len(terms))
             conditions.append(f"place IN (SELECT rowid FROM decisions WHERE {holding})")  # noqa: S608 # constants
-        where, values = where_of(wanted)
-        found = f"FROM {FOUND} WHERE {where}"
+        where, values = where_of(filters)
+        matches = f"FROM {FOUND} WHERE {where}"
         with self._lock, self.catalogue.cursor() as connection:
             connection.execute(HITS.format(" AND ".join(conditions)), [*limits.values(), *terms])
             (totals,) = records(
                 connection,
                 "SELECT count(*) AS decisions, count(DISTINCT number) AS trials, "
                 "histogram(planned) FILTER (tactical = 'M') AS \"M\", "
-                f"histogram(planned) FILTER (tactical = 'Y') AS \"Y\" {found}",
+                f"histogram(planned) FILTER (tactical = 'Y') AS \"Y\" {matches}",
                 values,
             )
             last_page = max(1, -(-totals["decisions"] // PAGE))
             page = min(page, last_page)
             rows = records(
                 connection,
-                f"SELECT trial_id, spec_hash, outcome, hits.* {found} "
+                f"SELECT trial_id, spec_hash, outcome, hits.* {matches} "
                 "ORDER BY who, trial_id, spec_hash, hits.decision, hits.side "
                 f"LIMIT {PAGE} OFFSET ?",
                 [*values, PAGE * (page - 1)],
@@ -104,7 +102,7 @@ class Words:
                     [[row["place"] for row in rows]],
                 ).fetchall()
             )
-            facets = facets_of(connection, FOUND, FACETS, wanted)
+            facets = facets_of(connection, FOUND, FACETS, filters)
         crossed = {letter: counts for letter in "MY" if (counts := totals.pop(letter))}
         for row in rows:
             text = texts.get(row["place"])
@@ -114,7 +112,7 @@ class Words:
 
 
 def terms_of(query: str) -> tuple[str, ...]:
-    """The words of a query, and its phrases in quotes.
+    """Return the words of a query, and its phrases in quotes.
 
     >>> terms_of('yield "collision course')
     ('yield', 'collision course')
@@ -126,7 +124,7 @@ def terms_of(query: str) -> tuple[str, ...]:
 
 
 def pieces_of(text: str, terms: Sequence[str]) -> list[tuple[str, bool]]:
-    """A part of a text with its first match, cut into the terms, True, and what is between them."""
+    """Cut a part of a text with its first match into terms, True, and the text between them."""
     longest_first = sorted(terms, key=len, reverse=True)
     looked_for = "|".join(re.escape(term).replace(r"\ ", r"\s") for term in longest_first)
     pattern = re.compile(f"({looked_for or '(?!)'})", re.IGNORECASE)

@@ -1,4 +1,4 @@
-"""What all pages share: the database, the list of its trials, the templates, the addresses."""
+"""State that all pages share: the database, the list of its trials, templates, addresses."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from merge_runner_analysis.web.search import Words
 from merge_runner_analysis.web.urls import HOME, Links
 from merge_runner_analysis.wording import MEASURES, TABLE
 
-# What draws and moves a trial, in the order in which it is loaded.
+# Scripts that draw and move a trial, in the order of loading.
 _PARTS = "moment track charts ribbons panel clock comparison start"
 REPLAY = [f"replay/{part}.js" for part in _PARTS.split()]
 PAGES = {
@@ -42,12 +42,12 @@ PAGES = {
 }
 # The parts of a scope in an address; the list of trials filters by the same names.
 SCOPE = ("sweep", "model", "variant", "condition")
-# What hangs under these, each with one list of all.
+# Pages with one list of all their entries.
 LISTS = {"Tables and figures": "tables", "Notes": "notes", "What words mean": "glossary"}
 
 
 class NotThere(Exception):
-    """What an address asks for is not there; the text says what is."""
+    """An address of something that is not there; the text says what is."""
 
 
 class TooMuch(Exception):
@@ -55,18 +55,18 @@ class TooMuch(Exception):
 
 
 class NothingNew(Exception):
-    """What was seen of a page is what it still shows."""
+    """The page is as the reader saw it last."""
 
 
 def download(text: str, name: str) -> Response:
-    """A file that a browser saves under this name."""
+    """Return a file that a browser saves under this name."""
     kind = {".csv": "text/csv", ".tex": "application/x-tex"}[Path(name).suffix]
     headers = {"content-disposition": f'attachment; filename="{name}"'}
     return Response(text, headers=headers, media_type=f"{kind}; charset=utf-8")
 
 
 def news_of(shown: object, seen: str, state: str = "all") -> str:
-    """What is shown, as a short text that differs where it does; raises NothingNew."""
+    """Return a digest of the shown content; raises NothingNew where it is the one ``seen``."""
     now = f"{state}-{hashlib.sha256(repr(shown).encode()).hexdigest()[:16]}"
     if now == seen:
         raise NothingNew
@@ -80,15 +80,15 @@ class Site:
     db: Path
     at: Links = field(default_factory=Links)
     program: str = "merge-runner"
-    """What to type to run this program."""
+    """Command that runs this program."""
     reader: str = "reader"
-    """Who writes notes."""
+    """Name of the reader who writes notes."""
     study: str = ""
     """The file of the study whose names and parts are known, as it was typed."""
     is_still: bool = False
-    """Whether no news is taken in."""
+    """True: no news is taken in."""
     policy: str = ""
-    """What a page without a server may load: each says so itself."""
+    """Content security policy of a page without a server."""
     inlined: Mapping[str, str] = field(default_factory=dict)
     """The styles and scripts of a page that holds them itself, by name."""
 
@@ -142,33 +142,33 @@ class Site:
         self.catalogue.tag(self.notes.kept().tags)
 
     def trial(self, trial_id: str, spec_hash: str) -> Row:
-        """The trial of this name, of several specs of this one; raises NotThere."""
+        """Return the trial of this name, of several specs of this one; raises NotThere."""
         row = self.catalogue.find(trial_id, spec_hash)
         if row is None:
             raise NotThere(f"the database holds no trial {trial_id}")
         return row
 
     def in_words(self, condition: str) -> str:
-        """What a condition's name says; empty where no human drove it and it has no trial."""
+        """Return a condition in words; empty where no human drove it and it has no trial."""
         if condition not in self._conditions:
             self._conditions = self.catalogue.condition_texts()
         return self._conditions.get(condition, "")
 
     @property
     def beginning(self) -> bool:
-        """Whether the trials are being read for the first time."""
+        """Return whether the trials are being read for the first time."""
         return self._first_reading is not None and self._first_reading.is_alive()
 
     def share(self, *options: str, of_study: bool = True) -> str:
-        """The command that writes what is shown here as files; ``of_study``: it takes --study."""
+        """Return the command that exports the shown pages; ``of_study``: it takes --study."""
         db = [] if self.db == DEFAULT_DB else ["--db", str(self.db)]
         study = ["--study", self.study] if self.study and of_study else []
         return shlex.join([self.program, "view", *db, *study, *options])
 
     def render(self, template: str, **values: object) -> str:
         """Return a page, or a part of one."""
-        found = self._environment.get_template(template)
-        return found.render({"held": self.catalogue.held, **values})
+        values = {"is_locked": self.catalogue.is_locked, **values}
+        return self._environment.get_template(template).render(values)
 
     def close(self) -> None:
         """Leave nothing behind."""

@@ -7,7 +7,7 @@ from functools import partialmethod
 from typing import Any
 from urllib.parse import quote, urlencode
 
-# What an address says of a cell: which it is, and the run and condition that its table is of.
+# Parts of a cell's address: the cell, and the run and condition of its table.
 CELL = ("cell", "of_run", "of_condition")
 # The page to begin at.
 HOME = "index"
@@ -24,7 +24,7 @@ class Links:
         self._leads = leads or str
 
     def to(self, name: str, /, **state: object) -> str:
-        """A page of its own: ``trials``, ``sql``."""
+        """Return the address of a page: ``trials``, ``sql``."""
         return self._leads(f"/{'' if name == HOME else name}" + query_of(state))
 
     def _named(self, kind: str, name: str, /, **state: object) -> str:
@@ -46,7 +46,7 @@ class Links:
     others = partialmethod(_of_trial, "others")
 
     def cell(self, table: str, row: str, column: str, /, **part: str) -> str:
-        """The trials behind a cell, of a table of all trials or of a ``part``: see ``CELL``.
+        """Return the address of a cell's trials, of all trials or of a ``part``: see ``CELL``.
 
         No table's name has a slash and no column's a colon, whatever is in the row's.
         """
@@ -54,11 +54,11 @@ class Links:
 
 
 def query_of(state: Mapping[str, Any]) -> str:
-    """The part of an address after the path; what is empty is left out."""
+    """Return the part of an address after the path; empty values are left out."""
     given = {name: value for name, value in state.items() if value is not None and value != ""}
     return f"?{urlencode(given, doseq=True)}" if given else ""
 
 
 def whole(text: str) -> int | None:
-    """A number of up to 7 digits; None for anything else."""
+    """Return a number of up to 7 digits; None for anything else."""
     return int(text) if text.isascii() and text.isdigit() and len(text) < 8 else None

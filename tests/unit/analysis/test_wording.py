@@ -145,7 +145,7 @@ def test_crashes_that_another_rule_decides_are_said_by_both():
     )
 
 
-@pytest.mark.parametrize(("n", "says"), [(19, "cannot tell yet"), (20, "not as with people")])
+@pytest.mark.parametrize(("n", "says"), [(19, "fewer than 20 trials"), (20, "unlike people's")])
 def test_no_verdict_is_shown_of_too_few_trials(n, says):
     of = row("headway", "unlike", n=n)
     assert verdict_word(of) == says
@@ -252,10 +252,10 @@ def test_no_sentence_claims_a_direction_that_the_corrected_p_does_not_carry(of):
     ("measure", "ci", "says"),
     [
         ("collisions", (-4.0, 5.0), "like people"),
-        ("collisions", (-9.0, -5.1), "fewer than people"),
+        ("collisions", (-9.0, -5.1), "fewer than people's"),
         ("gap", (-1.0, -0.5), "like people"),
         ("gap", (-1.1, -0.5), "smaller than people's"),
-        ("headway", (-0.1, 0.1), "not as with people"),
+        ("headway", (-0.1, 0.1), "unlike people's"),
     ],
 )
 def test_within_a_margin_a_driver_is_like_people_wherever_that_is_said(measure, ci, says):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from merge_runner_analysis.tables.model import Column, Row, Table
 from merge_runner_analysis.web import effect_rows
-from merge_runner_analysis.web.question import UNREAD, answer_of, answered
+from merge_runner_analysis.web.question import PLANTED, UNREAD, answer_of, answered
 from merge_runner_analysis.wording import SAME_TRIALS, UNCORRECTED
 
 GOES_FIRST, GAP, COST = "goes first (%)", "gap (m)", "cost (USD)"
@@ -76,7 +76,7 @@ SEEN = "A change of 10.00 points or more would have been seen in four of five st
         (
             [effect(drivers="scripted"), copied("persona")],
             f"In a rehearsal with a scripted stand-in, h{HURRY[1:]}",
-            f"{SAME}p = 0.001. Persona=yes is {UNREAD}.",
+            f"{SAME}p = 0.001. Persona=yes is {UNREAD}. {PLANTED}",
         ),
         (
             [effect(f"words{n}", 0.9 - n / 10, difference=1.0) for n in range(4)],
@@ -197,8 +197,8 @@ def test_an_interaction_names_the_levels_of_both_factors():
     crossed = {"level": "taxi × yes", "reference": "none × no"}
     made = answer([effect(), effect("persona × hurry", 0.4, **crossed)], levels_of("hurry"))
     main, interaction = made.changes
-    assert main.said == "yes, primary test"
-    assert interaction.said == "effect of persona=taxi with hurry=yes, less that with hurry=no"
+    assert main.detail == "yes, primary test"
+    assert interaction.detail == "effect of persona=taxi with hurry=yes, less that with hurry=no"
     assert (interaction.reference, interaction.level) == (None, None)
 
 

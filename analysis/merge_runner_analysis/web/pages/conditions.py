@@ -12,13 +12,13 @@ from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.scope import carried, scope_of
 from merge_runner_analysis.web.site import NotThere, Site, news_of
 
-# So many trials are drawn: a browser can still show them, and more would be one dark spot.
+# Drawn trials: a browser can still show them, and more would be one dark spot.
 MOST = 500
 # Sizes in the picture, in its units.
 WIDTH, LEFT, RIGHT, PANEL, BETWEEN, TOP, FOOT = 1000, 42, 8, 170, 34, 24, 42
 KEY = "trial_id", "spec_hash"
 CROSS = "m-5-5 10 10m0-10-10 10"
-# What is drawn of a trial, each as a list; the headway is that of the vehicle that went first.
+# The drawn series of a trial, each a list; the headway is that of the vehicle that went first.
 PANELS = {
     "first_mps": "Speed of the vehicle that merged first (m/s)",
     "second_mps": "Speed of the second one (m/s)",
@@ -71,7 +71,7 @@ HAVING 2 * count(*) >= (SELECT count(*) FROM nearest WHERE is_near AND place = 0
 
 
 def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
-    """The traces of a condition, of the scope that is asked for.
+    """Return the traces of a condition, within the scope of the address.
 
     Raises NotThere, and NothingNew as they were ``seen``.
     """
@@ -79,8 +79,8 @@ def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     if not site.in_words(name):
         raise NotThere(f"there is no condition {name!r} here")
     bar = scope_of(site, asked, any_prompt=True)
-    wanted = {**bar.scope.wanted, "condition": name, "who": ["drivers", "stand-ins"]}
-    rows = site.catalogue.every(wanted)
+    filters = {**bar.scope.filters, "condition": name, "who": ["drivers", "stand-ins"]}
+    rows = site.catalogue.every(filters)
     humans = site.catalogue.every({"condition": name, "who": "humans"})
     chosen = [rows[i * len(rows) // MOST] for i in range(MOST)] if len(rows) > MOST else rows
     traces = {(row["trial_id"], row["spec_hash"]): row for row in _read(site, TRACES, chosen)}
@@ -90,13 +90,13 @@ def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     band = _read(site, BAND, humans)
     return site.render(
         "condition.html",
-        here="",
+        view="",
         name=name,
         bar=bar,
         carried={key: kept for key, kept in carried(asked).items() if key != "condition"},
         sweep=bar.scope.sweep,
         state=state,
-        groups=site.catalogue.counts(wanted, "model", "variant"),
+        groups=site.catalogue.counts(filters, "model", "variant"),
         trials=len(rows),
         drawn=len(drawn),
         sampled=len(rows) > MOST,
@@ -106,7 +106,7 @@ def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
 
 
 def picture(drawn: Sequence[Row], band: Sequence[Row]) -> dict[str, Any]:
-    """Three panels over one axis of time: where all lines lie, in the units of the picture."""
+    """Return three panels over one axis of time, with their lines in the picture's units."""
     end = max([*(row["time_s"][-1] for row in drawn), *(row["time_s"] for row in band)])
     time, seconds = _axis([0.0, end], (LEFT, WIDTH - RIGHT), most=16)
     values = {name: [v for row in [*drawn, *band] for v in row[name]] for name in PANELS}
@@ -139,7 +139,7 @@ def picture(drawn: Sequence[Row], band: Sequence[Row]) -> dict[str, Any]:
 def _axis(
     values: Sequence[float], places: tuple[float, float], most: int
 ) -> tuple[Scale, list[tuple[float, int]]]:
-    """An axis of whole steps that holds all values, and its ticks: (place, value)."""
+    """Return an axis of whole steps that holds all values, and its ticks: (place, value)."""
     low, high = min(values), max(values)
     steps = (size * 10**zeros for zeros in range(9) for size in (1, 2, 5))
     step = next(step for step in steps if high - low <= (most - 1) * step)
@@ -149,7 +149,7 @@ def _axis(
 
 
 def _path(row: Row, time: Scale, scales: Mapping[str, Scale]) -> str:
-    """One path with a line in each panel; a collision has a cross at its end.
+    """Return a path with a line in each panel; a collision has a cross at its end.
 
     In whole units, each point by its distance from the one before: that is a third of the text.
     """
@@ -164,5 +164,4 @@ def _path(row: Row, time: Scale, scales: Mapping[str, Scale]) -> str:
 
 
 def _read(site: Site, sql: str, trials: Sequence[Row]) -> list[Row]:
-    """What a query finds of trials."""
     return site.catalogue.ask(sql, *([row[name] for row in trials] for name in KEY))

@@ -27,7 +27,7 @@ from merge_runner_analysis.web.scope import Scope, scope_of, unmarked
 from merge_runner_analysis.web.site import NotThere, Site
 from merge_runner_analysis.wording import DIFFERS, OPEN, SHOWN, UNLIKE, shown_state
 
-# How attempts of a driver's trials with a prompt ended, and which model answered.
+# Outcomes and served models of the attempts of a driver's trials with a prompt.
 ATTEMPTS = """
 SELECT model_served AS served, outcome, count(*) AS times
 FROM calls SEMI JOIN (FROM listed WHERE model = ? AND variant = ?) USING (trial_id, spec_hash)
@@ -36,57 +36,57 @@ GROUP BY ALL ORDER BY ALL
 
 
 def drivers_page(site: Site, asked: Mapping[str, str]) -> str:
-    """All drivers with their prompts; raises NotThere."""
+    """Return all drivers with their prompts; raises NotThere."""
     bar = scope_of(site, asked)
     chosen = bar.scope.drivers or bar.drivers
     drivers, values = judged(site, bar, asked)
-    kinds = by_kind([one for one in drivers if unmarked(one.name) in chosen])
-    return site.render("drivers.html", here="drivers", kinds=kinds, **values)
+    kinds = by_kind([driver for driver in drivers if unmarked(driver.name) in chosen])
+    return site.render("drivers.html", view="drivers", kinds=kinds, **values)
 
 
 def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
-    """A driver with one prompt, of ``human`` the humans; raises NotThere."""
+    """Return the page of a driver with one prompt, or of ``human``; raises NotThere."""
     bar = scope_of(site, asked, "" if name == HUMAN else name)
     scope = bar.scope
     drivers, values = judged(site, bar, asked)
-    by_name = {one.name: one for one in drivers if one.prompt == scope.prompt}
-    own = by_name.get(name)
-    if own is None and name != HUMAN and values["table"] is not None:
+    by_name = {driver.name: driver for driver in drivers if driver.prompt == scope.prompt}
+    driver = by_name.get(name)
+    if driver is None and name != HUMAN and values["table"] is not None:
         raise NotThere(
             f"no driver {name!r} was played with this prompt; there are: "
             f"{', '.join(by_name) or 'none'}"
         )
     trials = scope.trials(name, scope.prompt)
-    beside = by_name.get(asked.get("with", ""))
-    was_asked = own and own.facts and own.facts["asked"] and not beside
+    other_driver = by_name.get(asked.get("with", ""))
+    was_asked = driver and driver.facts and driver.facts["asked"] and not other_driver
     awaited, first = _first(site, name, scope) if was_asked else (None, "")
     job, is_awaited, apart = None, False, None
-    if own and beside:
-        job, is_awaited, apart = compared(site, own, beside, scope)
-    both = [one for one in (own, beside) if one]
+    if driver and other_driver:
+        job, is_awaited, apart = compared(site, driver, other_driver, scope)
+    both = [shown for shown in (driver, other_driver) if shown]
     conditions = by_condition(site, scope, both)
-    # Of each condition, the humans' and the drivers' share of trials in which left goes first.
+    # The humans' and the drivers' share of trials in which left goes first, by condition.
     shares = (
         [rate(cell["left_first"], cell["merged"]) if cell else rate(0, 0) for cell in cells]
         for cells in (conditions["humans"], *(cells for _, cells in conditions["rows"]))
     )
     return site.render(
         "driver.html",
-        here="drivers",
+        view="drivers",
         name=name,
-        own=own,
-        beside=beside,
+        driver=driver,
+        other_driver=other_driver,
         compared=job if is_awaited else None,
         apart=apart,
         linked=True,
         middle=MIDDLE,
-        others=[one for one in by_name.values() if one is not own],
-        **values | {"human": humans_of(values["table"], own)},
+        others=[other for other in by_name.values() if other is not driver],
+        **values | {"human": humans_of(values["table"], driver)},
         awaited=awaited,
         first=first,
-        found=site.words.search(trials) if was_asked else None,
+        result=site.words.search(trials) if was_asked else None,
         kept=trials,
-        summary=_summary(own) if own and own.cells else "",
+        summary=_summary(driver) if driver and driver.cells else "",
         attempts=site.catalogue.ask(ATTEMPTS, unmarked(name), scope.prompt),
         accounts=[
             row
@@ -101,9 +101,9 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
 
 
 def _counted(cells: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str]]:
-    """What is counted in each situation: its heading, and the counts of trials and of all of them.
+    """Return the counts to show by situation: heading, and the names of counts k and n.
 
-    Where an ego sat on the right, who goes first is also counted for it, on either side.
+    Where an ego was on the right, its going first is counted too, on either side.
     """
     egos = [side for side in SIDES if any(cell[f"ego_merged_{side}"] for cell in cells)]
     left = "Left, the ego, goes first" if egos == ["left"] else "Left goes first"
@@ -117,10 +117,10 @@ def _counted(cells: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str]]:
     ]
 
 
-def _summary(own: Driver) -> str:
-    """How many of the humans' traits are shown, and how many measures are open."""
+def _summary(driver: Driver) -> str:
+    """Return the number of human traits that are shown, and of measures that are open."""
     states = {
-        name: state for name, cell in own.cells.items() if (state := shown_state(cell.values))
+        name: state for name, cell in driver.cells.items() if (state := shown_state(cell.values))
     }
     traits = [states[name] for name in states if name not in {"collisions", "gap"}]
     shown = sum(state in {SHOWN, *DIFFERS} - {UNLIKE} for state in traits)
@@ -131,23 +131,23 @@ def _summary(own: Driver) -> str:
 
 
 def _first(site: Site, driver: str, scope: Scope) -> tuple[Job | None, str]:
-    """What is awaited, and what a driver does first, by the table of first actions."""
-    found, table = computed_table(site, "first-action", scope.sweep, scope.condition)
-    told = []
+    """Return the job to wait for, and a driver's first actions in sentences."""
+    job, table = computed_table(site, "first-action", scope.sweep, scope.condition)
+    sentences = []
     for row in table.rows if table else []:
-        is_told = row.groups[0] in {f"{driver}/{scope.prompt}", HUMAN}
-        if table and is_told and row.values.get("slope_ci"):
+        is_compared = row.groups[0] in {f"{driver}/{scope.prompt}", HUMAN}
+        if table and is_compared and row.values.get("slope_ci"):
             of = printed(table, row)
-            told.append(
+            sentences.append(
                 f"{of['driver']}: {of['brake_percent']} % brake, {of['hold_percent']} % hold, "
                 f"{of['go_percent']} % speed up, of {of['n']}. Per m/s that they are faster, they "
                 f"{_harder(row)}."
             )
-    return None if table else found, with_minus(" ".join(told)) if len(told) > 1 else ""
+    return None if table else job, with_minus(" ".join(sentences)) if len(sentences) > 1 else ""
 
 
 def _harder(row: TableRow) -> str:
-    """By how many m/s² one who is faster brakes, or speeds up, harder; with its interval."""
+    """Return by how many m/s² a faster driver brakes, or speeds up, harder; with interval."""
     values: Mapping[str, Any] = row.values
     brakes = values["slope"] < 0
     low, high = sorted(-end if brakes else end for end in values["slope_ci"])

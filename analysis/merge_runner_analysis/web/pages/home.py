@@ -21,16 +21,16 @@ TABLES = ("effects", "levels")  # of what a study's factors change
 
 
 def _question(site: Site, bar: Bar) -> tuple[list[Job], list[Job], Answer | None]:
-    """The computations of what the study's factors change, if any, those awaited, the answer.
+    """Return the jobs of the tables on factors, if any, those to wait for, and the answer.
 
-    A computation may end meanwhile: whether it is awaited is what its table was.
+    A job without a table is waited for, even if it ends meanwhile.
     """
     if len(bar.prompts) < 2 and not site.catalogue.factors():
         return [], [], None
     part = bar.scope.sweep, bar.scope.condition
-    found = [computed_table(site, name, *part) for name in TABLES]
-    jobs, tables = zip(*found, strict=True)
-    return [*jobs], [job for job, table in found if table is None], answer_of(*tables)
+    computed = [computed_table(site, name, *part) for name in TABLES]
+    jobs, tables = zip(*computed, strict=True)
+    return [*jobs], [job for job, table in computed if table is None], answer_of(*tables)
 
 
 def _is_tested(driver: Driver, measure: str) -> bool:
@@ -38,47 +38,50 @@ def _is_tested(driver: Driver, measure: str) -> bool:
 
 
 def home_page(site: Site, asked: Mapping[str, str]) -> str:
-    """The study; raises NotThere, and NothingNew where nothing is new since it was ``seen``."""
+    """Return the study's page; raises NotThere, and NothingNew where it is as ``seen``."""
     standing = standing_of(site.catalogue)
     bar = scope_of(site, asked)
     scope = bar.scope
     drivers, values = judged(site, bar, asked)
     jobs, asking, question = _question(site, bar)
     shown = [
-        one
-        for one in drivers
-        if one.prompt == scope.prompt and (not scope.drivers or unmarked(one.name) in scope.drivers)
+        driver
+        for driver in drivers
+        if driver.prompt == scope.prompt
+        and (not scope.drivers or unmarked(driver.name) in scope.drivers)
     ]
-    short = short_names([one.name for one in shown])
+    short = short_names([driver.name for driver in shown])
     models = {
-        short[one.name]: {name: cell.values for name, cell in one.cells.items()}
-        for one in shown
-        if one.kind == LANGUAGE_MODEL and one.cells
+        short[driver.name]: {name: cell.values for name, cell in driver.cells.items()}
+        for driver in shown
+        if driver.kind == LANGUAGE_MODEL and driver.cells
     }
     kinds = by_kind(shown)
     apart = None
-    kinds_shown = {one.kind for one in shown}
-    # Two language models, or a rehearsal with two stand-ins, are the question.
+    kinds_shown = {driver.kind for driver in shown}
+    # Two language models, or two mock models in a rehearsal, are the question.
     if not jobs and len(shown) == 2 and kinds_shown in ({LANGUAGE_MODEL}, {MOCK}):
         job, is_awaited, apart = compared(site, shown[0], shown[1], scope)
         jobs, asking = [job], [job] * is_awaited
     older = [job.older for job in (values["computed"], *jobs)]
-    now = standing, site.catalogue.state, site.catalogue.held, older
+    now = standing, site.catalogue.state, site.catalogue.is_locked, older
     seen = news_of(now, asked.get("seen", ""))
     conditions = by_condition(site, scope, shown)
     return site.render(
         "home.html",
-        here="index",
+        view="index",
         **values,
-        likeness=[(one, likeness_of(one)) for of_kind in kinds.values() for one in of_kind],
+        likeness=[
+            (driver, likeness_of(driver)) for of_kind in kinds.values() for driver in of_kind
+        ],
         likeness_headings=HEADINGS,
         more_compared=[
             measure.label
             for name, measure in MEASURES.items()
-            if name not in HEADINGS and any(_is_tested(one, name) for one in shown)
+            if name not in HEADINGS and any(_is_tested(driver, name) for driver in shown)
         ],
         short=short,
-        names_mean=names_mean(site.catalogue.ask(PLAYED), [one.name for one in shown]),
+        names_mean=names_mean(site.catalogue.ask(PLAYED), [driver.name for driver in shown]),
         # People's gap is that of the situations in which the first driver finished.
         people=people_of(conditions, humans_of(values["table"], next(iter(shown), None))),
         part=scope.part,
@@ -94,7 +97,7 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         middle=MIDDLE,
         linked=True,
         titles=dict(bar.prompts),
-        pair=[one.name for one in shown][:2],
+        pair=[driver.name for driver in shown][:2],
         notes=noted(shown),
         conditions=conditions,
     )

@@ -1,4 +1,4 @@
-"""What readers noted, all of it."""
+"""List of all notes, and new ones."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from merge_runner_analysis.web.urls import whole
 
 
 def notes_page(site: Site, _: Mapping[str, str]) -> str:
-    """Return all notes, the latest first, each with the address of what it is of.
+    """Return all notes, the latest first, each with the address of its trial or decision.
 
     It has none where the trial is not in this database.
     """
@@ -19,7 +19,7 @@ def notes_page(site: Site, _: Mapping[str, str]) -> str:
         row = site.catalogue.find(note.trial_id, note.spec_hash)
         at = {"side": note.side, "decision": note.decision}
         shown.append((note, row and site.at.trial(row, **at)))
-    return site.render("notes.html", here="notes", kept=kept, shown=shown)
+    return site.render("notes.html", view="notes", kept=kept, shown=shown)
 
 
 def add_note(site: Site, given: Mapping[str, str]) -> Row:

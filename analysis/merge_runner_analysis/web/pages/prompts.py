@@ -1,4 +1,4 @@
-"""Prompts: what each says otherwise than the baseline, and what that does, driver by driver."""
+"""Prompts: how each differs from the baseline, and the effect on each driver."""
 
 from __future__ import annotations
 
@@ -30,9 +30,8 @@ SELECT any_value(names) AS names FROM listed JOIN (
     SELECT spec_hash, json_keys(spec, '$.prompt_blocks') AS names FROM specs
 ) USING (spec_hash) WHERE variant = ? AND len(names) > 0
 """
-# What each variant asks first, beside the baseline on the same side: of all of them in the same
-# condition, as far as that was played. Where the two drivers may be told different things: what the
-# ego and what the other is.
+# The first prompt of each variant with the baseline's on the same side: all of the same condition,
+# as far as that was played. The ego's and the other driver's apart, where their words may differ.
 FIRST = """
 WITH asked AS (
     SELECT *, CASE WHEN focal IS NULL THEN 'both' WHEN side = focal THEN 'ego' ELSE 'other' END
@@ -70,60 +69,60 @@ WITHOUT_PROMPT = json.dumps({"prompt_blocks": None, **dict.fromkeys(SIDES, _UNPL
 
 
 def prompts_page(site: Site, asked: Mapping[str, str]) -> str:
-    """All prompts side by side, and the differences that they make."""
+    """Return all prompts side by side, and the differences that they make."""
     bar = scope_of(site, asked)
     chosen = bar.scope.drivers or bar.drivers
-    found, contrasts = computed_table(site, "contrasts", bar.scope.sweep, bar.scope.condition)
+    job, contrasts = computed_table(site, "contrasts", bar.scope.sweep, bar.scope.condition)
     played, values = judged(site, bar, asked)
     driven: dict[str, list[Driver]] = {}
-    for one in played:
-        if unmarked(one.name) in chosen:
-            driven.setdefault(one.name, []).append(one)
+    for driver in played:
+        if unmarked(driver.name) in chosen:
+            driven.setdefault(driver.name, []).append(driver)
     drivers, ends = differences(contrasts, chosen) if contrasts else ({}, {})
     return site.render(
         "prompts.html",
-        here="prompts",
+        view="prompts",
         **values | {"headings": {}},
-        found=found,
+        job=job,
         contrasts=contrasts,
-        prompts=_told(site),
+        prompts=_first_prompts(site),
         left_out=partial(left_out, site),
         drivers=drivers,
         ends=ends,
         middle=MIDDLE,
         collisions=COLLISIONS.name,
         baseline=BASELINE,
-        reworded=any(one.prompt != BASELINE for played in driven.values() for one in played),
+        reworded=any(driver.prompt != BASELINE for played in driven.values() for driver in played),
         # Those that were played with several prompts, the baseline first.
         kinds={
-            name: sorted(prompts, key=lambda one: one.prompt != BASELINE)
+            name: sorted(prompts, key=lambda driver: driver.prompt != BASELINE)
             for name, prompts in sorted(driven.items())
             if len(prompts) > 1
         },
     )
 
 
-def _told(site: Site) -> dict[str, dict[str, list[Part]]]:
-    """What each prompt asks first, by its reader: one, or the two drivers where these differ."""
-    told: dict[str, dict[str, list[Part]]] = {}
+def _first_prompts(site: Site) -> dict[str, dict[str, list[Part]]]:
+    """Return the first prompt's parts, by variant and reader: two readers where theirs differ."""
+    by_variant: dict[str, dict[str, list[Part]]] = {}
     seen: dict[str, list[list[Part]]] = {}
     for row in site.catalogue.ask(FIRST, BASELINE):
         variant, digests = row["variant"], digests_of(json.loads(row["blocks"]), row["side"])
         parts = parts_of(row["prompt"], row["baseline"], digests)
-        said = [part for part in parts if part.changed or row["baseline"] is None]
-        if said not in seen.setdefault(variant, []):
-            seen[variant].append(said)
-            told.setdefault(variant, {})[row["reader"]] = parts
-    return told
+        changes = [part for part in parts if part.changed or row["baseline"] is None]
+        if changes not in seen.setdefault(variant, []):
+            seen[variant].append(changes)
+            by_variant.setdefault(variant, {})[row["reader"]] = parts
+    return by_variant
 
 
 def differences(
     table: Table, chosen: Collection[str]
 ) -> tuple[dict[str, dict[str, dict[str, Any]]], dict[str, float]]:
-    """What each prompt changes, by driver of these, by both prompts, and by measure.
+    """Return each prompt's differences by driver, pair of prompts and measure, and axis ends.
 
     Each difference is as it is printed, with its mark, filled where its corrected p is below 5 %,
-    and what a link to its trials needs. And where the axis of each measure ends on both sides.
+    and the names for a link to its trials. An axis ends at the same distance on both sides.
     """
     # A driver that is not judged has none.
     rows = [row for row in table.rows if row.values.get("difference") is not None]
@@ -151,34 +150,36 @@ def differences(
 
 
 def _values(row: Row) -> list[float]:
-    """A difference, with the ends of its interval if it has one."""
+    """Return a difference, with the ends of its interval if it has one."""
     values: Mapping[str, Any] = row.values
     return [values["difference"], *(values.get("ci") or ())]
 
 
 def left_out(site: Site, variant: str) -> str:
-    """What a variant's prompt leaves out and adds, by name and meaning."""
+    """Describe the blocks that a variant's prompt leaves out and adds, by name and meaning."""
     ((names,),) = map(dict.values, site.catalogue.ask(STORED, variant))
     if names is None:
         return f"of which {UNKNOWN}"
     baseline = frozenset(blocks_of(BASELINE))
-    # A block that one driver alone is told has its side behind its name; of the baseline's ones
-    # that is what the other one is not told.
-    own = frozenset(level_of(name.partition("@")[0]) for name in names) - baseline
-    own |= baseline & frozenset(names)
+    # A block of one driver's prompt alone has its side behind its name; a baseline's block is then
+    # left out of the other driver's.
+    blocks = frozenset(level_of(name.partition("@")[0]) for name in names) - baseline
+    blocks |= baseline & frozenset(names)
     # The levels of words are in the variant's name already.
-    changes = Variant(removes=baseline - own, adds=own - baseline - frozenset(variant.split(" ")))
-    return changes_text(changes, _named) or ("the whole prompt" if own == baseline else "")
+    changes = Variant(
+        removes=baseline - blocks, adds=blocks - baseline - frozenset(variant.split(" "))
+    )
+    return changes_text(changes, _named) or ("the whole prompt" if blocks == baseline else "")
 
 
 def _named(block: str) -> str:
-    """A block with what it means, if that is known here."""
+    """Return a block's name, with its meaning if that is known here."""
     meaning = block_meaning(block)
     return block if meaning == UNKNOWN else f"{block}: {meaning}"
 
 
 def discordant_page(site: Site, asked: Mapping[str, str]) -> str:
-    """The pairs of trials that ended otherwise with a variant than with the baseline."""
+    """Return the pairs of trials that ended otherwise with a variant than with the baseline."""
     driver, variant = asked.get("model", ""), asked.get("variant", "")
     if not driver or not variant:
         raise NotThere("/discordant needs model=MODEL and variant=VARIANT")
@@ -187,7 +188,7 @@ def discordant_page(site: Site, asked: Mapping[str, str]) -> str:
     kinds = Counter((pair["base_outcome"], pair["outcome"]) for pair in differing)
     return site.render(
         "discordant.html",
-        here="prompts",
+        view="prompts",
         model=driver,
         variant=variant,
         left_out=left_out(site, variant),

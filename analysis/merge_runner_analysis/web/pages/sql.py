@@ -21,7 +21,7 @@ LISTING = threading.Lock()
 # Types of which values stand to the right.
 NUMBER = re.compile(r"U?(TINY|SMALL|BIG|HUGE)?INT(EGER)?|FLOAT|DOUBLE|BIGNUM|DECIMAL\(.*\)")
 
-# What holds of the trials of each part of a scope.
+# SQL conditions for each part of a scope.
 SCOPED = {
     "sweep": "(trial_id, spec_hash) in (select trial_id, spec_hash from sweep_trials\n"
     "    where sweep_id in ({}))",
@@ -53,7 +53,7 @@ limit 20""",
 
 
 def sql_page(site: Site, asked: Mapping[str, str]) -> str:
-    """The page of a query, with its result."""
+    """Return the page of a query, with its result."""
     query = query_in(asked)
     is_asked, result, problem = bool(query.strip()), None, None
     if is_asked:
@@ -66,7 +66,7 @@ def sql_page(site: Site, asked: Mapping[str, str]) -> str:
         schema = tables()
     return site.render(
         "sql.html",
-        here="sql",
+        view="sql",
         bar=scope_of(site, asked, any_prompt=True),
         carried=carried(asked),
         query=query if is_asked else scoped_query(carried(asked)),
@@ -84,12 +84,12 @@ def sql_page(site: Site, asked: Mapping[str, str]) -> str:
 
 
 def sql_csv(site: Site, asked: Mapping[str, str]) -> Response:
-    """All that a query finds, as a file; raises UsageError."""
+    """Return the whole result of a query as a file; raises UsageError."""
     return download(site.queries.csv(query_in(asked)), "query.csv")
 
 
 def scoped_query(chosen: Mapping[str, Sequence[str]]) -> str:
-    """A query of the trials of a scope; the first example where none is chosen."""
+    """Return a query of the trials of a scope; the first example where none is chosen."""
     if not chosen:
         return next(iter(EXAMPLES.values()))
     parts = [SCOPED[name].format(", ".join(map(quoted, of))) for name, of in chosen.items()]
@@ -101,5 +101,5 @@ def scoped_query(chosen: Mapping[str, Sequence[str]]) -> str:
 
 
 def query_in(asked: Mapping[str, str]) -> str:
-    """The query in an address; a form ends its lines as the web does."""
+    """Return the query in an address; a form ends its lines with CR LF."""
     return asked.get("q", "").replace("\r\n", "\n")

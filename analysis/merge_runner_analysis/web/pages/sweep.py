@@ -21,7 +21,7 @@ WHERE facet = 'cause' GROUP BY ALL ORDER BY trials DESC, cause
 """
 
 
-# How often things happened that may cost trust: ``count`` of ``of`` are columns of a run, and
+# Rates of events that may cost trust: ``count`` of ``of`` are columns of a run, and
 # ``state`` filters the trials behind the count.
 TRUST = [
     dict(zip(("name", "count", "of", "things", "meaning", "state"), rate, strict=True))
@@ -46,19 +46,19 @@ TRUST = [
     )
 ]  # fmt: skip
 
-# What the list of runs always shows; the other rates where there is any such case.
+# Rates that the list of runs always shows; others appear where there is any such case.
 ALWAYS = ("collided", "failed", "invalid", "faults")
 
 
 def sweeps_page(site: Site, asked: Mapping[str, str]) -> str:
-    """The runs of a scope; raises NotThere, and NothingNew where they are as they were ``seen``."""
+    """Return the runs of a scope; raises NotThere, and NothingNew where they are as ``seen``."""
     bar, part = scope_of(site, asked, any_prompt=True), carried(asked)
     runs = list_runs(site.catalogue)
-    counted = numbers_of(site.catalogue, bar.scope.wanted)
+    counted = numbers_of(site.catalogue, bar.scope.filters)
     rare = counted[""] | {"fallbacks": 0}  # each follows an invalid reply
     return site.render(
         "sweeps.html",
-        here="sweeps",
+        view="sweeps",
         bar=bar,
         carried=part,
         runs=[run for run in runs if not part or counted[run["sweep_id"]]["trials"]],
@@ -71,27 +71,27 @@ def sweeps_page(site: Site, asked: Mapping[str, str]) -> str:
 
 
 def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
-    """One run; raises NotThere, and NothingNew as ``seen``."""
+    """Return the page of a run; raises NotThere, and NothingNew where it is as ``seen``."""
     seen = asked.get("seen", "")
-    found = [run for run in list_runs(site.catalogue) if run["sweep_id"] == sweep_id]
-    if not found:
+    matching = [run for run in list_runs(site.catalogue) if run["sweep_id"] == sweep_id]
+    if not matching:
         raise NotThere(f"the database holds no run {sweep_id}")
-    (run,) = found
+    (run,) = matching
     state = run["state"]
-    if seen and state == "lost" and site.catalogue.held:
+    if seen and state == "lost" and site.catalogue.is_locked:
         raise NothingNew  # how it ended cannot be read yet
     return site.render(
         "sweep.html",
-        here="sweeps",
+        view="sweeps",
         entry=run,
         audit=audit_of(site, [run]),
         arms=site.catalogue.counts({"sweep": sweep_id}, "model", "variant"),
         trust=TRUST,
         task=", ".join(
             dict.fromkeys(
-                one
+                setting
                 for arm in run["config"].get("arms") or ()
-                for one in task_settings(arm.get("scenario") or {})
+                for setting in task_settings(arm.get("scenario") or {})
             )
         ),
         sums_apart=APART,
@@ -105,5 +105,5 @@ def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
 
 
 def audit_of(site: Site, runs: Sequence[Row]) -> Job | None:
-    """What the audit notes of each run; None while one goes on, which ends with an audit."""
+    """Return the audit's notes on each run; None while a run goes on, which ends with an audit."""
     return None if any(run["followed"] for run in runs) else computed(site, ("audit",))

@@ -37,49 +37,49 @@ DRAWN = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox"
 
 
 def tables_page(site: Site, _: Mapping[str, str]) -> str:
-    """The list of all tables and figures."""
+    """Return the list of all tables and figures."""
     grouped = {name for names in GROUPS.values() for name in names}
     others = [name for name in TABLES if name not in grouped]
     groups = {of: [name for name in names if name in TABLES] for of, names in GROUPS.items()}
     groups["More"] += others
-    return site.render("tables.html", here="tables", tables=TABLES, figures=FIGURES, groups=groups)
+    return site.render("tables.html", view="tables", tables=TABLES, figures=FIGURES, groups=groups)
 
 
 def table_file(site: Site, name: str, suffix: str, _: Mapping[str, str]) -> Response:
-    """A table as a file; raises NotThere and StoreError."""
+    """Return a table as a file; raises NotThere and StoreError."""
     form = TABLE_FILES[_known(suffix, TABLE_FILES, "file")]
     content = awaited(site, ("table", _known(name, TABLES, "table"), "", ""))
     return download(render([from_text(content["table"])], form) + "\n", f"{name}.{suffix}")
 
 
 def figure_file(site: Site, name: str, suffix: str, _: Mapping[str, str]) -> Response:
-    """A figure as a file; raises NotThere and StoreError."""
+    """Return a figure as a file; raises NotThere and StoreError."""
     kind = FIGURE_FILES[_known(suffix, FIGURE_FILES, "file")]
     content = awaited(site, ("figure", _known(name, FIGURES, "figure"), suffix))
     return Response(content["file"], headers={"content-security-policy": DRAWN}, media_type=kind)
 
 
 def figure_page(site: Site, name: str, _: Mapping[str, str]) -> str:
-    """A figure with its caption, its files, and how it is cited; raises NotThere."""
+    """Return a figure with its caption, its files and its citation; raises NotThere."""
     about = FIGURES[_known(name, FIGURES, "figure")]
-    found = computed(site, ("figure", name, "svg"))
+    job = computed(site, ("figure", name, "svg"))
     return site.render(
         "figure.html",
-        here="tables",
+        view="tables",
         name=name,
         about=about,
-        computed=found,
-        image=b64encode(found.content["file"]).decode() if found.content else "",
+        computed=job,
+        image=b64encode(job.content["file"]).decode() if job.content else "",
         descriptions=descriptions_of(site),
         version=metadata.version("merge-runner"),
     )
 
 
 def cite_page(site: Site, _: Mapping[str, str]) -> str:
-    """How the results of a study are cited."""
+    """Return the page that says how to cite the results of a study."""
     return site.render(
         "cite.html",
-        here="cite",
+        view="cite",
         computed=computed(site, ("digest",)),
         cited_as="Results",
         descriptions=descriptions_of(site),
@@ -88,16 +88,16 @@ def cite_page(site: Site, _: Mapping[str, str]) -> str:
 
 
 def table_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
-    """One table; raises NotThere."""
-    found, table = computed_table(site, _known(name, TABLES, "table"))
+    """Return the page of a table; raises NotThere."""
+    job, table = computed_table(site, _known(name, TABLES, "table"))
     without = every(asked, "without")
     columns = shown_columns(table) if table else []
     return site.render(
         "table.html",
-        here="tables",
+        view="tables",
         name=name,
         about=TABLES[name].about,
-        computed=found,
+        computed=job,
         table=table
         and table_view(
             table, lambda table, row, column: site.at.cell(table.name, row.id, column.name)

@@ -1,4 +1,4 @@
-"""One trial, one decision of it, and the trials to lay beside it: found by words, or offered."""
+"""One trial, one decision of it, and other trials to compare: a search by words, or an offer."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from merge_runner_analysis.web.trial.sentences import (
     facts,
     judged_text,
     outcome_text,
+    study_words,
     summary,
-    told,
 )
 
-# What is offered to lay beside a trial, and by what rule.
+# Offers of a trial to compare with, and their rules.
 HUMAN, REPETITION = "nearest human", "next repetition"
 OFFERS = {
     HUMAN: "the human trial of this condition, at such speeds, whose headway "
@@ -87,13 +87,13 @@ def _page(site: Site, row: Row, trial: Trial, template: str) -> str:
     account = account_of(row, trial)
     return site.render(
         template,
-        here="trials",
+        view="trials",
         scripts=REPLAY,
         panels=panels(site, row, trial),
         row=row,
         outcome=outcome_text(row),
         facts=facts(row),
-        told=told(row, trial),
+        study_words=study_words(row, trial),
         judged=judged_text(trial.scenario),
         view_box=VIEW_BOX,
         data=replay_data(row, trial, account) if trial.states else None,
@@ -108,7 +108,7 @@ def _page(site: Site, row: Row, trial: Trial, template: str) -> str:
 
 
 def read(site: Site, rows: Sequence[Row]) -> list[Trial]:
-    """What was stored of trials."""
+    """Read the stored trials of these rows."""
     with site.catalogue.cursor() as connection:
         return read_trials(connection, [(row["trial_id"], row["spec_hash"]) for row in rows])
 
@@ -116,14 +116,14 @@ def read(site: Site, rows: Sequence[Row]) -> list[Trial]:
 def panels(site: Site, row: Row, trial: Trial) -> list[Markup]:
     """Return the panels of all decisions of a trial, in the order of its ribbons."""
     others = site.catalogue.others
-    decisions = (d for mine in trial.by_side.values() for d in mine)
+    decisions = (d for of_side in trial.by_side.values() for d in of_side)
     return [decision_panel(site, row, trial, d, others) for d in decisions]
 
 
 def decision_panel(
     site: Site, row: Row, trial: Trial, decision: Row, others: Sequence[Pair]
 ) -> Markup:
-    """What a driver was told, said, planned and did; ``others`` are answers of another model."""
+    """Return a decision's observation, reply, plan and action; ``others``: served models."""
     named = {"side": decision["side"], "decision": decision["decision"]}
     query = REPLY.format(decision["call_key"])
     raw = site.at.to("sql.csv", q=query) if site.at.served else ""
@@ -156,7 +156,7 @@ def decision_panel(
 
 
 def _older_s(decision: Row, trial: Trial) -> float | None:
-    """When the plan was made that a decision without one fell back on; None where none was left."""
+    """Return the time of the older plan that a fallback drove on; None where none was left."""
     pace, before = trial.paces[decision["side"]], decision["before"]
     while before and not before["plan"]:
         before = before["before"]
@@ -168,7 +168,7 @@ def _older_s(decision: Row, trial: Trial) -> float | None:
 
 
 def others(site: Site, trial_id: str, asked: Mapping[str, str]) -> dict[str, Any] | str | None:
-    """What a trial's page asks about others: one to lay beside it, one that is offered, or several.
+    """Return other trials for a trial's page: one to compare, one on offer, or several.
 
     ``compare=KEY`` gives what a replay draws of it, ``offer=KIND`` a key; None where there is none.
     ``q=WORDS`` gives the first trials that have the words, those of the same condition before
@@ -196,7 +196,7 @@ def others(site: Site, trial_id: str, asked: Mapping[str, str]) -> dict[str, Any
 
 
 def named(site: Site, key: str) -> Row | None:
-    """The trial that a key stands for; a name with several specs stands for the first of them."""
+    """Return the trial of a key; a name with several specs stands for the first of them."""
     name, _, spec = key.rpartition("@")
     return site.catalogue.find(key) or (site.catalogue.find(name, spec) if name else None)
 

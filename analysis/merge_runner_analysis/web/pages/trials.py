@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from merge_runner.prompts.blocks import decomposed
 from merge_runner.study.arms import OPPONENT
 from merge_runner_analysis.tables import TABLES
-from merge_runner_analysis.web.catalogue import PAGE, SORTS, Wanted
+from merge_runner_analysis.web.catalogue import PAGE, SORTS, TrialFilter
 from merge_runner_analysis.web.computed import awaited, computed
 from merge_runner_analysis.web.filters import HEADINGS, filter_of, sort_of
 from merge_runner_analysis.web.listing import FACTOR
@@ -22,32 +22,32 @@ MOST = 4  # drivers whose sums stand above a list
 
 
 def trials_page(site: Site, asked: Mapping[str, str]) -> str:
-    """One page of the trials that an address asks for; raises NothingNew as it was ``seen``."""
+    """Return a page of the trials in an address; raises NothingNew where it is as ``seen``."""
     state = site.catalogue.state
     seen = news_of(state, asked.get("seen", ""))
     news = site.at.to("trials", **{**asked, "seen": seen})
     if "seen" in asked:  # that the trials are no longer those that were seen
-        here = site.at.to("trials", **{**asked, "seen": ""})
-        return site.render("_news.html", trials=state["trials"], here=here, news=news)
+        address = site.at.to("trials", **{**asked, "seen": ""})
+        return site.render("_news.html", trials=state["trials"], address=address, news=news)
     chosen, sort, cell = filter_of(asked), sort_of(asked), cell_of(asked)
-    wanted, named = chosen, None
+    filters, named = chosen, None
     if cell:
         named = computed(site, cell_request(cell))
         if named.content is None:
-            return site.render("behind.html", here="trials", cell=cell["cell"], computed=named)
-        wanted = {**chosen, "trials": named.content["trials"]}
-    totals = site.catalogue.totals(wanted)
+            return site.render("behind.html", view="trials", cell=cell["cell"], computed=named)
+        filters = {**chosen, "trials": named.content["trials"]}
+    totals = site.catalogue.totals(filters)
     trials = sum(part["trials"] for part in totals)
     last = max(1, -(-trials // PAGE))
     page = min(whole(asked.get("page", "")) or 1, last)
-    rows = site.catalogue.page(wanted, sort, page)
+    rows = site.catalogue.page(filters, sort, page)
     # An export has no filters. Why replies were invalid says whether they were, too.
-    facets = {} if site.is_still else facets_shown(site, site.catalogue.facets(wanted))
+    facets = {} if site.is_still else facets_shown(site, site.catalogue.facets(filters))
     if not chosen.get("validity"):
         facets.pop("validity", None)
     return site.render(
         "trials.html",
-        here="trials",
+        view="trials",
         facets=facets,
         chosen=chosen,
         headings=HEADINGS,
@@ -77,7 +77,7 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
 
 
 def _factors(row: Row) -> str:
-    """The levels of a trial's study that its driver does not name already."""
+    """Return a trial's levels, without those that its driver's name has."""
     levels = [*(row["levels"] or ())]
     return ", ".join(
         level
@@ -86,32 +86,32 @@ def _factors(row: Row) -> str:
     )
 
 
-def _unknown(site: Site, chosen: Wanted) -> list[tuple[str, str, list[str]]]:
-    """Facets, as they are called, with a chosen value that no trial has, and the values there."""
+def _unknown(site: Site, chosen: TrialFilter) -> list[tuple[str, str, list[str]]]:
+    """Return facets, by heading, with a chosen value that no trial has, and the known values."""
     known = site.catalogue.facets({})
     return [
-        (HEADINGS.get(name, name.removeprefix(FACTOR)), value, [there for there, _ in values])
+        (HEADINGS.get(name, name.removeprefix(FACTOR)), value, [text for text, _ in values])
         for name, value in chosen.items()
         if name != "q" and value not in dict(values := known.get(name, []))
     ]
 
 
-def export_filter(site: Site, asked: Mapping[str, str]) -> Wanted:
-    """The filter in an address, whose cell may have to be computed.
+def export_filter(site: Site, asked: Mapping[str, str]) -> TrialFilter:
+    """Return the filter in an address, whose cell may have to be computed.
 
     Raises NotThere, StoreError and TooMuch.
     """
-    wanted, cell = filter_of(asked), cell_of(asked)
-    return {**wanted, "trials": awaited(site, cell_request(cell))["trials"]} if cell else wanted
+    filters, cell = filter_of(asked), cell_of(asked)
+    return {**filters, "trials": awaited(site, cell_request(cell))["trials"]} if cell else filters
 
 
 def cell_of(asked: Mapping[str, str]) -> dict[str, str]:
-    """The cell that an address names, with the part of the trials that it is of; empty for none."""
+    """Return the cell in an address, with its part of the trials; empty for none."""
     return {name: asked[name] for name in CELL if asked.get(name)} if asked.get("cell") else {}
 
 
 def cell_request(cell: Mapping[str, str]) -> tuple[str, ...]:
-    """What is asked for a cell, ``TABLE/ROW:COLUMN``; raises NotThere."""
+    """Return the request for a cell, ``TABLE/ROW:COLUMN``; raises NotThere."""
     table, _, rest = cell["cell"].partition("/")
     row, _, column = rest.rpartition(":")
     if table not in TABLES or not row:

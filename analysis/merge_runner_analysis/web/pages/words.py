@@ -1,4 +1,4 @@
-"""What drivers said, searched: decisions whose words hold those of a query."""
+"""Search in drivers' words: decisions whose words hold those of a query."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ LIMIT = re.compile(r"-?(0?\.\d{1,6}|[01](\.0{1,6})?)")
 
 
 def words_page(site: Site, asked: Mapping[str, str]) -> str:
-    """A page of the decisions that an address asks for."""
+    """Return a page of the decisions that match an address."""
     query = asked.get("q", "")
-    wanted = filter_of(asked) | {name: asked.get(name, "") for name in FACETS}
-    wanted = {name: value for name, value in wanted.items() if value and name != "q"}
+    filters = filter_of(asked) | {name: asked.get(name, "") for name in FACETS}
+    filters = {name: value for name, value in filters.items() if value and name != "q"}
     limits = {name: text for name in LIMITS if LIMIT.fullmatch(text := asked.get(name, ""))}
-    chosen = {**wanted, **limits, "q": query}
+    chosen = {**filters, **limits, "q": query}
     page = whole(asked.get("page", "")) or 1
-    found = site.words.search(wanted, terms_of(query), limits, page)
+    result = site.words.search(filters, terms_of(query), limits, page)
     return site.render(
         "words.html",
-        here="words",
+        view="words",
         headings=HEADINGS,
         carried=carried(asked),
         limits=LIMITS,
-        found=found,
-        facets=facets_shown(site, found["facets"]),
+        result=result,
+        facets=facets_shown(site, result["facets"]),
         chosen=chosen,
         kept=chosen,
     )

@@ -1,8 +1,8 @@
-"""Why a trial went as it did: its class, what happened in words, and the moments to mark.
+"""Explanation of a trial: its class, its events in words, and the moments to mark.
 
-What would have become of a collision had one driver done otherwise is moved and judged by the
-world's own rules; the other vehicle drives as it drove, and keeps its speed from where its samples
-end.
+To see whether one driver could have avoided a collision, its vehicle is moved and judged by the
+scenario's own rules; the other vehicle drives as it drove, and keeps its speed after its last
+sample.
 """
 
 from __future__ import annotations
@@ -48,16 +48,16 @@ class Course:
         return len(self.times_s) - 1
 
     def change_mps(self, side: Side, sample: int) -> float:
-        """How much faster a vehicle is than it was at the start of control."""
+        """Return a vehicle's change of speed since the start of control."""
         return self.speeds_mps[side][sample] - self.speeds_mps[side][0]
 
     def driven_mps2(self, side: Side, sample: int) -> float:
-        """The acceleration of a vehicle from a sample, which is not the last one, to the next."""
+        """Return a vehicle's acceleration from a sample, which is not the last one, to the next."""
         (before_mps, after_mps) = self.speeds_mps[side][sample : sample + 2]
         return (after_mps - before_mps) / (self.times_s[sample + 1] - self.times_s[sample])
 
     def avoided(self, side: Side, action: float, since: int) -> bool:
-        """Whether there is no collision if a side drives one action from a sample on."""
+        """Return whether a side avoids the collision by driving one action from a sample on."""
         scenario, commanded_mps2 = self.scenario, action * self.scenario.max_acceleration_mps2
         own_m, speed = self.positions_m[side][since], self.speeds_mps[side][since]
         for other_m in self._onward(other_side(side), since):
@@ -71,7 +71,7 @@ class Course:
         return True
 
     def last_chance(self, side: Side, action: float, after: int = -1) -> int | None:
-        """The last sample from which the hardest action of a side still avoids the collision.
+        """Return the last sample from which a side's hardest action still avoids the collision.
 
         Of two moments the earlier one is always the better to begin at. None where no sample
         ``after`` a given one will do.
@@ -88,7 +88,7 @@ class Course:
         return low
 
     def least_mps2(self, side: Side, action: float, since: int) -> float:
-        """The least strength that avoids the collision from a sample at which the hardest does."""
+        """Return the least strength that avoids the collision from a sample on."""
         low, high = 0.0, 1.0
         if self.avoided(side, low, since):
             return low
@@ -99,7 +99,7 @@ class Course:
         return high * self.scenario.max_acceleration_mps2
 
     def _onward(self, side: Side, since: int) -> Iterator[float]:
-        """The positions of a vehicle after a sample, until a trial would be timed out."""
+        """Yield a vehicle's positions after a sample, until a trial would be timed out."""
         positions, speed = self.positions_m[side], self.speeds_mps[side][-1]
         yield from positions[since + 1 :]
         position = positions[-1]
@@ -121,10 +121,10 @@ time-based analysis of road user behaviour in normal and critical encounters (TU
 NEAR_GAP_M = 1.0
 """A gap that is as good as none: ours. The humans' mean is 3.85 m."""
 LONG_WAIT_TIMES = 2.0
-"""A wait is long where it takes so many times as long as at the initial speeds: ours."""
+"""A wait is long from this multiple of the time at the initial speeds on: ours."""
 
-# Of trials that did not collide, by their columns and ``alone_s``: when the first vehicle would
-# have been at the merge point if both had kept their initial speeds.
+# Classes of trials without a collision, by their columns and ``alone_s``: the time at which the
+# first vehicle would have been at the merge point if both had kept their initial speeds.
 OTHER_ACCOUNTS = f"""
 CASE WHEN status = 'finished' AND (gap_m < {NEAR_GAP_M} OR min_ttc_s < {NEAR_TTC_S})
     THEN '{NEAR_MISS}'
@@ -142,7 +142,7 @@ Decided = Sequence[Mapping[str, Any]]
 
 
 def collision_class(course: Course, decisions: Decided) -> str:
-    """How a collision came about.
+    """Return the class of a collision.
 
     It is judged at the last sample from which one driver alone could still have avoided it, by
     braking or speeding up as hard as the vehicle can. ``invalid plan``: a driver drove on an older
@@ -161,7 +161,7 @@ def collision_class(course: Course, decisions: Decided) -> str:
 
 
 def judged_at(course: Course) -> int:
-    """The last sample from which one driver alone avoids the collision; the end where none is."""
+    """Return the last sample from which one driver alone avoids the collision, or the end."""
     latest = -1
     for side in SIDES:
         for action in (BRAKING, SPEEDING_UP):
@@ -203,7 +203,7 @@ class Mark:
 
 @dataclass(frozen=True, slots=True)
 class Account:
-    """What is to be said of a trial of a class."""
+    """Explanation of a trial: a heading, sentences, and marks."""
 
     heading: str
     sentences: list[str]
@@ -252,7 +252,7 @@ def _collision(course: Course, name: str) -> str:
 
 
 def _avoidable(course: Course, side: Side, chance: int | None) -> str:
-    """Until when a driver could have avoided the collision, and by how much, rounded up."""
+    """Return until when a driver could have avoided the collision, and by how much, rounded up."""
     if chance is None:
         return f"By braking alone the {side} driver could never have avoided it."
     done, _ = _braking(course, side, chance)
@@ -263,9 +263,9 @@ def _avoidable(course: Course, side: Side, chance: int | None) -> str:
 
 
 def _braking(course: Course, side: Side, chance: int) -> tuple[str, str]:
-    """What would have avoided the collision from a sample on, given how the vehicle then drove.
+    """Return the braking that avoids the collision from a sample on, compared with the driven.
 
-    As it stands in a sentence, rounded up, and as a mark calls it.
+    Two texts: for a sentence, rounded up, and for a mark.
     """
     least_mps2 = ceil(course.least_mps2(side, BRAKING, chance) * 10 - TICK_S) / 10
     braked_mps2 = -course.driven_mps2(side, chance)
@@ -284,7 +284,7 @@ def _braking(course: Course, side: Side, chance: int) -> tuple[str, str]:
 def _marks(
     course: Course, decisions: Decided, chances: Mapping[Side, int | None]
 ) -> Iterator[Mark]:
-    """Each choice that differs from the one before, each fallback, and each last chance."""
+    """Yield each choice that differs from the one before, each fallback and each last chance."""
     before: dict[Side, str] = {}
     for decision in decisions:
         at_s, side, word = decision["time_s"], decision["side"], decision["tactical"]

@@ -33,14 +33,14 @@ class Part:
 
     @property
     def changed(self) -> bool:
-        """Whether anything in it is new, or gone."""
+        """Return whether any piece is new, or gone."""
         return any(change != "same" for change, _ in self.pieces)
 
 
 def parts_of(
     prompt: str, before: str | None, digests: Mapping[str, str] | None = None
 ) -> list[Part]:
-    """The parts of a prompt, each compared with the same block of the one before.
+    """Return the parts of a prompt, each compared with the same block of the one before.
 
     Those that are only in the one before come last. Without one before, nothing is marked. The
     ``digests`` of its blocks, as its spec has them, name the words of a study.
@@ -54,13 +54,13 @@ def parts_of(
 
 
 def digests_of(blocks: Mapping[str, str], side: Side) -> dict[str, str]:
-    """The digests of the blocks that a spec has, without those of the other side's prompt alone."""
+    """Return the digests of a spec's blocks, without those of the other side's prompt alone."""
     named = ((name.partition("@"), digest) for name, digest in blocks.items())
     return {name: digest for (name, _, of), digest in named if of in ("", side)}
 
 
 def words_of(prompt: str, digests: Mapping[str, str]) -> list[tuple[str, str]]:
-    """The words of a study in a prompt: the level or prompt that adds them, and their text."""
+    """Return the words of a study in a prompt: the level or prompt that adds them, their text."""
     return [
         (name, text)
         for name, text in _blocks(prompt, tuple(digests.items()))
@@ -70,7 +70,7 @@ def words_of(prompt: str, digests: Mapping[str, str]) -> list[tuple[str, str]]:
 
 @lru_cache(KEPT)
 def _blocks(prompt: str, digests: tuple[tuple[str, str], ...]) -> list[tuple[str, str]]:
-    """Name and text of each block; what belongs to none that is known here has no name.
+    """Return the name and text of each block; text of no block that is known here has no name.
 
     Of the blocks whose paragraphs begin like the next ones the one with the longest beginnings is
     meant. ``digests`` are name and digest of all that the prompt has.
@@ -103,7 +103,7 @@ def _blocks(prompt: str, digests: tuple[tuple[str, str], ...]) -> list[tuple[str
 
 
 def _own_block(paragraphs: Sequence[str], digests: Iterable[tuple[str, str]]) -> tuple[str, int]:
-    """The name of the block that comes next, known by the digest of its text, and its length.
+    """Return the name of the next block, known by the digest of its text, and its length.
 
     The digest covers what the block stands before, too.
     """
@@ -118,14 +118,14 @@ def _own_block(paragraphs: Sequence[str], digests: Iterable[tuple[str, str]]) ->
 
 
 def level_of(block: str) -> str:
-    """The level or prompt that adds a block: ``hurry=yes`` of ``hurry=yes.1``."""
+    """Return the level or prompt that adds a block: ``hurry=yes`` of ``hurry=yes.1``."""
     name, _, number = block.rpartition(".")
     return name if number.isdigit() and block not in BLOCKS else block
 
 
 @cache
 def _begun(template: str) -> list[str]:
-    """The text of each paragraph up to its first value, by which it is known."""
+    """Return the text of each paragraph up to its first value, by which it is known."""
     return [paragraph.partition("{")[0] for paragraph in template.split("\n\n")]
 
 
@@ -135,7 +135,7 @@ def _words(text: str) -> list[str]:
 
 
 def _compared(before: str, now: str) -> tuple[tuple[Change, str], ...]:
-    """The text of a block, word by word, with what is gone from the one before."""
+    """Return the text of a block, word by word, with the words gone since the one before."""
     if before == now:
         return (("same", now),)
     old, new = _words(before), _words(now)

@@ -63,26 +63,26 @@ class Trial:
         """The decisions of each side that has any."""
         decisions = self.decisions
         return {
-            side: mine for side in SIDES if (mine := [d for d in decisions if d["side"] == side])
+            side: rows for side in SIDES if (rows := [d for d in decisions if d["side"] == side])
         }
 
     def interval_s(self, side: Side) -> float:
-        """How long a decision of a side is driven."""
+        """Return how long a decision of a side is driven."""
         return self.paces[side].interval_steps * self.scenario.step_s
 
 
 def read_trials(connection: DuckDBPyConnection, keys: Sequence[Key]) -> list[Trial]:
     """Read trials that are known to be there, by their names and specs."""
-    wanted = {"trials": [name for name, _ in keys], "specs": [spec for _, spec in keys]}
+    parameters = {"trials": [name for name, _ in keys], "specs": [spec for _, spec in keys]}
     states, calls, tasks = (
-        _by_trial(records(connection, sql, wanted)) for sql in (STATES, CALLS, TASKS)
+        _by_trial(records(connection, sql, parameters)) for sql in (STATES, CALLS, TASKS)
     )
-    result = connection.execute(DECISIONS, wanted)
+    result = connection.execute(DECISIONS, parameters)
     lost = dict.fromkeys(names_of(result)) | {"valid": False, "fallback": False, "lost": True}
     rows = list(by_name(result))
-    is_told = any(row["other_seen"] is not None for row in rows)
+    is_noisy = any(row["other_seen"] is not None for row in rows)
     decisions = _by_trial(rows)
-    perceived = _by_trial(records(connection, PERCEIVED, wanted) if is_told else ())
+    perceived = _by_trial(records(connection, PERCEIVED, parameters) if is_noisy else ())
     return [
         _trial(tasks[key][0], states[key], decisions[key], calls[key], perceived[key], lost)
         for key in keys
@@ -136,11 +136,11 @@ def _trial(
 
 
 def scenario_of(source: str, spec: Mapping[str, Any] | None) -> ScenarioConfig:
-    """The task of a trial, as its spec tells it, or as it usually is."""
+    """Return the task of a trial from its spec, or the usual one."""
     usual = HUMAN_TASK if source == "human" else {}
     return ScenarioConfig.model_validate(usual if spec is None else spec)
 
 
 def controlled(samples: Row, name: str) -> list[float]:
-    """The samples of a vehicle from the start of control on; in the tunnels nobody controls it."""
+    """Return a vehicle's samples from the start of control on; in the tunnels it has none."""
     return [x for t, x in zip(samples["time_s"], samples[name], strict=True) if t >= 0]

@@ -1,4 +1,4 @@
-"""What the page of a trial draws: the replay with its moments, and plans."""
+"""Data of a trial's pictures: the replay with its moments, and plans."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ DRAWN = {"t": "time_s", "x": "position_m", "v": "velocity_mps", "a": "accelerati
 
 
 def account_of(row: Row, trial: Trial) -> Account | None:
-    """Why a trial went as it did; None where there is nothing to explain."""
+    """Return the explanation of a trial; None where there is nothing to explain."""
     if row["account"] is None:
         return None
     times, places, speeds = (
@@ -34,7 +34,7 @@ def account_of(row: Row, trial: Trial) -> Account | None:
 
 
 def replay_data(row: Row, trial: Trial, account: Account | None) -> dict[str, Any]:
-    """What the replay draws: samples, the track, the bounds of a collision."""
+    """Return the data of the replay: samples, the track, the bounds of a collision."""
     scenario = trial.scenario
     return {
         "spec": row["spec_hash"],
@@ -68,7 +68,7 @@ def replay_data(row: Row, trial: Trial, account: Account | None) -> dict[str, An
 
 
 def marks(row: Row, trial: Trial, account: Account | None) -> list[dict[str, Any]]:
-    """The moments that matter, in order: merges, a collision, and those of the account."""
+    """Return the moments that matter, in order: merges, a collision, those of the account."""
     moments: list[tuple[float, str, str, str]] = [
         (reached_s, side, "merge", f"{side} merges")
         for side, samples in trial.states.items()
@@ -85,7 +85,7 @@ def marks(row: Row, trial: Trial, account: Account | None) -> list[dict[str, Any
 
 
 def reaches_s(samples: Row, place_m: float) -> float | None:
-    """When a vehicle is at a place, between two samples in proportion; None where it never is."""
+    """Return when a vehicle is at a place, linear between samples; None where it never is."""
     places, times = samples["position_m"], samples["time_s"]
     i = bisect_left(places, place_m)  # no vehicle drives backwards
     if i in {0, len(places)}:
@@ -95,7 +95,7 @@ def reaches_s(samples: Row, place_m: float) -> float | None:
 
 
 def collision_bounds(trial: Trial) -> list[float | None]:
-    """The headway below which the vehicles collide, for each sample; None where they cannot.
+    """Return the headway below which the vehicles collide, by sample; None where they cannot.
 
     To a millimetre, at their mean position: the further apart they are along the road, the less
     they overlap.
@@ -121,7 +121,7 @@ def collision_bounds(trial: Trial) -> list[float | None]:
 
 
 def plan_chart(row: Row, trial: Trial) -> dict[str, Any] | None:
-    """A plan as steps over its horizon, beside what the previous plan intended for that time.
+    """Return a plan as steps over its horizon, beside the previous plan for that time.
 
     None where there is no plan.
     """

@@ -1,4 +1,4 @@
-"""What is said of a trial: how it ended, what it was about, and what its charts show."""
+"""Sentences on a trial: its outcome, its condition and measures, and its charts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from merge_runner_analysis.wording import money, number
 
 
 def outcome_text(row: Row) -> str:
-    """How a trial ended, in a sentence."""
+    """Return how a trial ended, in a sentence."""
     end = f"{row['end_time_s']:.1f} s"
     without_first = {
         "collided": f"The vehicles crashed after {end}.",
@@ -31,7 +31,7 @@ def outcome_text(row: Row) -> str:
 
 
 def judged_text(scenario: ScenarioConfig) -> str:
-    """What the picture draws of the rule by which the scenario judges a collision."""
+    """Describe the outlines that the picture draws for the scenario's collision rule."""
     length = f"{scenario.vehicle_length_m:g} m"
     drawn = {
         "euclid2d": f"circles of {length}, a vehicle's length, about the centres",
@@ -42,7 +42,7 @@ def judged_text(scenario: ScenarioConfig) -> str:
 
 
 def facts(row: Row) -> list[str]:
-    """What a trial was about and what was measured, in short sentences."""
+    """Return a trial's condition and measures, in short sentences."""
     condition = condition_text(row["projected_headway_m"], row["relative_velocity_mps"])
     programs = "no prompt, since only programs drive"
     prompt = programs if row["source"] == "driver" else f"the prompt {title_of(row['variant'])}"
@@ -58,8 +58,8 @@ def facts(row: Row) -> list[str]:
     return [f"{text}." for text in texts if text]
 
 
-def told(row: Row, trial: Trial) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Who was told which words of a study: the drivers, and the levels with their text.
+def study_words(row: Row, trial: Trial) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Return the words of a study by driver: a heading, and the levels with their text.
 
     Empty where neither prompt has any.
     """
@@ -78,7 +78,7 @@ def told(row: Row, trial: Trial) -> list[tuple[str, list[tuple[str, str]]]]:
 
 
 def summary(trial: Trial) -> list[str]:
-    """What the charts of a trial show, in sentences."""
+    """Describe the charts of a trial, a sentence for each vehicle."""
     lines = []
     for side, samples in trial.states.items():
         speeds = controlled(samples, "velocity_mps")
