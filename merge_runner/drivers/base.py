@@ -71,7 +71,7 @@ class Driver(Protocol):
         ...
 
     async def decide(self, observation: Observation, number: int) -> Decision:
-        """Return the decision at the ``number``-th instant of its pace; raise CallFailed.
+        """Return the decision at the ``number``-th instant of its pace, without waiting.
 
         Instants count from 0, the start of control. With the control start ``own_exit`` that is
         the earlier exit, and the first number of the driver that exits later is above 0.

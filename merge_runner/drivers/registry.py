@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from inspect import iscoroutinefunction
 from math import inf, isfinite
 from typing import TYPE_CHECKING, Any, TypeGuard
 
@@ -65,6 +66,10 @@ class Program:
         name = self.driver.__qualname__
         if not isinstance(self.revision, int) or self.revision < 1:
             raise UsageError(f"the revision of the driver {name} is a whole number from 1 on")
+        if not iscoroutinefunction(getattr(self.driver, "decide", None)):
+            raise UsageError(
+                f"the driver {name} needs `async def decide(self, observation, number)`"
+            )
         if self.rate_hz is not None and not 0 < self.rate_hz < inf:
             raise UsageError(f"the driver {name} needs a rate_hz above 0")
         if self.sets:

@@ -25,7 +25,7 @@ from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.call import Wait
 from merge_runner.llm.ledger import Cap, Ledger
 from merge_runner.run.cluster_assignment import Assignment, recorded_calls
-from merge_runner.run.cluster_worker import Chunk, Played, RunSetup, stop
+from merge_runner.run.cluster_worker import Chunk, Played, RunSetup, forget, stop
 from merge_runner.run.guard import FirstDecisions
 from merge_runner.run.trials import Capacity, Ended
 from merge_runner.trial_records import TrialRecord, TrialSpec
@@ -107,6 +107,8 @@ class ClusterRunner:
         while self._assigned:
             with contextlib.suppress(MergeRunnerError, OSError):  # the first one has ended the run
                 await self._collect()
+        with contextlib.suppress(OSError):
+            await self._client.run(forget, self._setup.run, on_error="ignore")
 
     def _take(self, event: tuple[float, tuple[Any, ...]]) -> None:
         """Hand an event of a worker, with its time, to the chunk that it names first."""
@@ -161,11 +163,14 @@ class ClusterRunner:
             works, timeout=COUNT_WORKERS_EVERY_S, return_when=asyncio.FIRST_COMPLETED
         )
         for work in filter(asyncio.Task.done, works):
-            assignment, played = self._assigned.pop(work), work.result()
+            assignment = self._assigned.pop(work)
+            played, unbooked = work.result()
             if isinstance(played, Played):
                 self._keep(assignment, played)
             else:
                 self._lose(assignment, played)
+            if unbooked is not None:
+                raise unbooked
 
     def _keep(self, assignment: Assignment, played: Played) -> None:
         """Keep the results and the costs of a chunk; costs already ``booked`` count once."""
@@ -188,8 +193,10 @@ class ClusterRunner:
             for row in record.decisions if isinstance(record, TrialRecord) else ():
                 if asked[row.side] in plan.entries:
                     self.first.count(asked[row.side], row.decision)
-        if (error := played.error) is not None:
-            raise type(error)(f"{error} (told by the Dask worker {assignment.address})")
+        if played.exit_code:
+            stopped = SweepStopped(f"{played.error} (told by the Dask worker {assignment.address})")
+            stopped.exit_code = played.exit_code
+            raise stopped
 
     def _lose(self, assignment: Assignment, error: Exception) -> None:
         """Put the trials of a lost chunk back; its attempts of unknown cost stay reserved."""

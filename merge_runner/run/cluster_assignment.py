@@ -16,7 +16,14 @@ from merge_runner.llm.durable import Operation, Rows
 from merge_runner.llm.ledger import CallLabel, Ledger
 from merge_runner.llm.store import CachedCall
 from merge_runner.records import Attempt
-from merge_runner.run.cluster_worker import Chunk, Recorded, answer, fingerprint, play_chunk
+from merge_runner.run.cluster_worker import (
+    Chunk,
+    Recorded,
+    answer,
+    fingerprint,
+    play_chunk,
+    stop,
+)
 from merge_runner.run.plan import Plan
 from merge_runner.run.replay import Replay
 from merge_runner.trial_records import TrialSpec
@@ -46,9 +53,12 @@ class Assignment:
         cap = self.chunk.cap
         return max(0.0, cap.usd - sum(self.usd.values())) if cap is not None else 0.0
 
-    async def play(self, client: Client, ledger: Ledger) -> Any:  # noqa: ANN401 # or why it is lost
-        """Let the worker play the chunk, and book its attempts meanwhile; return its result."""
-        run = partial(client.run, workers=[self.address])
+    async def play(self, client: Client, ledger: Ledger) -> tuple[Any, BaseException | None]:
+        """Let the worker play the chunk, and book its attempts meanwhile.
+
+        Returns the worker's result, or why it is lost, and the error that ended the booking.
+        """
+        run, setup = partial(client.run, workers=[self.address]), self.chunk.setup
 
         async def play() -> Any:  # noqa: ANN401
             # Not as a task of Dask, which would play a lost one again before its loss is booked.
@@ -60,13 +70,18 @@ class Assignment:
             return results[self.address]
 
         async def book() -> None:
-            name, setup = self.chunk.name, self.chunk.setup
             while (answers := await self._book(ledger)) is not None:
                 if answers:
-                    await run(answer, setup.run, name, answers, on_error="ignore")
+                    await run(answer, setup.run, self.chunk.name, answers, on_error="ignore")
 
-        result, _ = await asyncio.gather(play(), book())
-        return result
+        playing, booking = asyncio.create_task(play()), asyncio.create_task(book())
+        await asyncio.wait([playing, booking], return_when=asyncio.FIRST_EXCEPTION)
+        if not playing.done():  # no attempt gets an answer any more; what is paid is kept
+            with contextlib.suppress(OSError):  # the scheduler is gone, as the result will say
+                await run(stop, setup.run, on_error="ignore")
+        await asyncio.wait([playing, booking])
+        unbooked = booking.exception()
+        return playing.result(), unbooked
 
     async def _book(self, ledger: Ledger) -> dict[int, bool] | None:
         """Reserve the attempts and book the costs of the next events, in their order.

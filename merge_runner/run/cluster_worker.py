@@ -12,6 +12,7 @@ from functools import cache, partial
 from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from traceback import walk_tb
 from typing import TYPE_CHECKING
 
 import merge_runner
@@ -31,6 +32,7 @@ from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.options import Options
 from merge_runner.run.plan import Plan
 from merge_runner.study.parts import catalogue_of
+from merge_runner.text_safety import one_line
 from merge_runner.trial_records import TrialRecord, TrialSpec
 
 if TYPE_CHECKING:
@@ -73,14 +75,25 @@ class Chunk:
 
 @dataclass(slots=True)
 class Played:
-    """Result of a chunk; ``spent`` and ``opened`` are rows of the worker's ledger."""
+    """Result of a chunk; ``spent`` and ``opened`` are rows of the worker's ledger.
+
+    ``error`` is the text of what ended it, for a run that exits with ``exit_code``.
+    """
 
     ended: list[tuple[TrialSpec, TrialRecord | TrialSuspended]] = field(default_factory=list)
     recorded: Recorded = ((), ())
     spent: Rows = field(default_factory=list)
     opened: Rows = field(default_factory=list)
     meters: Mapping[str, Meter] = field(default_factory=dict)
-    error: MergeRunnerError | None = None
+    error: str = ""
+    exit_code: int = 0
+
+    def fail(self, error: BaseException) -> None:
+        """Note an error as text, since not every exception can be pickled."""
+        if isinstance(error, MergeRunnerError):
+            self.error, self.exit_code = str(error), error.exit_code
+        else:
+            self.error, self.exit_code = _described(error), SweepStopped.exit_code
 
 
 class RemoteLedger(Ledger):
@@ -171,14 +184,19 @@ def fingerprint() -> str:
     return f"{merge_runner.__version__} ({code.hexdigest()[:12]})"
 
 
+def forget(run: str, *, dask_worker: Worker) -> None:
+    """Drop the state of a run that has ended."""
+    dask_worker.extensions.pop(run, None)
+
+
 async def play_chunk(program: str, pickled: bytes, *, dask_worker: Worker) -> Played:
     """Play a Chunk, which only a worker with the same ``program`` can read."""
     if fingerprint() != program:
-        differs = UsageError(
+        differs = (
             f"it has merge-runner {fingerprint()}, and the coordinator {program}: install the same "
             "one for all, with the same plug-ins"
         )
-        return Played(error=differs)
+        return Played(error=differs, exit_code=UsageError.exit_code)
     # Dask's profiler samples all threads; Python 3.11 can deadlock there.
     dask_worker.periodic_callbacks["profile"].stop()
     chunk: Chunk = pickle.loads(pickled)  # noqa: S301 # a scheduler runs any code
@@ -187,7 +205,7 @@ async def play_chunk(program: str, pickled: bytes, *, dask_worker: Worker) -> Pl
         if state.plan is None:
             state.plan = _with_code(chunk.setup.plan)
     except MergeRunnerError as exc:
-        return Played(error=type(exc)(str(exc)))
+        return Played(error=str(exc), exit_code=exc.exit_code)
     chunk = replace(chunk, setup=replace(chunk.setup, plan=state.plan))
 
     def tell(kind: str, number: int, usd: float, label: CallLabel) -> None:
@@ -239,12 +257,23 @@ async def _play(chunk: Chunk, state: WorkerRun, tell: Callable[..., object]) -> 
             stopped.cancel()
             await asyncio.wait([work])
             await runner.drain()
-            if not work.cancelled():
-                work.result()
+            # Of whatever kind: the replies that are paid go to the coordinator all the same.
+            error = None if work.cancelled() else work.exception()
         except MergeRunnerError as exc:
-            played.error = type(exc)(str(exc))
+            error = exc
+        if error is not None:
+            played.fail(error)
         known = {call.request.key for call in chunk.recorded[0]}
         new = [call for call in replies.entries() if call.request.key not in known]
         played.recorded = new, [*replies.all_unanswered().items()]
         played.spent, played.opened = ledger.rows()
     return played
+
+
+def _described(error: BaseException) -> str:
+    """Return an error of foreign code, such as a driver's, in one line with its place."""
+    frames = [frame for frame, _ in walk_tb(error.__traceback__)]
+    own = Path(merge_runner.__file__).parent
+    foreign = (f for f in frames if own not in Path(f.f_code.co_filename).parents)
+    code = next(foreign, frames[-1]).f_code
+    return one_line(f"{code.co_qualname} of {code.co_filename} raised {error!r}")

@@ -94,7 +94,7 @@ async def open_session(
         if live and options.dask is None:
             for name, entry in plan.entries.items():
                 resolve_endpoint(name, entry)  # raises where its key is missing
-        cap = _cap(plan, options, cache, say, live=live)
+        cap = _cap(plan, options, cache, say, is_open=bool(todo) and not options.replay)
         if live:
             asked = plan.entries.items()
             cache.locks.take({f"{e.id} at {plan.endpoints[name]}" for name, e in asked})
@@ -103,12 +103,12 @@ async def open_session(
 
 
 def _cap(
-    plan: Plan, options: Options, cache: ResponseCache, say: Callable[[str], None], *, live: bool
+    plan: Plan, options: Options, cache: ResponseCache, say: Callable[[str], None], *, is_open: bool
 ) -> Cap | None:
     """Return the cap of a run, by --max-cost or by its study's budget; None: there is none.
 
-    In a ``live`` run it also covers the ledgers of sweeps that share it, and other ledgers of this
-    study: from before its file had a budget, or since it has none.
+    Where something ``is_open`` to be run, it also covers the ledgers of sweeps that share it, and
+    other ledgers of this study: from before its file had a budget, or since it has none.
     """
     ledger, study = plan.ledger, plan.study.name
     usd, source = options.max_cost_usd, "--max-cost"
@@ -117,7 +117,7 @@ def _cap(
     if usd is None:
         return None
     others = []
-    for scope in scopes(cache) if live else ():
+    for scope in scopes(cache) if is_open else ():
         is_same_study = study in (ledger, scope) and scope.split("/")[0] == study
         if scope != ledger and (scope in options.ledgers or is_same_study):
             others.append(scope)

@@ -59,14 +59,10 @@ def cross(
         name: [text for text in levels if text in only.get(name, levels)]
         for name, levels in axes.items()
     }
-    per_condition = sum(repetitions[prompt] for prompt in selected[PROMPT])
-    cells = math.prod(len(selected[name]) for name in axes if name != PROMPT)
-    trials = conditions * per_condition * cells
-    if trials > MOST_TRIALS:
-        raise UsageError(
-            f"these are {trials:,} trials, and at most {MOST_TRIALS:,} can be played: leave out "
-            "levels, conditions or repetitions, in the file or by --only, --conditions or --reps"
-        )
+    combinations = math.prod(map(len, selected.values()))
+    if combinations > MOST_TRIALS:  # making their arms would take minutes
+        raise _too_many(f"{combinations:,} combinations of levels")
+    trials = 0
     varying = [name for name, levels in axes.items() if len(levels) > 1]
     arms: dict[tuple[str, ...], Arm] = {}
     for combination in product(*selected.values()):
@@ -81,6 +77,9 @@ def cross(
             named = (f"{n}={t}" for n, t in arm.factors.items() if n not in (PROMPT, OPPONENT))
             # Arms with the same trials, such as a pair that is listed in both orders, play once.
             twin = arms.setdefault((arm.model, arm.variant, arm.focal or "", *named), arm)
+            trials += conditions * arm.repetitions if twin is arm else 0
+            if trials > MOST_TRIALS:
+                raise _too_many(f"more than {MOST_TRIALS:,} trials")
             if twin.asked != arm.asked:
                 raise UsageError(
                     f"the crossings {twin.label!r} and {arm.label!r} have the same names, and are "
@@ -93,6 +92,13 @@ def cross(
             f"there are no two different drivers to mirror: name them, as --model {models[0]}+OTHER"
         )
     return list(arms.values())
+
+
+def _too_many(number: str) -> UsageError:
+    return UsageError(
+        f"these are {number}, and at most {MOST_TRIALS:,} trials can be played: leave out "
+        "levels, conditions or repetitions, in the file or by --only, --conditions or --reps"
+    )
 
 
 def listed_levels(

@@ -74,6 +74,12 @@ def test_a_revision_is_a_whole_number(revision):
         Program(mine, "drives")
 
 
+def test_a_driver_decides_in_an_async_method():
+    mine = type("Mine", (), {"decide": lambda self, observation, number: None})
+    with pytest.raises(UsageError, match="the driver Mine needs `async def decide"):
+        Program(mine, "drives")
+
+
 def test_the_class_names_its_revision_and_the_spec_has_it():
     constant = PROGRAMS["constant"]
     revised = type("Revised", (constant.driver,), {"revision": 2})

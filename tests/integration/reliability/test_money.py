@@ -98,7 +98,12 @@ async def test_one_cap_holds_over_several_sweeps(merge_runner, experiments):
     assert (run.code, first["trials"]["suspended"]) == (3, 0), run.err
     assert other["trials"]["suspended"] > 0
     assert other["sweep_cost_usd"] < bill.usd <= ROOM_FOR_SOME
-    assert "USD of baseline/o3/set0 count against the budget, too" in run.err
+    told = "USD of baseline/o3/set0 count against the budget, too"
+    assert told in run.err
+    dry = await merge_runner(*sweep, "--max-cost", ROOM_FOR_SOME, "--dry-run")
+    assert told in dry.err
+    rest = json.loads(dry.out.splitlines()[-1])
+    assert rest["left_usd"] == pytest.approx(ROOM_FOR_SOME - bill.usd)
 
 
 async def test_a_begun_trial_that_cannot_be_paid_is_suspended_with_its_replies(merge_runner):

@@ -9,8 +9,10 @@ import json
 import logging
 import math
 import os
+import pickle
 import shutil
 import socket
+import sqlite3
 from contextlib import closing
 from functools import partial
 from importlib import import_module
@@ -21,9 +23,9 @@ import pytest
 from merge_runner.errors import SweepStopped, UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.ledger import CallLabel, Ledger
-from merge_runner.records import SLOT_HEADER
+from merge_runner.records import SLOT_HEADER, ReplayMiss
 from merge_runner.run.cluster_connection import connected
-from merge_runner.run.cluster_worker import RemoteLedger
+from merge_runner.run.cluster_worker import Played, RemoteLedger
 from tests.support.cluster import SIX, SMALL, all_held, ended, held_from, repetition_of, workers_of
 from tests.support.crossed_study import MODEL
 from tests.support.gate import HANGS_S, Gate
@@ -36,6 +38,33 @@ PAID = ("--model", "o3", "--yes", *FAST)
 DEAR = MODEL.replace("price}, output = {price}", "price}, output = 2.0") + (
     "timeout_s = {hangs_s}\ndeadline_s = {hangs_s}\n"
 )
+
+RAISING = """
+from merge_runner.plugin import PROGRAMS, Program
+
+class Raising:
+    def __init__(self, context):
+        self.context = context
+
+    async def decide(self, observation, number):
+        if number == 3:
+            raise ValueError("no plan")
+        return self.context.held(0.0)
+
+PROGRAMS.register("raising", Program(Raising, "raises"))
+"""
+RAISING_STUDY = """
+models = ["emulator+raising"]
+repetitions = 1
+conditions = ["L_4_0", "N_0_0"]
+[plugins]
+files = ["mine.py"]
+"""
+# The worker's seventh attempt cannot be reserved.
+UNWRITABLE = """
+CREATE TRIGGER full BEFORE INSERT ON open WHEN NEW.attempt = 7
+BEGIN SELECT RAISE(ABORT, 'the disk is full'); END
+"""
 
 
 @in_virtual_time
@@ -104,6 +133,54 @@ async def test_a_worker_with_other_source_is_refused(merge_runner, scheduler, tm
     run = await merge_runner(*SMALL, "--dask", scheduler.file)
     assert (run.code, "install the same one for all" in run.err) == (2, True)
     assert "Traceback" not in run.err
+
+
+async def test_a_driver_that_raises_ends_the_run_once_and_what_is_paid_is_kept(
+    merge_runner, scheduler, tmp_path
+):
+    """Nothing of the run is left at the workers."""
+    (tmp_path / "mine.py").write_text(RAISING)
+    (tmp_path / "study.toml").write_text(RAISING_STUDY)
+    await scheduler("--no-nanny")
+    async with watched() as server:
+        sweep = ("sweep", "study.toml", "--trust", "--in-flight", 2, "--dask", scheduler.file)
+        run = await merge_runner(*sweep, "--json", EMULATOR_BASE_URL=f"{server.url}/v1")
+        kept = len(cached_calls(tmp_path / "cache/responses"))
+    assert (run.code, server.requests) == (1, kept), run.err
+    assert kept >= 3
+    (told,) = [line for line in run.err.splitlines() if line.startswith("error:")]
+    assert "Raising.decide of " in told
+    assert "mine.py raised ValueError('no plan') (told by the Dask worker tcp://127.0.0.1:" in told
+    assert "Traceback" not in run.err
+
+    def names(dask_worker):
+        return [name for name, part in dask_worker.extensions.items() if "WorkerRun" in repr(part)]
+
+    async with connected(str(scheduler.file)) as client:
+        assert [*(await client.run(names)).values()] == [[]]
+
+
+def test_an_error_whose_class_wants_more_than_a_text_returns_from_a_worker():
+    played = Played()
+    played.fail(ReplayMiss("no reply", None))
+    assert (played.error, played.exit_code) == ("no reply", 4)
+    assert pickle.loads(pickle.dumps(played)) == played
+
+
+async def test_replies_are_kept_where_the_cost_of_a_later_attempt_cannot_be_reserved(
+    merge_runner, tmp_path
+):
+    folder = tmp_path / "cache/responses"
+    ResponseCache(folder).close()
+    with closing(sqlite3.connect(folder / "cache.db")) as cache:
+        cache.execute(UNWRITABLE)
+    (tmp_path / "models.toml").write_text(DEAR.format(name="dear", price=1.0, hangs_s=HANGS_S))
+    async with watched() as server:
+        sweep = (*SMALL, "--model", "dear", "--yes", *FAST, "--max-cost", 50)
+        run = await merge_runner(*sweep, "--dask", "local:1", **server.env)
+        assert (run.code, server.requests) == (1, 6), run.err
+    assert "the disk is full" in run.err
+    assert len(cached_calls(folder)) == 6
 
 
 async def test_a_worker_that_is_killed_costs_its_task_and_nothing_else(

@@ -46,13 +46,24 @@ def test_more_trials_than_can_be_played_are_refused_before_they_are_built(plan_o
     with pytest.raises(UsageError) as refused:
         plan_of(many)
     assert str(refused.value) == (
-        "these are 2,200,000 trials, and at most 1,000,000 can be played: leave out "
-        "levels, conditions or repetitions, in the file or by --only, --conditions or --reps"
+        "these are 1,100,000 combinations of levels, and at most 1,000,000 trials can be played: "
+        "leave out levels, conditions or repetitions, in the file or by --only, --conditions or "
+        "--reps"
     )
     part = {"seed": ["7", "8"], "max_output_tokens": ["300"]}
     assert plan_of(many, only=part).trials == 4
-    with pytest.raises(UsageError, match="these are 1,100,000 trials"):
+    with pytest.raises(UsageError, match="these are more than 1,000,000 trials"):
         make_plan("baseline", repetitions=100_000)
+
+
+def test_only_what_is_played_counts_as_a_trial(plan_of):
+    """What skip leaves out does not, and what is mirrored does."""
+    seeds = f"[factors]\nseed = {[*range(12)]}\n"
+    skip = f"skip = [{{ seed = {[*range(6)]} }}]\n"
+    pair = ["constant+emulator"]
+    assert plan_of(skip + seeds, pair, repetitions=100_000).trials == 600_000
+    with pytest.raises(UsageError, match="these are more than 1,000,000 trials"):
+        plan_of(skip + seeds, pair, repetitions=100_000, mirror=True)
 
 
 def test_what_is_the_default_already_is_not_sent(plan_of):

@@ -13,9 +13,13 @@ class Hesitant:
     And then more.
     """
 
+    async def decide(self, observation, number):
+        return observation
+
 
 class Silent:
     __doc__ = None
+    decide = Hesitant.decide
 
 
 def test_a_program_says_what_it_does_as_far_as_it_is_loaded():
