@@ -293,6 +293,7 @@ def test_another_trial_is_found_by_the_keyboard_and_goes_on_where_this_one_ended
     page.goto(f"/trials/{COLLIDED}")
     page.route("**/others/**", hold)
     page.keyboard.press("c")
+    expect(page.locator("#compare")).to_be_focused()
     with page.expect_request(lambda asked: "q=l_4_8" in asked.url):
         page.keyboard.insert_text("l_4_8")
     page.keyboard.insert_text(" emulator rep02")
