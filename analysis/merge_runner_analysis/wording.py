@@ -53,7 +53,8 @@ VERDICT_RULE = (
     "less than 5 points (crashes), 1 m (gap, and how far relative velocity moves it) or half a "
     "standard deviation (accelerations held). Less, more, unlike: a difference is shown, with a "
     "p below .05 that is corrected for the number of the driver's measures (Holm). Cannot tell "
-    f"yet: neither of the two; that is not “alike”. Of fewer than {ENOUGH} trials nothing is said"
+    "yet: neither of the two; that is not “alike”. Of a driver with fewer than "
+    f"{ENOUGH} trials nothing is said"
 )
 # Names of metrics in sentences and pages; others keep the label of the table.
 METRIC_NAMES = {

@@ -273,7 +273,7 @@ async def _play(chunk: Chunk, state: WorkerRun, tell: Callable[..., object]) -> 
 def _described(error: BaseException) -> str:
     """Return an error of foreign code, such as a driver's, in one line with its place."""
     frames = [frame for frame, _ in walk_tb(error.__traceback__)]
-    own = Path(merge_runner.__file__).parent
-    foreign = (f for f in frames if own not in Path(f.f_code.co_filename).parents)
+    package = Path(merge_runner.__file__).parent
+    foreign = (f for f in frames if package not in Path(f.f_code.co_filename).parents)
     code = next(foreign, frames[-1]).f_code
     return one_line(f"{code.co_qualname} of {code.co_filename} raised {error!r}")

@@ -55,12 +55,20 @@ def likeness_of(driver: Driver) -> dict[str, Likeness]:
 def tally(drivers: Sequence[Driver]) -> str:
     """Return in how many drivers each measure is like people's; empty where none is compared."""
     compared = [driver.cells for driver in drivers if driver.cells]
-    parts = []
+    like, open_measures = [], []
     for name, heading in HEADINGS.items():
+        label = heading[:1].lower() + heading[1:]
         states = [shown_state(cells[name].values) for cells in compared if name in cells]
-        if states:
-            parts.append(f"{states.count(SHOWN) or 'none'} ({heading[:1].lower()}{heading[1:]})")
-    return f"Of {len(compared)} drivers, like people: {', '.join(parts)}." if parts else ""
+        if {*states} <= {"", OPEN}:
+            open_measures.append(label)
+        else:
+            like.append(f"{states.count(SHOWN) or 'none'} ({label})")
+    if not compared:
+        return ""
+    if not like:
+        return f"Whether {len(compared)} drivers are like people cannot be told yet."
+    rest = f"; cannot be told yet: {', '.join(open_measures)}" if open_measures else ""
+    return f"Of {len(compared)} drivers, like people: {', '.join(like)}{rest}."
 
 
 def _likeness(cell: Cell) -> Likeness:
