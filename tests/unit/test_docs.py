@@ -76,6 +76,17 @@ def test_the_readings_of_the_docs_are_those_of_the_report():
     assert shown == ["| " + " | ".join(c.replace("|", r"\|") for c in r) + " |" for r in readings]
 
 
+def test_the_files_and_functions_that_the_design_names_are_there():
+    folders = (PROJECT / "merge_runner", PROJECT / "analysis/merge_runner_analysis")
+    named = re.findall(r"([\w/]+\.py)(?::(\w+(?:, \w+)*))?", (DOCS / "design.md").read_text())
+    assert len(named) > 50
+    for path, functions in named:
+        source = "".join(f.read_text() for base in folders if (f := base / path).exists())
+        assert source, path
+        for name in re.findall(r"\w+", functions):
+            assert re.search(rf"^ *(async def|def|class|) ?{name}\b", source, re.M), (path, name)
+
+
 def anchors(page: Path) -> set[str]:
     """What a link into a page can name: its headings, as GitHub spells them."""
     headings = re.findall(r"^#+ (.*)", page.read_text(), re.MULTILINE)

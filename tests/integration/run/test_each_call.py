@@ -49,10 +49,10 @@ ELSEWHERE = (
 )
 
 
-def drawn_path() -> set[str]:
-    """The files of ``llm`` on the path of a call in docs/design.md."""
+def drawn_path(way: str) -> set[str]:
+    """The files of ``llm`` on the path of a call, live or replayed, in docs/design.md."""
     _, _, text = (PROJECT / "docs/design.md").read_text().partition("## The path of a call")
-    return set(re.findall(r"llm/[\w/]+\.py", text.split("```")[1]))
+    return set(re.findall(r"llm/[\w/]+\.py", text.split("```")[1 if way == "live" else 3]))
 
 
 class Counts:
@@ -152,8 +152,7 @@ async def test_a_further_call_takes_no_more_than_it_did(counted):
             found[name] = more.total() / calls
             told += [f"{way}, {name}: {found[name]:.1f}, to become {GOALS[name][way]}"]
             told += [f"{n / calls:8.1f} {each}" for each, n in more.most_common() if n]
-        if way == "live":
-            entered = {each.split()[0] for each in many["functions"] - few["functions"]}
-            assert {file for file in entered if file.startswith("llm/")} == drawn_path()
+        entered = {each.split()[0] for each in many["functions"] - few["functions"]}
+        assert {file for file in entered if file.startswith("llm/")} == drawn_path(way)
         too_many = [name for name, n in found.items() if n > BOUNDS[name][way]]
         assert not too_many, "\n".join(told)
