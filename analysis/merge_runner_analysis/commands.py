@@ -60,20 +60,20 @@ WhereOption = Annotated[
     list[str] | None,
     option(
         "FACTOR=LEVEL",
-        "Only drivers' trials at this level of a factor of their study, or of model or prompt; may "
-        "be given more than once.",
+        "Only trials at this level of a factor, of model or of prompt, and human trials; may be "
+        "repeated.",
         "--where",
     ),
 ]
 RunOption = Annotated[
     str | None,
-    option("NAME", "Only drivers' trials of the runs of this --name, or sweep_id.", "--run"),
+    option("NAME", "Only trials of runs with this --name or sweep_id, and human trials.", "--run"),
 ]
 ByOption = Annotated[
     str | None,
     option(
         "FACTOR",
-        "With the table effects: the other factors at each level of this one, and interactions.",
+        "With the table effects: effects at each level of this factor, and interactions.",
         "--by",
     ),
 ]
@@ -205,7 +205,7 @@ def power(
     trust: TrustOption = False,
     as_json: cli.JsonOption = False,
 ) -> None:
-    """Say what a study could find and what it costs; send nothing.
+    """Estimate which effects a study can detect, and its cost; send nothing.
 
     Example: merge-runner power my-study/study.toml
     """
@@ -255,7 +255,7 @@ def figures(
     study_file: StudyOption = None,
     trust: TrustOption = False,
 ) -> None:
-    """Draw all figures as PDF and PNG.
+    """Draw all figures as PDF, SVG and PNG, with their numbers as CSV.
 
     Example: merge-runner figures --out results/figures
     """
@@ -395,7 +395,7 @@ def view(
     ] = None,
     no_open: Annotated[bool, flag("--no-open", "Do not open a browser.")] = False,
     reader: Annotated[
-        str | None, option("NAME", "Who writes notes; else your user name.", "--reader")
+        str | None, option("NAME", "Your name in notes; default: your user name.", "--reader")
     ] = None,
     db: DbOption = DEFAULT_DB,
     study_file: StudyOption = None,

@@ -45,7 +45,8 @@ def common(
 
 app = Program(
     name="merge-runner",
-    help="Finds out whether a language model drives like a human.",
+    help="Finds out whether a language model drives like a human.\n\n"
+    "Example: merge-runner sweep baseline",
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
 )

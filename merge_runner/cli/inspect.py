@@ -75,7 +75,7 @@ def audit(
     trust: cli.TrustOption = False,
     as_json: cli.JsonOption = False,
 ) -> None:
-    """Check that each trial is there and follows from its replies.
+    """Check that all trials are stored, and follow from their replies.
 
     Example: merge-runner audit --recording baseline.parquet
     """

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 def ledger(
     cache: cli.CacheOption = DEFAULT_CACHE,
     release: Annotated[
-        str | None, cli.option("SWEEP", "Stop counting what is reserved.", "--release")
+        str | None, cli.option("SWEEP", "Free the reservations of this sweep.", "--release")
     ] = None,
     yes: cli.YesOption = False,
     as_json: cli.JsonOption = False,

@@ -50,16 +50,16 @@ def beside_study(ctx: typer.Context, param: typer.CallbackParam, path: Path) -> 
     return homes.pop() / path
 
 
-DB = "The results database; that of a study's file lies beside it."
-CACHE = "The folder of recorded replies; that of a study's file lies beside it."
+DB = "The results database; that of a study's file is in its folder."
+CACHE = "The folder of recorded replies; that of a study's file is in its folder."
 DbOption = Annotated[Path, option("FILE", DB, "--db", callback=beside_study, **FILES)]
 CacheOption = Annotated[Path, option("DIR", CACHE, "--cache", callback=beside_study, **FILES)]
 ModelOption = Annotated[
     list[str] | None,
     option(
         "NAME",
-        "A model of the registry, a program, or LEFT+RIGHT; may be repeated. Else those of the "
-        "study's file, or the emulator.",
+        "A model or program of `merge-runner models`, or a pair LEFT+RIGHT; may be repeated. "
+        "Default: those of the study's file, or the emulator.",
         "--model",
         **PLAYED,
     ),
@@ -68,7 +68,7 @@ OnlyOption = Annotated[
     list[str] | None,
     option(
         "FACTOR=LEVEL",
-        "A level of a factor, or of model or prompt; may be repeated.",
+        "Only this level of a factor, of model or of prompt; may be repeated.",
         "--only",
         **PLAYED,
     ),
@@ -90,7 +90,7 @@ TrustOption = Annotated[
     bool,
     flag(
         "--trust",
-        "Run the study's code and send keys where its models.toml says, unasked.",
+        "Without asking, run the study's code, and send keys where its models.toml says.",
         **ASKED,
     ),
 ]
@@ -98,8 +98,7 @@ StudyOption = Annotated[
     str | None,
     option(
         "FILE",
-        "A study's file: its trials alone. Where a command needs its prompts, conditions, drivers "
-        "or metrics, these are known, and its plug-ins run.",
+        "Only trials of this study. A command that needs the study's parts runs its plug-ins.",
         "--study",
         **FILES,
     ),

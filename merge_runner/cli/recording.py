@@ -16,10 +16,13 @@ from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
 from merge_runner.text_safety import say
 
-SWEEP = "A sweep_id, which may be repeated; the newest sweep if none is given."
+SWEEP = "The sweep_id of a run; may be repeated. Default: the newest run."
 RecordingFile = Annotated[Path, typer.Argument(metavar="FILE", help="A recording (.parquet).")]
 
-recording_app = Program(help="Portable recordings: one Parquet file that anyone can replay.")
+recording_app = Program(
+    help="Portable recordings: one Parquet file that anyone can replay.\n\n"
+    "Example: merge-runner recording export study.parquet"
+)
 
 
 @recording_app.command("export")
@@ -30,7 +33,7 @@ def recording_export(
     sweeps: Annotated[list[str] | None, cli.option("ID", SWEEP, "--sweep")] = None,
     study: cli.StudyOption = None,
 ) -> None:
-    """Write what sweeps asked and were answered into one file.
+    """Write the requests and replies of runs into one file.
 
     Example: merge-runner recording export mine.parquet
     """

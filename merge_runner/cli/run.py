@@ -29,19 +29,19 @@ if TYPE_CHECKING:
     from merge_runner.run.plan import Plan
 
 GRID = (
-    "With --first, in the place of the study's conditions: h=FROM:TO:STEP,dv=FROM:TO:STEP, "
-    "projected headways in m and relative velocities in m/s; usual: -6:6:2 and -1.6:1.6:0.4."
+    "With --first, in place of the study's conditions: projected headways in m and relative "
+    "velocities in m/s, h=FROM:TO:STEP,dv=FROM:TO:STEP; usual: h=-6:6:2,dv=-1.6:1.6:0.4."
 )
-RUN_NAME = "What you call this run, as lists of runs and its summary show it."
+RUN_NAME = "Your name for this run, in lists of runs and in its summary."
 SAMPLES = "Another number draws a fresh set of samples."
 ORDER = "Another number draws another order of the trials."
-FIRST = "Only the first decision of both sides."
+FIRST = "Ask both drivers for their first decision only."
 DRY_RUN = "Only estimate: trials, calls, tokens, cost, time. Nothing is sent."
 SHOW_PROMPTS = "With --dry-run: print each prompt as its drivers read it."
-IN_FLIGHT = "Trials at once, over all workers."
+IN_FLIGHT = "Trials played at once, over all workers."
 KEEP_GOING = "Go on with a model that gives no valid decision."
 REPLAY = "From recorded replies alone: no key, no network."
-MAX_COST = "Never spend more on this, over all its runs."
+MAX_COST = "Never spend more than this, over all runs of the sweep."
 STRICT = "Stop when another model answers."
 DASK = "Play on a Dask cluster: local:N, a scheduler's address, or its file."
 BATCH = "Send requests in the provider's batches: cheaper, but it takes hours."
@@ -67,14 +67,15 @@ def sweep(
         list[str] | None,
         typer.Argument(
             metavar="NAME...",
-            help="experiments/NAME.toml, or a path; baseline if none is named; to replay also a "
+            help="A study: experiments/NAME.toml, or a path; default: baseline. To replay, also a "
             "recording, FILE.parquet. Several are played one after the other.",
         ),
     ] = None,
     models: cli.ModelOption = None,
     only: cli.OnlyOption = None,
     mirror: Annotated[
-        bool, cli.flag("--mirror", "Also play two drivers both ways.", **cli.PLAYED)
+        bool,
+        cli.flag("--mirror", "Play pairs of different drivers in both positions.", **cli.PLAYED),
     ] = False,
     repetitions: cli.RepsOption = None,
     conditions: cli.ConditionsOption = None,

@@ -15,6 +15,8 @@ from merge_runner.cli import complete_app
 from merge_runner.config import ScenarioConfig
 from merge_runner.llm.models import read_models
 from merge_runner.prompts.blocks import BLOCKS, FIELDS, VARIANTS, Situation
+from merge_runner_analysis.figures import FIGURES
+from merge_runner_analysis.tables import TABLES
 from tests.support.harness import PROJECT, asked_to_write
 from tests.unit.prompts.test_render import FIRST
 
@@ -44,6 +46,10 @@ it is out of sight.
 | field | value |
 |---|---|
 """
+SHOWN = {
+    "tables": ("table", {name: table.about for name, table in TABLES.items()}),
+    "figures": ("figure", {name: figure.shows for name, figure in FIGURES.items()}),
+}
 MODELS = (
     "# Model list\n\nGenerated from `experiments/models.toml`. `merge-runner models` adds prices "
     "and keys. RPM and TPM are requests and\ntokens a minute of a common paid tier.\n\n"
@@ -67,6 +73,10 @@ def _commands() -> Iterator[str]:
     for name, command in whole.commands.items():
         of_command = typer.Context(command, info_name=name, parent=root)
         yield _help(of_command, name)
+        if name in SHOWN:
+            kind, shown = SHOWN[name]
+            yield f"\n| {kind} | shows |\n|---|---|\n"
+            yield from (f"| `{key}` | {about} |\n" for key, about in shown.items())
         for part, inner in getattr(command, "commands", {}).items():
             within = typer.Context(inner, info_name=part, parent=of_command)
             yield _help(within, f"{name} {part}")

@@ -19,7 +19,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-human_app = Program(help="The human recordings, 4TU doi 10.4121/19550377.")
+human_app = Program(
+    help="The human recordings, 4TU doi 10.4121/19550377.\n\n"
+    "Example: merge-runner human import 19550377.zip"
+)
 PathArgument = Annotated[
     Path,
     typer.Argument(
@@ -65,7 +68,7 @@ def human_import(path: PathArgument, db: DbOption = DEFAULT_DB) -> None:
 
 @human_app.command("status")
 def human_status(db: DbOption = DEFAULT_DB, as_json: JsonOption = False) -> None:
-    """Count the human trials, beside the published counts.
+    """Count the human trials, next to the published counts.
 
     Example: merge-runner human status --db results/merge.duckdb
     """

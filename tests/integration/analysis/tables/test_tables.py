@@ -12,7 +12,6 @@ from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.explain import explain
-from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.metrics import METRICS
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.stats.indicators import score
@@ -32,14 +31,6 @@ from tests.support.tables import QUICK, by_id, cell, made, notes_with
 def test_a_table_reads_as_its_golden_file(tables, name):
     golden = PROJECT / f"tests/golden/tables/{name}.txt"
     assert render([tables[name]], TableFormat.TEXT) + "\n" == golden.read_text(encoding="utf-8")
-
-
-def test_the_docs_list_the_tables_and_figures_as_the_explorer_does():
-    text = (PROJECT / "docs/numbers.md").read_text(encoding="utf-8").replace("\\|", "|")
-    rows = [f"| `{name}` | {table.about} |" for name, table in TABLES.items()]
-    assert "\n".join(["|---|---|", *rows, ""]) in text
-    *names, last = (f"`{name}`" for name in FIGURES)
-    assert f"The figures are {', '.join(names)} and {last}." in text
 
 
 def hidden_in(table, width):
