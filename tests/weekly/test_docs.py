@@ -28,6 +28,7 @@ INSTALLED = (
     "make() { command make -o .venv/python -o .venv/runtime -o .venv/dev -o .venv/dask "
     '-o .venv-peer/installed ${RUN:+RUN="$RUN"} "$@"; }\n'
 )
+PUBLISHES = "merge-runner recording export study.parquet --study"
 SERVES = re.compile(r" emulate |make view$| view$| view --port")
 LINKED = (".venv", "Makefile", "pyproject.toml", "requirements", "analysis", "benchmarks", "tests")
 
@@ -110,6 +111,10 @@ async def test_every_command_of_the_docs_does_what_it_says(folder):
                 assert code == 0, f"{page.name}: {command}\n{out}"
                 assert "Traceback" not in out
                 done.append(command)
+                if command.startswith(PUBLISHES):
+                    exported = out
+            if page.name == "README.md" and page.parent == PROJECT:
+                assert out.strip() in exported  # the digest of the study, and of its replay
     assert {"make sweep", "make report"} <= set(done)
     assert len(done) >= 14
 
