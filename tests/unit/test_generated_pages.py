@@ -20,7 +20,7 @@ from merge_runner_analysis.tables import TABLES
 from tests.support.harness import PROJECT, asked_to_write
 from tests.unit.prompts.test_render import FIRST
 
-WIDTH = 90
+WIDTH = 80
 COMMANDS = """\
 # Commands
 
