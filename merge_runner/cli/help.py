@@ -20,7 +20,9 @@ def _write_groups(command: TyperCommand | TyperGroup, ctx: Any, formatter: Any) 
     for param in command.get_params(ctx):
         usual = "Arguments" if param.param_type_name == "argument" else "Options"
         if record := param.get_help_record(ctx):
-            groups.setdefault(getattr(param, "rich_help_panel", None) or usual, []).append(record)
+            name, _, _ = record[0].partition(" <")  # without the type of an argument
+            panel = getattr(param, "rich_help_panel", None) or usual
+            groups.setdefault(panel, []).append((name, record[1]))
     for name, listed in getattr(command, "commands", {}).items():
         summary = (listed.help or "").partition("\n\n")[0]
         groups.setdefault(listed.rich_help_panel or "Commands", []).append((name, summary))

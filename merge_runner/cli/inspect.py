@@ -112,7 +112,7 @@ def audit(
 
 def forget(
     sweeps: Annotated[
-        list[str], typer.Argument(metavar="SWEEP...", help="A sweep_id; * stands for anything.")
+        list[str], typer.Argument(metavar="SWEEP", help="A sweep_id; * stands for anything.")
     ],
     db: cli.DbOption = DEFAULT_DB,
     yes: cli.YesOption = False,

@@ -66,7 +66,7 @@ def sweep(
     studies: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="NAME...",
+            metavar="NAME",
             help="A study: experiments/NAME.toml, or a path; default: baseline. To replay, also a "
             "recording, FILE.parquet. Several are played one after the other.",
         ),
