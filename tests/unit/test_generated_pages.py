@@ -83,8 +83,10 @@ def _commands() -> Iterator[str]:
 
 
 def _help(ctx: typer.Context, title: str) -> str:
-    lines = [line.rstrip() for line in ctx.command.get_help(ctx).splitlines()]
-    return f"\n## {title}\n\n```text\n" + "\n".join(lines) + "\n```\n"
+    text = "\n".join(line.rstrip() for line in ctx.command.get_help(ctx).splitlines())
+    if title == "replay":
+        text = text.partition("\n\nOptions:")[0] + "\n\nOptions: those of sweep."
+    return f"\n## {title}\n\n```text\n{text}\n```\n"
 
 
 def _prompt_blocks() -> Iterator[str]:
