@@ -19,7 +19,7 @@ FROM sweeps ORDER BY started_at, sweep_id
 
 
 def study_name(name: str, factors: Iterable[str]) -> str:
-    """Return ``mood (opponent, temperature)``: other factors make another study of one name."""
+    """Return the name with its factors, as ``mood (opponent, temperature)``."""
     varied = sorted({*factors} - {MODEL, PROMPT})
     return f"{name} ({', '.join(varied)})" if varied else name
 
