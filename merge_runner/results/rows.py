@@ -205,8 +205,9 @@ def stored_rows(
     keys: Sequence[TrialKey],
     span: tuple[int, int] | None = None,
 ) -> Stored:
-    """Return the rows of a table for these trials."""
-    result = rows_of_trials(connection, "*", table, keys, span)
+    """Return the rows of a table for these trials; an error of DuckDB if it lacks a key column."""
+    named = ", ".join(f"{name} AS {name}" for name in KEY_COLUMNS[table])
+    result = rows_of_trials(connection, f"* REPLACE ({named})" if named else "*", table, keys, span)
     names, rows = names_of(result), defaultdict[TrialKey, list[Row]](list)
     key = itemgetter(*map(names.index, ("trial_id", "spec_hash")))
     for row in result.fetchall():
