@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from merge_runner.records import (
     Attempt,
@@ -55,8 +55,7 @@ class TrialSpec:
     kinematics: Condition = field(kw_only=True)
 
 
-@dataclass(frozen=True, slots=True)
-class StateRow:
+class StateRow(NamedTuple):
     """One vehicle at one sample; the acceleration is that realised over the step before it."""
 
     step: int

@@ -196,8 +196,7 @@ def check_sweep(
     append(connection, "planned", planned)
     connection.execute(AUDITED)
     counts = {"trials": len(planned), **next(by_name(connection.execute("FROM counts")))}
-    views = ("list_findings", "state_findings", *CALL_FINDINGS)
-    findings = _findings(connection, views, sweep_id)
+    findings = _findings(connection, ("list_findings", *CALL_FINDINGS), sweep_id)
     audit = Audit(sweep_id, counts, findings, [*_notes(connection)])
     connection.execute("INSERT INTO done FROM audited")
     return audit

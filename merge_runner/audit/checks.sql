@@ -1,6 +1,6 @@
--- Checks that a replay cannot make, and checks of trials by their states alone. The views read the
--- tables of a database and these: the audited sweep, its planned trials (if subject.known), its stored
--- trials, the trials that were audited before, and pairs of models that do not match.
+-- Checks that a replay cannot make. The views read the tables of a database and these: the audited
+-- sweep, its planned trials (if subject.known), its stored trials, the trials that were audited before,
+-- and pairs of models that do not match.
 CREATE OR REPLACE TEMP TABLE subject (sweep_id VARCHAR, finished BOOLEAN, known BOOLEAN);
 CREATE OR REPLACE TEMP TABLE planned (trial_id VARCHAR, spec_hash VARCHAR);
 CREATE OR REPLACE TEMP TABLE audited AS SELECT trial_id, spec_hash FROM trials LIMIT 0;
@@ -55,106 +55,6 @@ FROM (
 ) ANTI JOIN trials USING (trial_id, spec_hash) GROUP BY name, trial_id
 UNION ALL SELECT 'spec', NULL, format('the spec stored as {} has another hash', spec_hash)
 FROM specs WHERE left(sha256(spec::VARCHAR), 16) <> spec_hash;
-
--- Checks of the states on the inverse Y of the experiment: two branches of 100 m whose starts are 25 m
--- apart, and one lane of 50 m.
-
-CREATE OR REPLACE TEMP VIEW rules AS
-SELECT spec_hash, scenario->>'$.collision_rule' AS rule,
-    (scenario->>'$.vehicle_length_m')::DOUBLE AS length_m,
-    (scenario->>'$.vehicle_width_m')::DOUBLE AS width_m,
-    round((scenario->>'$.timeout_s')::DOUBLE / (scenario->>'$.step_s')::DOUBLE) AS timeout_steps
-FROM (SELECT spec_hash, if(json_valid(spec), spec->'$.scenario', NULL) AS scenario FROM specs);
-
-CREATE OR REPLACE TEMP VIEW traced AS
-WITH samples AS (
-    SELECT trial_id, spec_hash, step, max(time_s) AS time_s, count(*) AS vehicles,
-        max(position_m) FILTER (side = 'left') AS left_m,
-        max(position_m) FILTER (side = 'right') AS right_m
-    FROM states SEMI JOIN audited USING (trial_id, spec_hash) GROUP BY ALL
-), placed AS (
-    SELECT *, lag(left_m) OVER trial AS left_before_m, lag(right_m) OVER trial AS right_before_m,
-        sqrt(1 - 0.125 ** 2) AS cosine,
-        if(left_m > 100, 0, 0.125) AS left_x, if(left_m > 100, 1, cosine) AS left_y,
-        if(right_m > 100, 0, -0.125) AS right_x, if(right_m > 100, 1, cosine) AS right_y,
-        0.125 * (greatest(100 - left_m, 0) + greatest(100 - right_m, 0)) AS x,
-        right_m * right_y - left_m * left_y + if(right_m > 100, 100 * (cosine - 1), 0)
-            - if(left_m > 100, 100 * (cosine - 1), 0) AS y
-    FROM samples WINDOW trial AS (PARTITION BY trial_id, spec_hash ORDER BY step)
-), turned AS (
-    SELECT *, left_x * right_x + left_y * right_y AS along,
-        abs(left_x * right_y - left_y * right_x) AS across
-    FROM placed
-)
--- Depth of the overlap of the vehicles; below 0 they are disjoint. Two boxes are disjoint if their
--- projections along or across either of them are.
-SELECT trial_id, spec_hash, step, time_s, vehicles, left_m, right_m, left_before_m, right_before_m,
-    length_m, timeout_steps, CASE rule
-        WHEN 'euclid2d' THEN length_m - sqrt(x ** 2 + y ** 2)
-        WHEN 'shared_lane'
-            THEN if(greatest(left_m, right_m) >= 100, length_m - abs(left_m - right_m), -1)
-        ELSE least(
-            (length_m * (1 + along) + width_m * across) / 2
-                - greatest(abs(x * left_x + y * left_y), abs(x * right_x + y * right_y)),
-            (width_m * (1 + along) + length_m * across) / 2
-                - greatest(abs(x * left_y - y * left_x), abs(x * right_y - y * right_x)))
-        END AS depth_m
-FROM turned JOIN rules USING (spec_hash);
-
-CREATE OR REPLACE TEMP VIEW driven AS
-SELECT trial_id, spec_hash, max(step) AS last_step, max(time_s) AS end_s,
-    count(*) FILTER (vehicles = 2 AND left_m IS NOT NULL AND right_m IS NOT NULL) AS samples,
-    max(greatest(left_m, right_m)) AS far_m, any_value(timeout_steps) AS timeout_steps,
-    min(step) FILTER (left_m >= 100) AS left_step, min(step) FILTER (right_m >= 100) AS right_step,
-    min(step) FILTER (depth_m > 1e-9) AS touch_step, arg_max(depth_m, step) AS last_depth_m,
-    -- Positions are linear within the step in which the first vehicle arrives.
-    arg_min(abs(left_before_m - right_before_m + least(
-            if(left_m >= 100, (100 - left_before_m) / (left_m - left_before_m), 1),
-            if(right_m >= 100, (100 - right_before_m) / (right_m - right_before_m), 1)
-        ) * (left_m - left_before_m - right_m + right_before_m)) - length_m, step)
-        FILTER (greatest(left_m, right_m) >= 100) AS gap_m
-FROM traced GROUP BY trial_id, spec_hash;
-
-CREATE OR REPLACE TEMP VIEW state_findings AS
-WITH judged AS (
-    SELECT trials.trial_id, if(status = 'finished', driven.gap_m, NULL) AS gap_m,
-        trial_metrics.gap_m AS view_gap_m, CASE
-        WHEN samples IS NULL THEN 'it has no states'
-        WHEN samples <> last_step + 1
-            THEN format('it has {} samples of both vehicles in {} steps', samples, last_step + 1)
-        WHEN abs(end_time_s - end_s) > 1e-6
-            THEN format('it ended after {} s, its states after {} s', end_time_s, end_s)
-        WHEN status = 'failed' AND error IS NULL THEN 'it failed and names no reason'
-        WHEN status = 'finished' AND far_m < 150
-            THEN 'it is finished, and nobody has reached the end of the track'
-        WHEN status IN ('timeout', 'failed') AND far_m >= 150
-            THEN format('it is {}, and a vehicle has reached the end of the track', status)
-        WHEN status = 'timeout' AND last_step <> timeout_steps
-            THEN format('its time was over after {} of {} steps', last_step, timeout_steps)
-        WHEN status IN ('collided', 'failed') AND merged_first IS NOT NULL
-            THEN format('it is {}, and has a first merger', status)
-        WHEN status IN ('collided', 'failed') OR left_step = right_step THEN NULL
-        WHEN merged_first IS DISTINCT FROM CASE
-                WHEN left_step < coalesce(right_step, left_step + 1) THEN 'left'
-                WHEN right_step IS NOT NULL THEN 'right' END
-            THEN 'another vehicle merged first by its states than by its row, or none'
-        END AS outcome, CASE
-        WHEN status = 'collided' AND last_depth_m < -1e-9
-            THEN 'it is collided, and its last states are apart'
-        WHEN touch_step < last_step OR (touch_step IS NOT NULL AND status <> 'collided')
-            THEN format('it is {} after {} steps, and its states collide after {}',
-                status, last_step, touch_step)
-        END AS collision
-    FROM trials SEMI JOIN audited USING (trial_id, spec_hash)
-    LEFT JOIN driven USING (trial_id, spec_hash)
-    LEFT JOIN trial_metrics USING (trial_id, spec_hash)
-)
-SELECT 'outcome' AS kind, trial_id, outcome AS text FROM judged WHERE outcome IS NOT NULL
-UNION ALL SELECT 'collision', trial_id, collision FROM judged WHERE collision IS NOT NULL
-UNION ALL SELECT 'gap', trial_id, format('it is {} m in trial_metrics, and by its states {} m',
-    coalesce(round(view_gap_m, 3)::VARCHAR, 'no'), coalesce(round(gap_m, 3)::VARCHAR, 'no'))
-FROM judged WHERE gap_m IS DISTINCT FROM view_gap_m
-    AND NOT coalesce(abs(view_gap_m - gap_m) <= 1e-6, false);
 
 -- Calls and their replies. Replies are read in chunks, since each may have many megabytes: the id of
 -- each, a hash of its answer, and the request that it answers, if it names one.

@@ -8,6 +8,7 @@ import io
 import os
 import sys
 from copy import copy
+from importlib import import_module
 from typing import Annotated
 
 import typer
@@ -18,7 +19,6 @@ from merge_runner.cli.inspect import audit, digest, forget, sql
 from merge_runner.cli.models import emulate, models
 from merge_runner.cli.money import ledger
 from merge_runner.cli.options import flag, print_out
-from merge_runner.cli.packages import load_commands
 from merge_runner.cli.recording import recording_app
 from merge_runner.cli.run import init, replay, sweep
 from merge_runner.errors import MergeRunnerError, UsageError
@@ -30,6 +30,7 @@ OUTPUT_ERRORS = (errno.ENOSPC, errno.EFBIG, errno.EIO)
 USAGE: type[typer.BadParameter] = typer.BadParameter.__mro__[2]
 # Errors that _code_and_line describes if a user can act on them.
 EXPECTED = (MergeRunnerError, ModuleNotFoundError, OSError, RuntimeError)
+GROUP = "merge_runner.commands"  # of the entry points that name modules with commands
 COMPLETION = "_MERGE_RUNNER_COMPLETE"  # set by the shell's script that typer installs
 
 
@@ -68,8 +69,19 @@ BUILT_IN |= {str(info.name) for info in app.registered_groups}
 
 
 def complete_app() -> typer.Typer:
-    """Return the program with the commands of all installed packages."""
-    load_commands()
+    """Return the program with the commands of all installed packages.
+
+    Each module of the group adds its commands to ``app``. One that is missing is left out: the
+    analysis need not be installed.
+    """
+    from importlib.metadata import entry_points  # not imported for a built-in command
+
+    for module in sorted({point.module for point in entry_points(group=GROUP)}):
+        try:
+            import_module(module)
+        except ModuleNotFoundError as exc:
+            if not f"{module}.".startswith(f"{exc.name}."):
+                raise
     return app
 
 
@@ -101,7 +113,7 @@ def main() -> None:
     try:
         command = next(words, None)
         if completing or sys.argv[1:2] != [command] or command not in BUILT_IN:
-            load_commands()
+            complete_app()
         run = app if completing else app_with_one_command(command)
         sys.exit(run(prog_name="merge-runner", standalone_mode=False))
     except typer.Abort:

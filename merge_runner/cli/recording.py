@@ -58,7 +58,12 @@ def recording_export(
         calls = export_recording(file, opened, keys, provenance)
     say(f"{calls} calls of {sweep_ids} are in {file}")
     digest, trials = results_digest(db, [row["sweep_id"] for row in rows])
-    say(f"their digest, and that of a replay: {digest}  {trials} trials")
+    # Failed trials are in it, and their errors; trials that wait for money are not.
+    ended = all(row["exit_code"] == 0 for row in rows)
+    same = (
+        ", and that of a replay" if ended else " (that of a replay may differ: a run had problems)"
+    )
+    say(f"their digest{same}: {digest}  {trials} trials")
     if plugins := carried_plugins(provenance):
         say(f"with them the whole source of the study's plug-ins: {', '.join(plugins)}")
 

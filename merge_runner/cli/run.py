@@ -113,7 +113,6 @@ def sweep(
     Example: merge-runner sweep baseline --model o3 --dry-run
     """
     from merge_runner.run.options import Options
-    from merge_runner.run.plan import make_plan
 
     if not isfinite(max_cost_usd or 0):
         raise UsageError("--max-cost is a number of USD")
@@ -122,12 +121,12 @@ def sweep(
     if recordings and not replay:
         raise UsageError("--recording goes with a replay; to keep its replies: recording import")
     options = Options(
-        db=db,
-        cache=cache,
-        in_flight=in_flight,
-        rpm=rpm,
-        tpm=tpm,
-        max_cost_usd=max_cost_usd,
+        db,
+        cache,
+        in_flight,
+        rpm,
+        tpm,
+        max_cost_usd,
         replay=replay,
         recordings=recordings or (),
         strict_model=strict_model,
@@ -138,29 +137,26 @@ def sweep(
         typed=sys.argv[1:],
         name=run_name,
     )
-    make = partial(
-        make_plan,
-        models=models or (),
-        repetitions=repetitions,
-        conditions=cli.listed(conditions),
-        variants=cli.listed(variants),
-        sample_set=sample_set,
-        order_seed=order_seed,
-        only=cli.levels(only or (), "--only"),
-        db=db,
-        mirror=mirror,
-        first=first,
-        grid=grid,
-        trust=trust,
-    )
-    sizes = (repetitions, grid, conditions, variants)
-    chosen = any((*sizes, models, only, mirror, first, sample_set, order_seed))
-    whole = any(size is not None for size in sizes)
+    sizes = {
+        "repetitions": repetitions,
+        "grid": grid,
+        "conditions": cli.listed(conditions),
+        "variants": cli.listed(variants),
+    }
+    selection = sizes | {
+        "models": models or (),
+        "only": cli.levels(only or (), "--only"),
+        "mirror": mirror,
+        "first": first,
+        "sample_set": sample_set,
+        "order_seed": order_seed,
+    }
     if dry_run:
         play = partial(_estimate, show_prompts=show_prompts, as_json=as_json)
     else:
+        whole = any(size is not None for size in sizes.values())
         play = partial(_play, whole=whole, yes=yes, as_json=as_json)
-    plans = partial(_plans, make=make, options=options, chosen=chosen, trust=trust)
+    plans = partial(_plans, selection=selection, options=options, trust=trust)
     sys.exit(_play_all(studies or ["baseline"], plans, play, options))
 
 
@@ -187,16 +183,15 @@ def _play_all(
     return next(filter(None, codes), 0)
 
 
-def _plans(
-    name: str, *, make: Callable[[str], Plan], options: Options, chosen: bool, trust: bool
-) -> list[Plan]:
-    """Return the plan of a study, or those in a recording; ``chosen``: the user selects a part."""
+def _plans(name: str, *, selection: dict[str, Any], options: Options, trust: bool) -> list[Plan]:
+    """Return the plan of a study, or those in a recording, which is played whole."""
+    from merge_runner.run.plan import make_plan
     from merge_runner.run.recorded_plans import recorded_plans
 
     if name.endswith(".parquet"):
-        _refuse_a_part(name, chosen=chosen, replay=options.replay)
+        _refuse_a_part(name, chosen=any(selection.values()), replay=options.replay)
         return [*recorded_plans(Path(name), db=options.db, trust=trust)]
-    plan = make(name)
+    plan = make_plan(name, **selection, db=options.db, trust=trust)
     if options.dask is not None and (options.replay or plan.replays_humans):
         raise UsageError("a replay needs no cluster: leave --dask out")
     return [plan]

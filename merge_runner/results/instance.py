@@ -12,7 +12,7 @@ from pathlib import Path
 
 import duckdb
 
-BYTES_OF_A_CALL, MERGED_BYTES = 3_000, 2**26
+BYTES_OF_A_CALL, MERGED_BYTES = 1_000, 2**26
 """Compressed bytes of a call with short replies and its share of the states; and the excess of the
 file's size up to which its row groups are merged."""
 SIZES = """
@@ -27,6 +27,7 @@ SETTINGS: Settings = {
     "memory_limit": "1GB",  # limit_memory lowers it
     "threads": 2,
     "max_vacuum_tasks": 0,  # merge_small_groups raises it
+    "force_compression": "zstd",  # a quarter of the size of what DuckDB chooses, and written sooner
     # The oldest DuckDB that can open new files.
     "storage_compatibility_version": "v1.2.0",
 }

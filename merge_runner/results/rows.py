@@ -17,7 +17,7 @@ import duckdb
 
 from merge_runner.records import ANSWERS, Attempt, ChatRequest, Observation, Usage, is_scripted
 from merge_runner.results.database import names_of
-from merge_runner.trial_records import StateRow, TrialRecord, TrialSpec
+from merge_runner.trial_records import TrialRecord, TrialSpec
 
 Row = tuple[Any, ...]
 TrialKey = tuple[str, str]
@@ -44,7 +44,6 @@ KEY_COLUMNS: dict[str, tuple[str, ...]] = {
     "calls": ("decision", "side", "attempt"),
 }
 # Fields that are adjacent columns; dataclasses.astuple would copy each value.
-_state = attrgetter(*(field.name for field in fields(StateRow)))
 _usage = attrgetter(*(field.name for field in fields(Usage)))
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
 
@@ -63,7 +62,7 @@ def rows_of(record: TrialRecord) -> dict[str, list[Row]]:
     return {
         "trials": [trial],
         "trial_factors": list(factor_rows(spec)),
-        "states": [(*key, *_state(row)) for row in record.states],
+        "states": [(*key, *row) for row in record.states],
         "decisions": list(_decision_rows(record)),
         "calls": [
             call_row(key, call.request, attempt, cached=attempt.number <= call.earlier)
@@ -206,8 +205,9 @@ def stored_rows(
     keys: Sequence[TrialKey],
     span: tuple[int, int] | None = None,
 ) -> Stored:
-    """Return the rows of a table for these trials."""
-    result = rows_of_trials(connection, "*", table, keys, span)
+    """Return the rows of a table for these trials; an error of DuckDB if it lacks a key column."""
+    named = ", ".join(f"{name} AS {name}" for name in KEY_COLUMNS[table])
+    result = rows_of_trials(connection, f"* REPLACE ({named})" if named else "*", table, keys, span)
     names, rows = names_of(result), defaultdict[TrialKey, list[Row]](list)
     key = itemgetter(*map(names.index, ("trial_id", "spec_hash")))
     for row in result.fetchall():

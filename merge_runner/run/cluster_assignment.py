@@ -37,14 +37,15 @@ class Assignment:
     """A chunk on a worker, its events, and the money of its attempts.
 
     An event is a kind, an attempt's number, USD and a CallLabel; after the last one comes None.
-    ``usd`` is by attempt its worst case, or its cost where that is known. The rows ``booked`` are
-    counted as spent already.
+    ``usd`` is by attempt its worst case, or its cost where that is known; ``is_reserved`` has those
+    that asked for a reservation. The rows ``booked`` are counted as spent already.
     """
 
     address: str
     chunk: Chunk
     events: asyncio.Queue[tuple[Any, ...] | None] = field(default_factory=asyncio.Queue)
     usd: dict[int, float] = field(default_factory=dict)
+    is_reserved: dict[int, bool] = field(default_factory=dict)
     booked: Rows = field(default_factory=list)
 
     @property
@@ -92,23 +93,26 @@ class Assignment:
         while not self.events.empty():
             events.append(self.events.get_nowait())
         messages = [event for event in events if event is not None]
+        # An attempt that has waited long asks again.
+        new = {e[:2]: e for e in messages if e[0] == "cost" or e[1] not in self.is_reserved}
         operations = list[Operation]()
-        for kind, number, usd, label in messages:
+        for kind, number, usd, label in new.values():
             attempt = self.chunk.name, number, usd
             if kind == "reserve":
                 operations.append(partial(ledger.reserve, *attempt, CallLabel(*label)))
             else:
                 operations.append(partial(ledger.pay, *attempt, CallLabel(*label).driver))
         results = await asyncio.gather(*map(ledger.store.write, operations))
-        answers = dict[int, bool]()
-        for (kind, number, usd, _), result in zip(messages, results, strict=True):
+        for (kind, number, usd, _), result in zip(new.values(), results, strict=True):
             if kind == "reserve":
-                answers[number] = result
+                self.is_reserved[number] = result
             else:
                 self.booked.append(result)
             if result:
                 self.usd[number] = usd
-        return answers if len(messages) == len(events) else None
+        if len(messages) < len(events):
+            return None
+        return {number: self.is_reserved[number] for kind, number, *_ in messages if kind != "cost"}
 
 
 async def recorded_calls(plan: Plan, cache: ResponseCache, specs: Sequence[TrialSpec]) -> Recorded:

@@ -38,8 +38,9 @@ from merge_runner.trial_records import TrialRecord, TrialSpec
 if TYPE_CHECKING:
     from distributed import Worker
 
-# The coordinator may be slow, or its machine suspended; one that is gone never answers.
-SILENT_S = 300
+# The coordinator may be slow, or its machine suspended; one that is gone never answers. Dask may
+# lose an event, so that it is sent again.
+SILENT_S, AGAIN_S = 300, 15
 # The calls with an answer, and by key the attempts at those without one.
 Recorded = tuple[Sequence[CachedCall], Sequence[tuple[str, tuple[Attempt, ...]]]]
 
@@ -118,10 +119,11 @@ class RemoteLedger(Ledger):
         """Let the coordinator reserve an attempt; False if that exceeds the cap."""
         number = next(self._numbers)
         answer = self._waiting[number] = asyncio.get_running_loop().create_future()
-        self._tell("reserve", number, usd, label)
         try:
             async with asyncio.timeout(SILENT_S):
-                is_paid: bool = await answer
+                while not answer.done():
+                    self._tell("reserve", number, usd, label)
+                    await asyncio.wait([answer], timeout=AGAIN_S)
         except TimeoutError as exc:
             raise SweepStopped(f"the coordinator has said nothing for {SILENT_S} s") from exc
         except asyncio.CancelledError:
@@ -129,6 +131,7 @@ class RemoteLedger(Ledger):
             raise
         finally:
             del self._waiting[number]
+        is_paid: bool = answer.result()
         if is_paid:
             self._reserved[key] = number, label
         return is_paid

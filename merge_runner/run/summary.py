@@ -19,6 +19,7 @@ from merge_runner.text_safety import first_of
 from merge_runner.trial_records import Status
 
 if TYPE_CHECKING:
+    from merge_runner.run.plan import Plan
     from merge_runner.run.progress import Progress
 
 
@@ -43,7 +44,7 @@ def as_dict(
     ``checked`` are the facts of the database and their audit; without them the values from
     ``decisions`` on are left out. ``ended_with`` is added unchanged.
     """
-    plan, spending, meter = progress.plan, progress.ledger.spending, progress.meter()
+    plan, trials = progress.plan, progress.trials
     playing_s = ((progress.ended_at or progress.began_at) - progress.began_at).total_seconds()
     summary: dict[str, Any] = {
         **ended_with,
@@ -56,16 +57,33 @@ def as_dict(
         "cache": str(options.cache),
         "trials": {
             "planned": plan.trials,
-            "stored_before": progress.trials.stored,
-            "suspended": progress.trials.outcome_counts["suspended"],
+            "stored_before": trials.stored,
+            "suspended": trials.outcome_counts["suspended"],
         },
+        **_counts(progress),
+        "estimate": None if expected is None else asdict(expected),
+        "playing_s": round(playing_s, 3),
+        "worst_stall_s": round(progress.worst_stall_s, 3),
+        "audit": None,
+    }
+    if checked is not None:
+        facts, audit = checked
+        outcomes = dict.fromkeys(get_args(Status), 0) | dict(facts["outcomes"])
+        summary |= _stored(plan, facts)
+        summary |= {"trials": summary["trials"] | outcomes, "audit": audit.as_dict()}
+    return summary
+
+
+def _counts(progress: Progress) -> dict[str, Any]:
+    """Return the counts of calls, attempts and costs."""
+    spending, meter = progress.ledger.spending, progress.meter()
+    return {
         "calls": {"live": meter.calls_live, "cached": meter.calls_cached},
         "calls_shared": meter.calls_shared,
         "calls_recorded": meter.calls_recorded,
         "attempts": meter.outcomes,
         "cost_usd": round(meter.cost_usd, 6),
         "calls_of_unknown_cost": meter.cost_unknown,
-        "estimate": None if expected is None else asdict(expected),
         "sweep_cost_usd": round(spending.spent_usd, 6),
         "set_aside_usd": round(spending.reserved_usd, 6),
         "attempts_of_unknown_cost": spending.open_attempts,
@@ -74,20 +92,16 @@ def as_dict(
         "underpriced": meter.underpriced,
         "damaged_entries": meter.damaged,
         "open_batches": progress.batches(),
-        "playing_s": round(playing_s, 3),
-        "worst_stall_s": round(progress.worst_stall_s, 3),
-        "audit": None,
     }
-    if checked is None:
-        return summary
-    facts, audit = checked
-    summary["trials"] |= dict.fromkeys(get_args(Status), 0) | dict(facts["outcomes"])
+
+
+def _stored(plan: Plan, facts: dict[str, Any]) -> dict[str, Any]:
+    """Return the facts of the database, levels in the order of the plan."""
     shown = {"condition": [*plan.conditions, "all"], **plan.levels}
     order = [(factor, level) for factor, levels in shown.items() for level in levels]
     by_level = {(row["factor"], row["level"]): row for row in facts["levels"]}
-    return summary | {
+    return {
         "scripted": bool(facts["stand_ins"]),
-        "audit": audit.as_dict(),
         "decisions": facts["decisions"],
         "invalid_decisions": facts["invalid"],
         "fallbacks": facts["fallbacks"],

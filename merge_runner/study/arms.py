@@ -83,67 +83,140 @@ def level_text(level: JsonValue) -> str:
     return level if isinstance(level, str) else json.dumps(level, separators=(",", ":"))
 
 
-def _arm(
+@dataclass
+class ArmDrivers:
+    """Drivers of an arm by side: names in the registry, names with parameters, and model entries.
+
+    ``one_sided`` is true if they have different texts, parameters or perceptions.
+    """
+
+    sides: dict[Side, str]
+    ego: Side
+    asked: dict[Side, str]
+    entries: dict[Side, ModelEntry]
+    one_sided: bool = False
+
+    @classmethod
+    def of(
+        cls, texts: Mapping[str, str], registry: Mapping[str, ModelEntry], *, mirrored: bool
+    ) -> ArmDrivers:
+        """Return the drivers of these levels, without parameters; raises UsageError."""
+        model, opponent = texts[MODEL], texts.get(OPPONENT, SELF)
+        if opponent != SELF and "+" in model:
+            raise UsageError(f"{model} is a pair already, and has no other opponent than {SELF}")
+        sides = both_sides(model if opponent == SELF else f"{model}+{opponent}")
+        for name in sides.values():
+            require({**registry, **PROGRAMS}, "model", name, "two joined by + drive left and right")
+        ego = ego_side(sides, registry, opponent)
+        if mirrored:
+            sides, ego = {side: sides[other_side(side)] for side in SIDES}, other_side(ego)
+        entries = {side: registry[name] for side, name in sides.items() if name in registry}
+        return cls(sides, ego, dict(sides), entries)
+
+    def receivers(self, given_to: GivenTo) -> list[Side]:
+        """Return the sides that ``given_to`` names."""
+        return {"both": [*SIDES], "ego": [self.ego], "other": [other_side(self.ego)]}[given_to]
+
+    def set_parameters(self, file: StudyFile, levels: Levels, texts: Mapping[str, str]) -> None:
+        """Give the models the parameters of these levels; raises UsageError."""
+        others = {MODEL, PROMPT, OPPONENT, PERCEPTION, *ScenarioConfig.model_fields, *file.texts}
+        changed = {*both_sides(texts[MODEL]).values()}
+        for parameter in (n for n, x in levels.items() if n not in others and x != DEFAULT):
+            given_to = file.given_to.get(parameter, "both")
+            receivers = self.receivers(given_to)
+            if given_to == "both":  # an opponent keeps its own parameters
+                receivers = [side for side in receivers if self.sides[side] in changed]
+            if not self.entries.keys() & {*receivers}:
+                name = texts[MODEL] if given_to == "both" else self.sides[receivers[0]]
+                raise UsageError(f"{name} is a program and takes no {parameter}, only {DEFAULT!r}")
+            for side in [side for side in receivers if side in self.entries]:
+                is_set = self._set(side, parameter, levels[parameter], texts[parameter])
+                self.one_sided |= is_set and given_to != "both"
+
+    def words(self, file: StudyFile, texts: Mapping[str, str]) -> dict[str, StudyText]:
+        """Return the text levels by factor; raises UsageError where no model would read one."""
+        words = {n: file.texts[n][t] for n, t in texts.items() if t in file.texts.get(n, ())}
+        for name, word in words.items():
+            receivers = self.receivers(word.given_to)
+            if not self.entries.keys() & {*receivers}:
+                raise UsageError(
+                    f"{self.sides[receivers[0]]} is a program and reads no words: leave "
+                    f"{name}={texts[name]} out there, by skip"
+                )
+            self.one_sided |= word.given_to != "both"
+        return words
+
+    def plant(self, words: Iterable[StudyText]) -> None:
+        """Plant the effects of text levels in the emulator, on both sides.
+
+        Both sides act on one plan: an effect that makes one driver go first makes the other yield.
+        """
+        scripted = [s for s, entry in self.entries.items() if entry.provider == EMULATOR]
+        own_first = {side: _number(self.entries[side], "x_own_first") for side in scripted}
+        gap_m = 0.0
+        for word in words:
+            gap_m += word.emulator.gap_m
+            for side in own_first.keys() & {*self.receivers(word.given_to)}:
+                own_first[side] += word.emulator.own_first
+        for side in scripted:
+            planted = {
+                "x_own_first": own_first[side],
+                "x_other_first": own_first.get(other_side(side), 0.0),
+                "x_gap_m": gap_m + _number(self.entries[side], "x_gap_m"),
+            }
+            for parameter, number in planted.items():
+                if number != _number(self.entries[side], parameter):
+                    self._set(side, parameter, number, f"{number:g}")
+
+    def _set(self, side: Side, parameter: str, value: JsonValue, text: str) -> bool:
+        """Set a parameter of a side's model; return whether that changes the model."""
+        before = self.entries[side]
+        self.entries[side] = with_parameter(self.sides[side], before, parameter, value)
+        if self.entries[side] == before:
+            return False
+        self.asked[side] += f" {parameter}={text}"
+        return True
+
+
+def make_arm(
     file: StudyFile,
     levels: Levels,
-    texts: Mapping[str, str],
     repetitions: int,
     registry: Mapping[str, ModelEntry],
     varying: Sequence[str],
     *,
     mirrored: bool = False,
 ) -> Arm:
-    """Return the arm of these levels; raises UsageError.
+    """Return the arm of these levels; with ``mirrored`` the drivers swap sides.
 
-    ``texts`` are the levels as in results. With ``mirrored`` the drivers swap sides.
+    Its label has the levels of the ``varying`` factors. Raises UsageError.
     """
-    model, opponent = texts[MODEL], texts.get(OPPONENT, SELF)
-    if opponent != SELF and "+" in model:
-        raise UsageError(f"{model} is a pair already, and has no other opponent than {SELF}")
-    sides = both_sides(model if opponent == SELF else f"{model}+{opponent}")
-    for name in sides.values():
-        require({**registry, **PROGRAMS}, "model", name, "two joined by + drive left and right")
-    ego = ego_side(sides, registry, opponent)
-    if mirrored:
-        sides, ego = {side: sides[other_side(side)] for side in SIDES}, other_side(ego)
-    asked = dict(sides)
-    entries = {side: registry[name] for side, name in sides.items() if name in registry}
-    one_sided = _set_parameters(file, levels, texts, ego, sides, asked, entries)
-    words = {n: file.texts[n][text] for n, text in texts.items() if text in file.texts.get(n, ())}
-    for name, word in words.items():
-        receivers = _receivers(word.given_to, ego)
-        if not entries.keys() & {*receivers}:
-            raise UsageError(
-                f"{sides[receivers[0]]} is a program and reads no words: leave "
-                f"{name}={texts[name]} out there, by skip"
-            )
-        one_sided |= word.given_to != "both"
-    names = asked[ego], asked[other_side(ego)]
-    _plant(words.values(), ego, sides, asked, entries)
-    variant = composed(texts[PROMPT], [f"{name}={texts[name]}" for name in words])
+    texts = {name: level_text(level) for name, level in levels.items()}
+    drivers = ArmDrivers.of(texts, registry, mirrored=mirrored)
+    drivers.set_parameters(file, levels, texts)
+    words, ego = drivers.words(file, texts), drivers.ego
+    names = drivers.asked[ego], drivers.asked[other_side(ego)]
+    drivers.plant(words.values())
+
+    def prompt(names: Iterable[str]) -> str:
+        return composed(texts[PROMPT], [f"{name}={texts[name]}" for name in names])
+
+    variant = prompt(words)
     prompts = {
-        side: composed(
-            texts[PROMPT],
-            [
-                f"{n}={texts[n]}"
-                for n, word in words.items()
-                if side in _receivers(word.given_to, ego)
-            ],
-        )
+        side: prompt(n for n, word in words.items() if side in drivers.receivers(word.given_to))
         for side in SIDES
     }
-    programs = {name: PROGRAMS[name] for name in sides.values() if name not in registry}
-    scenario = _scenario(file, levels, programs, ego)
+    scenario = _scenario(file, levels, drivers)
     if file.given_to.get(PERCEPTION, "both") != "both":
-        one_sided |= scenario.perception_left != scenario.perception_right
+        drivers.one_sided |= scenario.perception_left != scenario.perception_right
     parts = (texts[n] if n in (MODEL, PROMPT) else f"{n}={texts[n]}" for n in varying)
     label = " ".join(parts) or texts[PROMPT]
     return Arm(
-        model="+".join(dict.fromkeys(sides.values())),
-        sides=sides,
-        asked=asked,
+        model="+".join(dict.fromkeys(drivers.sides.values())),
+        sides=drivers.sides,
+        asked=drivers.asked,
         names=names,
-        entries={asked[side]: entry for side, entry in entries.items()},
+        entries={drivers.asked[side]: entry for side, entry in drivers.entries.items()},
         scenario=scenario,
         variant=variant,
         repetitions=repetitions,
@@ -152,76 +225,9 @@ def _arm(
         },
         label=f"{label} mirrored" if mirrored else label,
         ego=ego,
-        focal=ego if one_sided else None,
+        focal=ego if drivers.one_sided else None,
         prompts={} if {*prompts.values()} == {variant} else prompts,
     )
-
-
-def _receivers(given_to: GivenTo, ego: Side) -> list[Side]:
-    """Return the sides that ``given_to`` names."""
-    return {"both": [*SIDES], "ego": [ego], "other": [other_side(ego)]}[given_to]
-
-
-def _set_parameters(
-    file: StudyFile,
-    levels: Levels,
-    texts: Mapping[str, str],
-    ego: Side,
-    sides: Mapping[Side, str],
-    asked: dict[Side, str],
-    entries: dict[Side, ModelEntry],
-) -> bool:
-    """Set the parameters of these levels in ``entries``, and add them to the names in ``asked``.
-
-    Return whether only one driver has such a parameter. Raises UsageError.
-    """
-    others = {MODEL, PROMPT, OPPONENT, PERCEPTION, *ScenarioConfig.model_fields, *file.texts}
-    changed, one_sided = {*both_sides(texts[MODEL]).values()}, False
-    for parameter in (n for n, x in levels.items() if n not in others and x != DEFAULT):
-        given_to = file.given_to.get(parameter, "both")
-        receivers = _receivers(given_to, ego)
-        if given_to == "both":  # an opponent keeps its own parameters
-            receivers = [side for side in receivers if sides[side] in changed]
-        if not entries.keys() & {*receivers}:
-            name = texts[MODEL] if given_to == "both" else sides[receivers[0]]
-            raise UsageError(f"{name} is a program and takes no {parameter}, only {DEFAULT!r}")
-        for side in [side for side in receivers if side in entries]:
-            before = entries[side]
-            entries[side] = with_parameter(sides[side], before, parameter, levels[parameter])
-            if entries[side] != before:
-                asked[side] += f" {parameter}={texts[parameter]}"
-                one_sided |= given_to != "both"
-    return one_sided
-
-
-def _plant(
-    words: Iterable[StudyText],
-    ego: Side,
-    sides: Mapping[Side, str],
-    asked: dict[Side, str],
-    entries: dict[Side, ModelEntry],
-) -> None:
-    """Plant the effects of the text levels ``words`` in the emulator, on both sides.
-
-    Both sides act on one plan: an effect that makes one driver go first makes the other yield.
-    """
-    scripted = [side for side, entry in entries.items() if entry.provider == EMULATOR]
-    own_first = {side: _number(entries[side], "x_own_first") for side in scripted}
-    gap_m = 0.0
-    for word in words:
-        gap_m += word.emulator.gap_m
-        for side in own_first.keys() & {*_receivers(word.given_to, ego)}:
-            own_first[side] += word.emulator.own_first
-    for side in scripted:
-        planted = {
-            "x_own_first": own_first[side],
-            "x_other_first": own_first.get(other_side(side), 0.0),
-            "x_gap_m": gap_m + _number(entries[side], "x_gap_m"),
-        }
-        for parameter, number in planted.items():
-            if number != _number(entries[side], parameter):
-                entries[side] = with_parameter(sides[side], entries[side], parameter, number)
-                asked[side] += f" {parameter}={number:g}"
 
 
 def _number(entry: ModelEntry, parameter: str) -> float:
@@ -230,10 +236,9 @@ def _number(entry: ModelEntry, parameter: str) -> float:
     return number if isinstance(number, int | float) else 0.0
 
 
-def _scenario(
-    file: StudyFile, levels: Levels, programs: Mapping[str, Program], ego: Side
-) -> ScenarioConfig:
-    """Return the scenario of these levels for these programs; raises UsageError."""
+def _scenario(file: StudyFile, levels: Levels, drivers: ArmDrivers) -> ScenarioConfig:
+    """Return the scenario of these levels for these drivers; raises UsageError."""
+    programs = {n: PROGRAMS[n] for s, n in drivers.sides.items() if s not in drivers.entries}
     sides = [f"{PERCEPTION}_{side}" for side in SIDES]
     fields = ScenarioConfig.model_fields.keys() - {*sides}
     values = file.scenario.model_dump(exclude_unset=True)
@@ -241,7 +246,7 @@ def _scenario(
     values |= _world_step(validated(ScenarioConfig, values, "factors"), programs)
     known = {PERFECT_ONE: PERFECT, **file.perception}
     hint = f"define another one as [{PERCEPTION}.NAME]"
-    receivers = _receivers(file.given_to.get(PERCEPTION, "both"), ego)
+    receivers = drivers.receivers(file.given_to.get(PERCEPTION, "both"))
     affected = [f"{PERCEPTION}_{side}" for side in receivers]
     for factor in [name for name in (PERCEPTION, *sides) if name in levels]:
         level = level_text(levels[factor])

@@ -26,8 +26,8 @@ from merge_runner.study.arms import (
     PROMPT,
     Arm,
     Levels,
-    _arm,
     level_text,
+    make_arm,
 )
 from merge_runner.study.file import EVERY_PROMPT, StudyFile
 
@@ -70,7 +70,7 @@ def cross(
         if any(all(texts[name] in levels for name, levels in row.items()) for row in skip):
             continue
         levels = {name: axes[name][text] for name, text in texts.items()}
-        make = partial(_arm, file, levels, texts, repetitions[texts[PROMPT]], registry, varying)
+        make = partial(make_arm, file, levels, repetitions[texts[PROMPT]], registry, varying)
         first = make()
         has_mirror = (mirror or file.mirror) and (first.is_mixed or first.focal is not None)
         for arm in (first, make(mirrored=True)) if has_mirror else (first,):

@@ -11,8 +11,7 @@ from typer.testing import CliRunner
 
 import merge_runner as package
 from merge_runner.cli import complete_app
-from merge_runner.cli.app import app_with_one_command
-from merge_runner.cli.packages import GROUP, command_modules, load_commands
+from merge_runner.cli.app import GROUP, app_with_one_command
 from merge_runner.run.options import Options
 
 COMMANDS = {
@@ -63,17 +62,16 @@ def test_a_command_has_its_options_where_those_of_the_others_are_left_out():
 
 
 def test_packages_name_their_commands_by_an_entry_point(tmp_path, monkeypatch):
-    (analysis,) = [point.module for point in entry_points(group=GROUP)]
     (tmp_path / "mine-1.dist-info").mkdir()
     named = f"[other]\na = other\n[{GROUP}]\nb = mine_b.commands\na=mine_a : x\n\n[z]\n"
     (tmp_path / "mine-1.dist-info/entry_points.txt").write_text(named)
+    (tmp_path / "mine-1.dist-info/METADATA").write_text("Name: mine\n")
     monkeypatch.syspath_prepend(tmp_path)
-    assert command_modules() == [analysis, "mine_a", "mine_b.commands"]
-    load_commands()  # neither of the two packages is there
+    complete_app()  # neither of the two modules is there
     (tmp_path / "mine_a.py").write_text("import no_such_library")
     invalidate_caches()
     with pytest.raises(ModuleNotFoundError, match="no_such_library"):
-        load_commands()
+        complete_app()
 
 
 def every_command(command, path=()):

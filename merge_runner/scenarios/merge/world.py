@@ -109,20 +109,15 @@ class World:
 
     def states(self) -> tuple[StateRow, ...]:
         """Return the trace as one row per vehicle and sample."""
-        rows = []
-        for step in range(self.step + 1):
-            time_s = _time(step, self._config.step_s)
-            for side, vehicle in self._vehicles.items():
-                row = StateRow(
-                    step=step,
-                    time_s=time_s,
-                    side=side,
-                    position_m=vehicle.positions[step],
-                    velocity_mps=vehicle.velocities[step],
-                    acceleration_mps2=vehicle.accelerations[step],
-                )
-                rows.append(row)
-        return tuple(rows)
+        times_s = [_time(step, self._config.step_s) for step in range(self.step + 1)]
+        columns = {
+            side: (v.positions, v.velocities, v.accelerations) for side, v in self._vehicles.items()
+        }
+        return tuple(
+            StateRow(step, time_s, side, positions[step], velocities[step], accelerations[step])
+            for step, time_s in enumerate(times_s)
+            for side, (positions, velocities, accelerations) in columns.items()
+        )
 
     def _history(self, samples: list[float], before: float) -> tuple[float, ...]:
         length = self._config.memory_samples

@@ -177,6 +177,13 @@ async def test_hits_cost_nothing_and_the_estimate_counts_what_is_missing(merge_r
         text = [word for word in sweep if word != "--json"]
         second = await merge_runner(*text, 2, "--yes", **env)
         assert "estimated before: " in second.out
+        requests = server.requests
+        for db in (
+            (),
+            ("--db", "new"),
+        ):  # nothing is left to ask, so that it does not ask for --yes
+            again = await merge_runner(*sweep, 2, *db, **env)
+            assert (again.code, server.requests) == (0, requests), again.err
         replay = await merge_runner("replay", *sweep[1:], 2, "--db", "other", **env)
     assert replay.summary["cost_usd"] == replay.summary["calls"]["live"] == 0
     (calls,) = await sql(merge_runner, "select count(*) as n from calls")

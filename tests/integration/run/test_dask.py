@@ -14,6 +14,7 @@ import shutil
 import socket
 import sqlite3
 from contextlib import closing
+from dataclasses import astuple
 from functools import partial
 from importlib import import_module
 
@@ -24,8 +25,9 @@ from merge_runner.errors import SweepStopped, UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.ledger import CallLabel, Ledger
 from merge_runner.records import SLOT_HEADER, ReplayMiss
+from merge_runner.run.cluster_assignment import Assignment
 from merge_runner.run.cluster_connection import connected
-from merge_runner.run.cluster_worker import Played, RemoteLedger
+from merge_runner.run.cluster_worker import Chunk, Played, RemoteLedger
 from tests.support.cluster import SIX, SMALL, all_held, ended, held_from, repetition_of, workers_of
 from tests.support.crossed_study import MODEL
 from tests.support.gate import HANGS_S, Gate
@@ -74,6 +76,29 @@ async def test_a_coordinator_that_says_nothing_ends_its_workers_tasks(tmp_path):
         with pytest.raises(SweepStopped, match="the coordinator has said nothing for 300 s"):
             await ledger.ask_coordinator("a key", 1.0, CallLabel())
     assert now_s() == 300
+
+
+async def test_an_attempt_whose_event_is_lost_asks_again_and_is_reserved_once(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr("merge_runner.run.cluster_worker.AGAIN_S", 0.01)
+    assignment = Assignment("tcp://1", Chunk("task 1", None, None, (), 1.0, ((), ()), ()))
+    events = []
+
+    def tell(*event):
+        events.append((*event[:-1], astuple(event[-1])))
+
+    with closing(ResponseCache(tmp_path)) as cache:
+        ledger, worker = Ledger(cache, "baseline"), RemoteLedger(cache, "", None, tell)
+        asking = asyncio.create_task(worker.ask_coordinator("a key", 1.0, CallLabel("o3")))
+        while len(events) < 4:
+            await asyncio.sleep(0.01)
+        for late in (events[1:3], events[:1]):
+            for event in late:
+                assignment.events.put_nowait(event)
+            worker.answer(await assignment._book(ledger))
+        assert await asking
+        assert (ledger.read().reserved_usd, ledger.read().open_attempts) == (1.0, 1)
 
 
 async def test_what_cannot_be_on_a_cluster_is_told_in_one_line(merge_runner, tmp_path):

@@ -188,8 +188,10 @@ async def test_exported_sweeps_go_round_through_files_and_are_played_as_far_as_t
         assert (await merge_runner("recording", "export", f"{name}.parquet")).code == 0
     digest = results_digest(tmp_path / "results/merge.duckdb")
     assert digest[1] == 2
+    both = ("--sweep", sweeps[0], "--sweep", sweeps[1])
+    export = await merge_runner("recording", "export", "both.parquet", *both)
+    assert f"their digest, and that of a replay: {digest[0]}  2 trials\n" in export.err
     for command in (
-        ("recording", "export", "both.parquet", "--sweep", sweeps[0], "--sweep", sweeps[1]),
         ("recording", "verify", "both.parquet"),
         ("audit", "--recording", "both.parquet"),
     ):
@@ -208,6 +210,10 @@ async def test_exported_sweeps_go_round_through_files_and_are_played_as_far_as_t
     assert (run.code, run.summary["trials"]["planned"]) == (0, 2), run.err
     assert "holds 2 of the plan's 110 trials" in run.err
     assert results_digest(tmp_path / "again.duckdb") == digest
+    lacking = ("--db", "again.duckdb", "--cache", "none")
+    nothing = await merge_runner("recording", "export", "x.parquet", *lacking)
+    assert nothing.code == 1
+    assert "is not in the cache none: its run replayed a recording, which holds it" in nothing.err
     part = ("--conditions", "N_0_0", "--db", "part.duckdb", "--reps")
     assert (await merge_runner(*replay, "new", *part, 1)).code == 0
     asked = await merge_runner(*replay, "none", *named, *part, 2)

@@ -96,6 +96,8 @@ async def test_what_is_recorded_is_not_asked_again_and_what_is_new_or_has_failed
         assert "No such thing." in first["failed"]["emulator/baseline/N_0_0/rep01"]
         calls = query(tmp_path / DB, "select outcome, count(*) n from calls group by all")[1]
         assert dict(calls)["bad_request"] == 2
+        export = await merge_runner("recording", "export", "part.parquet")
+        assert "their digest (that of a replay may differ: a run had problems): " in export.err
         broken = False
         second = (await merge_runner(*sweep, "--reps", 2, **server.env)).summary
         new = server.requests - asked_first
