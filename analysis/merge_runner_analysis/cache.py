@@ -51,19 +51,13 @@ def stamp_of(db: Path) -> tuple[int, ...]:
 
 
 def present_state(db: Path) -> str:
-    """Return the state that tables depend on: the database's stamp, the program, a study's parts.
-
-    Raises UsageError where there is no database.
-    """
+    """Return the state that tables depend on: database, program, study. Raises UsageError."""
     return json.dumps([stamp_of(db), program(), in_use().text, in_use().plugins])
 
 
 @cache
 def program() -> str:
-    """Return the versions of the package and its plug-ins, and of their files the newest time.
-
-    Files of a checkout are edited under the same version.
-    """
+    """Return the versions of package and plug-ins, and the newest time of their files."""
     releases = {point.dist.name: point.dist.version for point in plugins() if point.dist}
     releases["merge-runner"] = version("merge-runner")
     sources = (*PACKAGES, *plugin_sources())
@@ -120,10 +114,7 @@ def _run(db: Path, sql: str, rows: Sequence[tuple[str, ...]]) -> list[tuple[str,
 def remembered(
     function: Callable[Concatenate[Owner, Others], Result],
 ) -> Callable[Concatenate[Owner, Others], Result]:
-    """Keep a function's results in its first argument, by the other ones.
-
-    A cache of the module would keep every study that was ever read.
-    """
+    """Keep a function's results in its first argument: a module's cache would keep every study."""
 
     @wraps(function)
     def remember(owner: Owner, /, *args: Others.args, **kwargs: Others.kwargs) -> Result:

@@ -1,7 +1,4 @@
-"""The commands of the analysis, beside those of the runner on one command line.
-
-Libraries are imported where they are used, so that the runner's commands start at once.
-"""
+"""The commands of the analysis; libraries are imported where they are used, to start at once."""
 
 from __future__ import annotations
 

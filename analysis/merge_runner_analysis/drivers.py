@@ -11,10 +11,7 @@ from merge_runner.records import SIDES, Side
 
 
 def language_models(names: Mapping[Side, str], spec: Mapping[str, Any]) -> dict[Side, str]:
-    """Return the drivers that are language models by the spec of their trials.
-
-    It knows the programs of a study, too, which may not be registered here.
-    """
+    """Return the language models by a spec: its programs may not be registered here."""
     return {side: name for side, name in names.items() if "program" not in (spec.get(side) or {})}
 
 
@@ -24,10 +21,7 @@ def programs_alone(spec: Mapping[str, Any]) -> bool:
 
 
 def has_chance(spec: Mapping[str, Any], sides: Collection[Side] = SIDES) -> bool:
-    """Return whether drivers of a spec, or what they perceive, are drawn by chance.
-
-    A language model samples; a program declares it.
-    """
+    """Return whether drivers of a spec, or what they perceive, are drawn by chance."""
     scenario = ScenarioConfig.model_validate(spec.get("scenario", {}))
     drivers = {side: spec.get(side) or {} for side in sides}
     return any(
@@ -45,10 +39,7 @@ def unresponsive(spec: Mapping[str, Any]) -> str:
 
 
 def stand_in(models: Mapping[Side, str], sides: Collection[Side] = SIDES) -> str:
-    """Return the label of these language models' trials, which a mock model answered on some sides.
-
-    A side that a program drives has no model.
-    """
+    """Return the label of language models' trials that a mock model answered on some sides."""
     named = {side: name for side, name in models.items() if name not in MOCKS}
     posing = "+".join(dict.fromkeys(name for side, name in named.items() if side in sides))
     real = [side for side in named if side not in sides]

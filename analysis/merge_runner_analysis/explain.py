@@ -30,10 +30,7 @@ QUERY = (
 
 
 class Source(NamedTuple):
-    """The trials of one group that a row rests on, and how to list them.
-
-    ``numerator``: those of them that a share or a count counts.
-    """
+    """Trials of a group behind a row, with a query; a share counts those in ``numerator``."""
 
     group: str
     text: str

@@ -1,7 +1,4 @@
-"""Results as data frames: single queries, and all that a study reads, in one opening of its file.
-
-A query that a single table, page or statistic needs is beside it.
-"""
+"""Results as data frames: single queries, and all that a study reads at once."""
 
 from __future__ import annotations
 
@@ -152,10 +149,9 @@ def _limit(connection: duckdb.DuckDBPyConnection) -> None:
 
 
 def load_trials(db: Path | str = DEFAULT_DB) -> pd.DataFrame:
-    """Return one row a trial, as its ``ego`` sees it: condition, outcome and metrics in SI units.
+    """Return one row a trial as its ``ego`` sees it, in SI units; see docs/tables.md.
 
-    See docs/tables.md. A trial whose ego sat on the right is mirrored: its left is the
-    ego's side. First situations that were only asked are left out.
+    A trial whose ego sat on the right is mirrored; first-decision probes are left out.
     """
     return load(f"FROM ({TRIALS}) WHERE source <> 'first_decision'", db)
 

@@ -202,10 +202,7 @@ def levels_of_group(levels: pd.DataFrame, group: Group) -> dict[str, str]:
 
 
 def levels_of(groups: Iterable[Group], order: Order) -> dict[str, list[str]]:
-    """Return the levels of each factor that these groups have, those in ``order`` first.
-
-    Then come usual ones, then numbers by size, then the rest by name.
-    """
+    """Return the levels of each factor: those in ``order``, usual ones, numbers, the rest."""
     every: dict[str, set[str]] = {}
     for group in groups:
         for factor, level in group.levels.items():
@@ -223,11 +220,10 @@ def _place(level: str, listed: Sequence[str]) -> tuple[int, bool, float, str]:
 
 
 def _as_seen(stored: Mapping[str, Any] | None, name: str, ego: str) -> dict[str, Any]:
-    """Return a spec as the ego sees it: with the ego's driver on the left.
+    """Return a spec as its ego sees it, on the left, with three hashes.
 
-    ``image`` is its hash, ``usual`` its hash at the usual mean speed. ``task`` is a hash of what
-    it covers beside the prompt, the mean speed and what is planted in the emulator: equal for all
-    prompts and conditions of a study.
+    ``image`` is its hash, ``usual`` that at the usual mean speed, ``task`` one without prompt, mean
+    speed and planted effects: equal for all prompts and conditions of a study.
     """
     spec, image = stored or {}, name
     if ego == "right" and {*SIDES} <= spec.keys():
@@ -262,9 +258,7 @@ def groups_of(
 ) -> list[Group]:
     """Return groups by driver and levels, mock models last; the frames are a study's.
 
-    Where a driver was run under several settings of the task, all but the most frequent carry a
-    mark, the same for a baseline and its variants; likewise where a prompt was changed, and where
-    a mock model answered some of its trials.
+    All but the most frequent task settings of a driver, and texts of a prompt, carry a mark.
     """
     if trials.empty:
         return []
@@ -324,8 +318,7 @@ def _model_group(rows: pd.DataFrame, first: pd.Series, unjudged: Reason) -> Grou
 def _distinct(group: Group, *, programs: bool, scripted: bool) -> Group:
     """Return the group without copies if only programs drive; count those of a language model.
 
-    A mock model reads no words: its trials of several prompts are copies where they went alike, the
-    first of those that did with the first of another's, and so on.
+    A mock model's nth trial of one course is a copy of the nth one of another prompt.
     """
     rows = group.trials
     ended = rows[rows["trace"].notna()].sort_values(["rep", "ego"], kind="stable")

@@ -1,7 +1,4 @@
-"""The list of metrics: what each trial has, how a group is summed up, and where that is shown.
-
-Tables, figures and pages ask this list, and name no metric that is not in it.
-"""
+"""The list of metrics: the value of each trial, its summary, and where that is shown."""
 
 from __future__ import annotations
 
@@ -28,20 +25,14 @@ JUDGED = ("collided", "collided_boxes")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Metric:
-    """A number of each trial, and how it is summarised.
+    """A number of each trial, and how it is summarised. Raises UsageError where these disagree.
 
-    ``name`` is that of its columns and rows, and ends with the unit. ``value`` is SQL over the
-    columns of ``trials`` and ``trial_metrics``, or one of JUDGED; a subquery over another table
-    knows the trial as ``trials.trial_id`` and ``trials.spec_hash``. A proportion is of a BOOLEAN
-    and printed in percent. ``trials`` are those that count, unless their value is NULL. ``weight``
-    is SQL of how much a trial counts in a mean: of a share of its replies, how many these are.
-
-    ``label`` and ``unit`` head a column, ``meaning`` describes one trial's number, or the
-    whole of a proportion. Raises UsageError where these do not fit together.
-
-    ``least`` is the smallest value that there can be, which intervals and axes do not pass.
-
-    ``paper_of_drivers`` and ``paper_of_humans`` are columns of ``paper_ablation_quantitative.csv``.
+    ``value`` is SQL over the columns of ``trials`` and ``trial_metrics``, or one of JUDGED; a
+    subquery over another table knows the trial as ``trials.trial_id`` and ``trials.spec_hash``. A
+    proportion is of a BOOLEAN. ``trials`` are those that count, unless their value is NULL;
+    ``weight`` is SQL of how much a trial counts in a mean. ``meaning`` describes one trial's
+    number, or the whole of a proportion; intervals and axes end at ``least``. ``paper_of_drivers``
+    and ``paper_of_humans`` are columns of ``paper_ablation_quantitative.csv``.
     """
 
     name: str

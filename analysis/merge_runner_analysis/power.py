@@ -98,8 +98,7 @@ COLUMNS = (
 class Truth:
     """Assumed behaviour of a driver: coefficients of Tables III and IV, and the rest.
 
-    ``gap_sd_m`` and ``noise`` are the standard deviations of the gaps and of the trials' logits,
-    ``collided`` is the share of trials that end in a collision.
+    ``gap_sd_m`` and ``noise`` are standard deviations of gaps and logits, ``collided`` is a share.
     """
 
     name: str
@@ -131,10 +130,7 @@ class Truth:
         return _chance(trials["logit"], trials["noise"])
 
     def plus(self, effect: Effect, conditions: Sequence[str]) -> Truth:
-        """Return the truth with an effect; of who goes first it is one on the mean over these.
-
-        As far as that can be: in no condition is a share more than 1.
-        """
+        """Return the truth with an effect; one on who goes first is on the mean over these."""
         added = {name: value for name, value in effect if name != "goes_first"}
         more = replace(self, **{name: getattr(self, name) + value for name, value in added.items()})
         if not effect.goes_first:
@@ -279,10 +275,7 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class Played:
-    """The trials of an arm as its ego sees them, and how they are assumed to go.
-
-    Either of two ``equal`` drivers with the same prompt may be the focal one.
-    """
+    """An arm's trials as its ego sees them; either of ``equal`` drivers may be focal."""
 
     cell: str
     side: Side
@@ -292,10 +285,7 @@ class Played:
     truth: Truth
 
     def trials(self, multiple: float, *, sides: bool) -> pd.DataFrame:
-        """Return so many times its trials by cell; those read from both sides have an ``image``.
-
-        Cells have ``sides`` where these are compared.
-        """
+        """Return so many times its trials by cell, perhaps of a side, with an ``image`` of both."""
         trials = _trials_of(self.truth, self.conditions, round(multiple * self.repetitions))
         names, images = trials["condition"], pd.Series(None, trials.index, dtype=object)
         if sides and self.equal:
@@ -311,10 +301,7 @@ def _level(level: tuple[Played, ...], multiple: float, *, sides: bool) -> pd.Dat
 
 @dataclass(frozen=True, slots=True)
 class Contrast:
-    """A level of a factor against its reference, in the cells of both, in one of ENDPOINTS.
-
-    It is ``assumed`` to differ by what the study names, by default, or as it is planted or played.
-    """
+    """A level against its reference in one of ENDPOINTS, by what is ``assumed``."""
 
     level: tuple[Played, ...]
     reference: tuple[Played, ...]
@@ -387,9 +374,8 @@ def chances(
 ) -> Iterator[Row]:
     """Simulate a plan that costs so much; ``groups`` are played ones. Raises UsageError.
 
-    Where factors vary, each level but a factor's reference has a row in the study's primary
-    measure. Where none does, or levels change how drivers react to their situation, the drivers
-    by themselves have rows.
+    Each level but a reference has a row in the primary measure. Drivers by themselves have rows
+    where no factor varies, or levels change their response to the situation.
     """
     labels: dict[Case | Contrast, list[tuple[str, str]]] = {}  # equal ones share rows
     for label, against, case in _cases(plan, groups):
@@ -447,11 +433,7 @@ def _cases(plan: Plan, groups: Sequence[Group]) -> Iterator[tuple[str, str, Case
 def _contrasts(
     plan: Plan, truths: Mapping[str, list[Truth]]
 ) -> Iterator[tuple[str, str, Contrast]]:
-    """Yield each level of each factor against its reference, in the cells that both have.
-
-    As in the table of effects mock models are compared with each other, and programs, which read no
-    prompt, are not compared by it.
-    """
+    """Yield each level against its factor's reference, as the table of effects does."""
     for scripted in (False, True):
         arms = [arm for arm in plan.arms if arm.is_scripted is scripted]
         at: dict[frozenset[tuple[str, str]], list[Arm]] = {}
@@ -551,10 +533,7 @@ def _place(plan: Plan, factor: str, level: str) -> int:
 
 
 def _rehearses(plan: Plan) -> bool:
-    """Return whether a study has nothing but parameters that plant an effect in the emulator.
-
-    Effects that its words plant, or that are planted beside an [effect], are no assumption.
-    """
+    """Return whether parameters alone plant effects: no words do, nor an [effect]."""
     file = plan.study.file
     words = (word for levels in file.texts.values() for word in levels.values())
     if file.effect or any(word.emulator != PlantedWords() for word in words):
@@ -563,10 +542,7 @@ def _rehearses(plan: Plan) -> bool:
 
 
 def _truths(plan: Plan, arm: Arm, groups: Sequence[Group]) -> list[Truth]:
-    """Return how an arm goes: as humans and as played, with named effects; or as planted.
-
-    In a rehearsal an arm goes as its ego's request says, also one in which nothing is planted.
-    """
+    """Return how an arm goes: as humans and as played with named effects, or as planted."""
     ego = arm.entries.get(arm.names[0])
     if ego and _rehearses(plan):
         fields = planted_fields(ego.parameters)

@@ -78,8 +78,7 @@ WHERE source <> 'human' GROUP BY ALL ORDER BY ALL
 class Provenance(NamedTuple):
     """Origin of the report's numbers: rows of the queries here.
 
-    By driver, variant and spec_hash ``settings`` are the collision rule, what else of the driving
-    task differs from the defaults, and the request parameters of the models.
+    ``settings`` by driver, variant and spec_hash: rule, unusual task settings, request parameters.
     """
 
     sweeps: pd.DataFrame
@@ -105,13 +104,9 @@ def provenance(db: Path) -> Provenance:
 
 
 def call_counts(study: Study, group: Group) -> pd.DataFrame:
-    """Return of each trial of a group the counts of its calls, and of what went wrong with them.
+    """Return the counts of each trial's calls; the table ``attempts`` explains them.
 
-    A call is asked at one decision, in one or more attempts. ``retried`` attempts were followed by
-    another, ``lost`` calls ended without an answer; of the ``answers``, ``invalid`` ones have no
-    valid plan, for a reason that has a count of its own, too; ``no_decision`` ones have one, and
-    lack the tactical decision asked for. ``fallback`` counts the ``decisions`` that were driven
-    from an older plan, or none.
+    Each reason for an invalid answer has a count, too; ``no_decision`` is not one of these.
     """
     trials = group.trials[KEYS].merge(study.frames.calls, how="left", on=KEYS)
     trials = trials.set_axis(group.trials.index).drop(columns=KEYS)
@@ -132,10 +127,7 @@ def tally(study: Study, group: Group) -> Counter[str]:
 
 
 def _settings(spec: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the settings of a driving task, and the parameters of the models on each side of it.
-
-    A spec is made with an empty prompt, by which that is known in any format.
-    """
+    """Yield the settings of a driving task, and its models' parameters without prompts."""
     yield from task_settings(spec.get("scenario", {}))
     for side in SIDES:
         body = spec.get(side, {}).get("body", {})

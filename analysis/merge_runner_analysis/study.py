@@ -42,10 +42,8 @@ ENOUGH_PER_CONDITION = 5
 class Study:
     """The groups of a database, humans first, and results that are computed once.
 
-    ``played`` are those of drivers, and ``models`` the ones of them that something is concluded
-    from, as ``unjudged`` are the others; ``asked`` and ``unjudged_asked`` are the same of drivers
-    that were only asked what they do first, each marked so by its name. ``state`` is that of the
-    results before they were read: rows may be stored meanwhile.
+    ``models`` are the ``played`` groups that are judged, ``unjudged`` the others; ``asked`` are
+    those of first-decision probes. ``state`` is that of the results before they were read.
     """
 
     def __init__(self, db: Path | str = DEFAULT_DB, selection: Selection = EVERYTHING) -> None:
@@ -110,10 +108,7 @@ class Study:
         ]
 
     def _selected(self, groups: list[Group]) -> list[Group]:
-        """Return the groups of the chosen drivers, at the chosen levels of factors.
-
-        Those that were only asked are chosen by the names of their models.
-        """
+        """Return the chosen groups; first-decision probes go by their models' names."""
         names = {
             group: group.name.removesuffix(ONLY_ASKED)
             if group.name.endswith(ONLY_ASKED)
@@ -172,8 +167,7 @@ class Study:
     def conditions(self) -> dict[str, tuple[float, float]]:
         """Name to projected headway in m and relative velocity in m/s, of those that were played.
 
-        Those of the humans come first; where no model played, all of these. The others are read
-        from the stored trials: what registered them may not be installed here.
+        Those of the humans come first; where no model played, all of these.
         """
         played = {
             row.condition: (row.projected_headway_m, row.relative_velocity_mps)
@@ -218,10 +212,7 @@ def in_one_study(study: Study, *groups: Group) -> bool:
 
 
 def _chosen(db: Path, studies: Studies, source: StudySource | None) -> tuple[str, Order]:
-    """Return the name of the study that was chosen, or an empty one, and the order of its levels.
-
-    Raises UsageError where the database has no trial of the study.
-    """
+    """Return the chosen study's name, if any, and its levels. Raises UsageError."""
     if source is None:
         return "", _pooled_order(studies)
     order = listed_levels(source.file, source.file.models)
@@ -237,10 +228,7 @@ def _chosen(db: Path, studies: Studies, source: StudySource | None) -> tuple[str
 
 
 def _pooled_order(studies: Studies) -> Order:
-    """Return the levels of each factor in the order of the study that lists the most of them.
-
-    The newest of equal ones counts; one level alone gives no order.
-    """
+    """Return levels in the order of the study that lists the most, or the newest."""
     pooled: dict[str, list[str]] = {}
     for factor in dict.fromkeys(name for order in studies.orders.values() for name in order):
         lists = [order[factor] for order in studies.orders.values() if factor in order]
@@ -253,10 +241,7 @@ def _pooled_order(studies: Studies) -> Order:
 def _at(
     where: Mapping[str, Sequence[str]], groups: list[Group], db: Path, order: Order
 ) -> list[Group]:
-    """Return the groups that have one of these levels of each factor.
-
-    Raises UsageError where there is none, or no such level.
-    """
+    """Return the groups that have one of these levels of each factor. Raises UsageError."""
     every, kept = levels_of(groups, order), groups
     for factor, levels in where.items():
         known = require(every, "factor", factor)

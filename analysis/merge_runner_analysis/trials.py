@@ -1,8 +1,6 @@
 """The trials of a database with their metrics, and with whether they collided, by two rules.
 
-By the rule that ended them and by that of the human experiment: a trial is judged by its stored
-trace. Where it ended in a collision that the other rule does not see, nobody knows what would have
-followed: it is undecided by that rule.
+A trial that ended in a collision which the other rule does not see is undecided by that rule.
 """
 
 from __future__ import annotations
@@ -48,10 +46,7 @@ Sample = tuple[int, float, float, float, float, float]
 
 
 def with_metrics(connection: duckdb.DuckDBPyConnection, trials: str) -> pd.DataFrame:
-    """Return the rows of a query of trials with a column for each metric that is not JUDGED.
-
-    Raises UsageError where the SQL of a metric fails.
-    """
+    """Return the rows of a query of trials with a column for each metric that is not JUDGED."""
     metrics = [metric for metric in METRICS.values() if metric.value not in JUDGED]
     types = {metric.column: "boolean" if metric.rate else "float" for metric in metrics}
     types |= {metric.weight_column: "float" for metric in metrics if metric.weight}
@@ -90,11 +85,7 @@ def judged(
     trials: pd.DataFrame,
     specs: Mapping[str, Mapping[str, Any]],
 ) -> pd.DataFrame:
-    """Return the trials with whether they collided, by two rules; NA where that is undecided.
-
-    ``collided``: by the rule of their scenario, looked for at its steps; not of humans.
-    ``collided_boxes``: by the rule of the human experiment. ``trials`` are rows of TRIALS.
-    """
+    """Return the trials with whether they collided by either rule; NA if undecided."""
     ended, human = trials["status"] != "failed", trials["source"] == "human"
     recorded = trials["status"].eq("collided").astype("boolean").where(ended)
     tasks = {

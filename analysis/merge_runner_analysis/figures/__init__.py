@@ -7,10 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """Title of a figure for lists, its caption, and the table that holds its numbers.
-
-    The numbers of those without a table are the metrics of the list of trials.
-    """
+    """Title of a figure, its caption, and the table with its numbers, if one has them."""
 
     shows: str
     caption: str

@@ -77,10 +77,7 @@ def effects_figure(study: Study) -> Figure:
 
 
 def _lines(study: Study) -> dict[str, list[tuple[str, Level]]]:
-    """Return by line its levels, each with its driver; without a factor one of all drivers.
-
-    Levels stand as the study lists them, the reference first.
-    """
+    """Return by line its levels, each with its driver; without a factor one line of all drivers."""
     factors = levels_of(study.models, study.order)
     lines: dict[str, list[tuple[str, Level]]] = {
         f"{factor}: {name}": []

@@ -161,10 +161,7 @@ def _played(study: Study, group: Group) -> Group:
 
 @remembered
 def left_traces(study: Study, group: Group, first: str) -> dict[float, list[Array]]:
-    """Return times in s and left speeds in m/s, (n, 2), where ``first`` merged first (A, B).
-
-    They are by relative velocity. The left one of two different drivers is the ego.
-    """
+    """Return times in s and left speeds in m/s by velocity, where ``first`` merged first."""
     if not group.measured:
         return {}
     trials = group.finished[group.finished["merged_first"] == first]
@@ -177,10 +174,7 @@ def left_traces(study: Study, group: Group, first: str) -> dict[float, list[Arra
 
 
 def published_gap_line(velocity_mps: float) -> tuple[Array, Array]:
-    """Return the human regression of the gap as the paper prints it: headways and gaps in m.
-
-    The line spans the headways of the humans' conditions, whatever other conditions were driven.
-    """
+    """Return the humans' regression of the gap as printed: headways and gaps in m."""
     farthest_m = max(abs(condition.projected_headway_m) for condition in HUMAN_CONDITIONS.values())
     headway = np.linspace(-farthest_m, farthest_m, 81)
     terms = published("paper_gap").query("driver == 'human'")["b"].to_numpy(float)

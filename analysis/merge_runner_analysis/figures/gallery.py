@@ -37,10 +37,7 @@ MAKERS: dict[str, Callable[[Study], Figure]] = {
 
 
 def write_figures(study: Study, folder: Path) -> Iterator[Path]:
-    """Write every figure in all FORMS, and the numbers of those with a table; yields the paths.
-
-    Raises UsageError.
-    """
+    """Write every figure in all FORMS, and its table; yields paths. Raises UsageError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as exc:

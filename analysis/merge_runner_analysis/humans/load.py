@@ -31,11 +31,7 @@ Source = tuple[str, int, int, File]
 
 @dataclass(slots=True)
 class Report:
-    """The outcome of an import.
-
-    ``added`` and ``stored`` count the trials added and those already stored; ``differing`` are ids
-    of trials already stored with other values. ``unreadable`` holds file and reason.
-    """
+    """Counts of new and ``stored`` trials, ids of ``differing`` ones, files with reasons."""
 
     added: int = 0
     stored: int = 0

@@ -1,11 +1,9 @@
 """A recorded trial: read from its CSV file or a velocity page, and converted for the database.
 
-The experiment's recorder wrote series under dotted names, and scalars only in the first row. The
-pages docs/plots/CONDITION.html of github.com/tud-hri/simple-merging-experiment show the speed of
-both vehicles of every trial at 20 Hz, from its start: the left vehicle in the first panel, the
-right one in the second, drawn solid where it went first, dashed where second, and dotted after a
-collision. Positions follow: the experiment moves a vehicle by the mean of its speeds before and
-after a step. Plotly's ``write_html`` made the pages; nothing of a page is run.
+The pages docs/plots/CONDITION.html of github.com/tud-hri/simple-merging-experiment show the speeds
+at 20 Hz: the left vehicle in the first panel, the right one in the second, drawn solid where it
+went first, dashed where second, dotted after a collision. Positions are their trapezoids, as in the
+experiment. Nothing of a page is run.
 """
 
 from __future__ import annotations
@@ -89,8 +87,8 @@ Lines = dict[Side, dict[str, Any]]
 class Trace:
     """Both vehicles, one value per sample, in SI units; at least 2 samples, all finite.
 
-    ``step_s`` is the time between samples, ``end_state`` the recorder's word for how the trial
-    ended, ``positions_m`` the distances that each vehicle travelled along its own branch.
+    ``end_state`` is the recorder's word, ``positions_m`` are distances along the vehicles'
+    branches.
     """
 
     step_s: float
@@ -127,10 +125,7 @@ def parse_csv(content: bytes) -> Trace:
 
 
 def trial_record(trace: Trace, experiment: int, iteration: int, page: str = "") -> TrialRecord:
-    """Return the record of trial ``iteration`` of an experiment; raises Unreadable.
-
-    ``page`` is the condition of the velocity page that shows it.
-    """
+    """Return the record of a trial; ``page`` is the condition of its page. Raises Unreadable."""
     status = _status(trace)
     condition = _condition(trace)
     if page not in ("", condition):

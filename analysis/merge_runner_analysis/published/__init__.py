@@ -1,7 +1,4 @@
-"""Published values that ship with the project; ``data/sources.csv`` cites each file.
-
-Counts, citations and paths are read without pandas, at once.
-"""
+"""Published values that ship with the project; ``sources.csv`` cites each file."""
 
 from __future__ import annotations
 
@@ -71,11 +68,7 @@ def printed_value(value: str | float) -> str | float:
 
 
 def human_outcomes() -> pd.DataFrame:
-    """Return the 990 human trials as far as they are published.
-
-    Columns as in ``trials``: condition, projected_headway_m, relative_velocity_mps, status,
-    merged_first. ``collided_boxes``: the experiment's collisions are boxes that overlap.
-    """
+    """Return the 990 human trials as far as they are published, with the columns of ``trials``."""
     import pandas as pd
 
     fates = (("finished", "left"), ("finished", "right"), ("collided", None))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from math import hypot, sqrt
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -21,25 +22,26 @@ LEVERAGE = 1e-9
 NEAREST = 1e-9  # to a difference, of what it may be instead
 LARGEST_Z = 30.0  # of this quantile p is 0 to 190 digits
 Z_WITH_POWER = Z + float(stats.norm.ppf(POWER))
+Array = NDArray[np.float64]
+Trials = Mapping[str, Any]  # columns, also of a data frame: condition and a measure
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, eq=False)
 class Cells:
     """Two rates by cell: successes and trials of the first, and of the second.
 
-    Their difference is that of Mantel and Haenszel: cells weigh n m / (n + m), as in least squares.
-    ``varying`` is by cell what share of the trials of either vary by themselves: not those that
-    stand in two cells with opposite outcomes, so that their sum is sure.
+    ``varying`` is by cell the share of trials that vary by themselves: those that are in two cells
+    with opposite outcomes do not, as their sum is sure.
     """
 
     a: NDArray[np.int_]
     n: NDArray[np.int_]
     b: NDArray[np.int_]
     m: NDArray[np.int_]
-    varying: tuple[NDArray[np.float64] | float, NDArray[np.float64] | float] = (1.0, 1.0)
+    varying: tuple[Array | float, Array | float] = (1.0, 1.0)
 
-    @property
-    def shares(self) -> NDArray[np.float64]:
+    @cached_property
+    def shares(self) -> Array:
         """Weight of each cell, of 1; a trial that stands in two cells counts half in each."""
         n, m = (
             (1 + of) / 2 * size for of, size in zip(self.varying, (self.n, self.m), strict=True)
@@ -52,7 +54,7 @@ class Cells:
         """Both rates, of cells that weigh as in their difference."""
         return float(self.shares @ (self.a / self.n)), float(self.shares @ (self.b / self.m))
 
-    @property
+    @cached_property
     def difference(self) -> float:
         """The first rate less the second."""
         return float(self.shares @ (self.a / self.n - self.b / self.m))
@@ -60,8 +62,7 @@ class Cells:
     def variance(self, apart: float) -> float:
         """Return that of the difference if the rates of every cell are so far apart.
 
-        As Miettinen and Nurminen (1985) have it: of the likeliest such rates, and unbiased however
-        few trials a cell has. Where both rates are equal the test is that of Mantel and Haenszel.
+        It is of the likeliest such rates, unbiased (Miettinen and Nurminen 1985).
         """
         n, m = self.n, self.m
         p, q = _likeliest(self.a, n, self.b, m, apart)
@@ -72,10 +73,7 @@ class Cells:
         return float(self.shares**2 @ of_cells)
 
     def end(self, sign: int, z: float = Z) -> float:
-        """Return the lower end (-1) or the upper one (1) of the score interval at a quantile.
-
-        Beyond it are the differences that are ``z`` of their standard errors from the observed one.
-        """
+        """Return the lower end (-1) or the upper one (1) of the score interval at a quantile."""
         value = self.difference
 
         def beyond(apart: float) -> float:
@@ -104,11 +102,8 @@ class Cells:
 
 def _likeliest(
     a: NDArray[np.int_], n: NDArray[np.int_], b: NDArray[np.int_], m: NDArray[np.int_], apart: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the likeliest rates that are so far apart (Miettinen and Nurminen 1985).
-
-    The second is a root of a cubic, which their appendix gives in closed form.
-    """
+) -> tuple[Array, Array]:
+    """Return the likeliest rates that are so far apart (Miettinen and Nurminen 1985)."""
     every, hits = n + m, a + b
     square = (n + 2 * m) * apart - every - hits
     linear = (m * apart - every - 2 * b) * apart + hits
@@ -121,30 +116,21 @@ def _likeliest(
     return np.clip(second + apart, 0, 1), second
 
 
-def weighted(
-    k: NDArray[np.int_], n: NDArray[np.int_], weights: NDArray[np.float64]
-) -> tuple[float, float]:
+def weighted(k: NDArray[np.int_], n: NDArray[np.int_], weights: Array) -> tuple[float, float]:
     """Return a rate of which conditions have weights, and the trials that it is as good as."""
     shares = weights / weights.sum()
     return float(shares @ (k / n)), 1 / float(shares**2 @ (1 / n))
 
 
-def shared_cells(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Cells | None:
-    """Return the rates of two groups in the conditions that both have; None where there is none.
-
-    A column ``varies`` says which trials vary by themselves (see ``Cells``); else all do.
-    """
-    counts = []
-    for frame in (first, second):
-        known = frame.loc[frame[measure].notna()]
-        cells, hits = known["condition"], known[measure].astype(bool)
-        varying = cells[known["varies"]] if "varies" in known else cells
-        counts += [Counter(cells[hits]), Counter(cells), Counter(varying)]
-    shared = sorted(counts[1].keys() & counts[4].keys())
-    if not shared:
+def shared_cells(first: Trials, second: Trials, measure: str) -> Cells | None:
+    """Return the rates of two groups in the conditions of both, if there are any."""
+    cells, belongs, hits, varies = _within_shared(first, second, measure)
+    if not len(cells):
         return None
     a, n, first_varying, b, m, second_varying = (
-        np.array([count[cell] for cell in shared], dtype=int) for count in counts
+        np.bincount(cells, of_group * counted).astype(int)
+        for of_group in (belongs, 1 - belongs)
+        for counted in (hits, 1, varies)
     )
     return Cells(a, n, b, m, (first_varying / n, second_varying / m))
 
@@ -152,9 +138,8 @@ def shared_cells(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Cel
 def contrast_rates(cells: Cells) -> Estimate:
     """Compare two rates within cells: Mantel and Haenszel's test (1959), with a score interval.
 
-    The interval has the differences that the test of Miettinen and Nurminen (1985) does not reject.
-    ``detectable`` is the one that is so many standard errors from 0 as it takes for the power. None
-    where not even rates of 0 and 1 would differ.
+    ``detectable`` is as many standard errors from 0 as the power takes; None where not even rates
+    of 0 and 1 would differ.
     """
     value, se = cells.difference, sqrt(cells.variance(0))
     ends = cells.end(-1), cells.end(1)
@@ -175,11 +160,7 @@ def _detectable(cells: Cells, sign: int) -> float | None:
 
 
 def difference_of_contrasts(cells: Cells, others: Cells) -> Estimate:
-    """Return the difference of two differences of rates: an interaction.
-
-    Its interval follows from those of both (MOVER; Zou and Donner 2008), and p is the level at
-    which that leaves 0 out.
-    """
+    """Return an interaction, with its interval and p by MOVER (Zou and Donner 2008)."""
     differences = cells.difference, others.difference
     value = differences[0] - differences[1]
 
@@ -202,8 +183,7 @@ def difference_of_contrasts(cells: Cells, others: Cells) -> Estimate:
 def detectable_rate(n: int, m: int, rate: float) -> float | None:
     """Return the minimum detectable effect of Fisher's test of n and m trials at a true ``rate``.
 
-    In the direction in which less is enough; None where not even rates of 0 and 1 differ from it
-    with the power.
+    It is that of the direction in which less is enough; None where no rate has the power.
     """
     chances = rejected(n, m) @ stats.binom.pmf(np.arange(m + 1), m, rate)
 
@@ -232,24 +212,17 @@ def rejected(n: int, m: int) -> NDArray[np.bool_]:
     return is_rejected
 
 
-def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Estimate | None:
+def contrast_means(first: Trials, second: Trials, measure: str) -> Estimate | None:
     """Compare two means within the conditions that both have, by Welch's test.
 
-    The difference is that of a linear model with a level for each condition, so that another mix of
-    conditions, as when one group collides more in some, makes no difference. Its error holds where
-    groups differ in size and in variance (HC2; MacKinnon and White 1985), and so do its degrees of
-    freedom (Bell and McCaffrey 2002, of two variances). In one condition it is the test of Welch
-    (1947). None where the groups share no condition, or a single trial is all of one; without a
-    test where all trials of a condition are equal.
+    The difference is that of a linear model with a level for each condition. Its error (HC2;
+    MacKinnon and White 1985) and degrees of freedom (Bell and McCaffrey 2002) hold where groups
+    differ in size and variance. None where no condition is shared, or a single trial is all of one;
+    without a test where all trials of a condition are equal.
     """
-    known = [frame.loc[frame[measure].notna(), ["condition", measure]] for frame in (first, second)]
-    shared = {*known[0]["condition"]} & {*known[1]["condition"]}
-    if not shared:
+    cells, belongs, values, _ = _within_shared(first, second, measure)
+    if not len(cells):
         return None
-    first_rows, second_rows = (frame[frame["condition"].isin(shared)] for frame in known)
-    cells, conditions = pd.factorize(pd.concat([first_rows["condition"], second_rows["condition"]]))
-    belongs = np.repeat([1.0, 0.0], [len(first_rows), len(second_rows)])
-    values = np.concatenate([first_rows[measure], second_rows[measure]]).astype(float)
     trials = np.bincount(cells)[cells]
     # The slope of the residuals within conditions is that of the whole model (Frisch and Waugh
     # 1933; Lovell 1963).
@@ -264,7 +237,7 @@ def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> E
     squared = (value - slope * group) ** 2 / left_over
     se = float(np.sqrt((group**2 * squared).sum())) / weight
     variances = [float(squared[belongs == of].mean()) for of in (0.0, 1.0)]
-    freedom = float(len(cells) - len(conditions) - 1)
+    freedom = float(len(cells) - (cells.max() + 1) - 1)
     if se > ROUNDING:
         freedom = _freedom(cells, belongs, group, left_over, np.array(variances))
     elif abs(slope) < ROUNDING:
@@ -272,34 +245,50 @@ def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> E
     return tested(slope, se, freedom)
 
 
-def means_within(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> tuple[float, float]:
+def means_within(first: Trials, second: Trials, measure: str) -> tuple[float, float]:
     """Return both means, of the conditions that both have, which weigh as in their difference."""
-    frames = first.loc[first[measure].notna()], second.loc[second[measure].notna()]
-    cells, conditions = pd.factorize(pd.concat([frame["condition"] for frame in frames]))
-    size, counts, sums = len(frames[0]), [], []
-    for codes, frame in zip((cells[:size], cells[size:]), frames, strict=True):
-        values = frame[measure].to_numpy(float)
-        counts.append(np.bincount(codes, minlength=len(conditions)))
-        sums.append(np.bincount(codes, values, minlength=len(conditions)))
-    shared = (counts[0] > 0) & (counts[1] > 0)
-    (n, m), (first_sum, second_sum) = ([part[shared] for part in parts] for parts in (counts, sums))
+    cells, belongs, values, _ = _within_shared(first, second, measure)
+    n, m = np.bincount(cells, belongs), np.bincount(cells, 1 - belongs)
     shares = n * m / (n + m)
     shares /= shares.sum()
-    return float(shares @ (first_sum / n)), float(shares @ (second_sum / m))
+    sums = np.bincount(cells, belongs * values), np.bincount(cells, (1 - belongs) * values)
+    return float(shares @ (sums[0] / n)), float(shares @ (sums[1] / m))
+
+
+def _within_shared(
+    first: Trials, second: Trials, measure: str
+) -> tuple[NDArray[np.int_], Array, Array, Array]:
+    """Return of trials in shared conditions: a code of it, group (1 or 0), value, ``varies``."""
+    groups = (first, second)
+    values = np.concatenate([_numbers(trials[measure]) for trials in groups])
+    belongs = np.repeat([1.0, 0.0], [len(trials["condition"]) for trials in groups])
+    varies = np.concatenate(
+        [trials.get("varies", np.ones(len(trials["condition"]))) for trials in groups]
+    )
+    kept = ~np.isnan(values)
+    cells, names = pd.factorize(np.concatenate([trials["condition"] for trials in groups]))
+    for of in (0.0, 1.0):
+        kept &= np.bincount(cells[kept & (belongs == of)], minlength=len(names))[cells] > 0
+    cells, _ = pd.factorize(cells[kept])
+    return cells, belongs[kept], values[kept], varies[kept]
+
+
+def _numbers(column: pd.Series | Array) -> Array:
+    if isinstance(column, np.ndarray):
+        return column
+    return np.asarray(column.to_numpy(float, na_value=np.nan))
 
 
 def _freedom(
     cells: NDArray[np.int_],
-    belongs: NDArray[np.float64],
-    group: NDArray[np.float64],
-    left_over: NDArray[np.float64],
-    variances: NDArray[np.float64],
+    belongs: Array,
+    group: Array,
+    left_over: Array,
+    variances: Array,
 ) -> float:
     """Return the degrees of freedom of an HC2 error by Satterthwaite (1946).
 
-    The error is a quadratic form of the residuals, whose mean and variance follow from the
-    ``variances`` of the second and the first group. Trials of one group and condition are alike, so
-    that only these are compared with each other.
+    The error is a quadratic form of residuals; ``variances`` are of the second and the first group.
     """
     both = 2 * cells + belongs.astype(int)
     _, at, size = np.unique(both, return_index=True, return_counts=True)
@@ -317,11 +306,7 @@ def _freedom(
 
 
 def corrected(p: list[float]) -> list[float]:
-    """Return a family's p-values by Holm (1979).
-
-    Not by statsmodels' multipletests, which collects garbage at every call: 0.1 s each, and there
-    is a family for every measure of every driver. A test holds both against each other.
-    """
+    """Return p-values by Holm (1979); statsmodels collects garbage for 0.1 s a call."""
     family = np.asarray(p, dtype=float)
     order = np.argsort(family, kind="stable")
     # The smallest is multiplied by the number of tests, the next by one less, and none falls.

@@ -1,17 +1,15 @@
-"""Effects of factors: each level against the reference, in every measure.
-
-Levels are compared within the cells that both have: a condition with one level of each other
-factor. A driver is a level of the factor ``model``; an interaction is a difference of differences,
-in the cells that all four have.
-"""
+"""Effects of factors: each level against the reference in every measure, within shared cells."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain, combinations, product
+from itertools import chain, combinations, compress, product
+from typing import Any
 
+import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from merge_runner.errors import UsageError
 from merge_runner.registry import in_use, require
@@ -19,18 +17,19 @@ from merge_runner.study.arms import MODEL
 from merge_runner.study.file import StudyFile, StudySource
 from merge_runner.text_safety import first_line
 from merge_runner_analysis.cache import remembered
-from merge_runner_analysis.frames import KEYS
 from merge_runner_analysis.grouping import Group, levels_of
 from merge_runner_analysis.metrics import BOXES, COLLISIONS, LEFT_FIRST, METRICS, Metric
 from merge_runner_analysis.stats import contrasts
 from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.intervals import difference
-from merge_runner_analysis.stats.levels import DRIVER, Level, copied_cells, levels_by_factor
+from merge_runner_analysis.stats.levels import DRIVER, Cell, Level, copied_cells, levels_by_factor
 from merge_runner_analysis.stats.measures import linear, undecided
 from merge_runner_analysis.stats.sides import from_both_sides, one_sided
 from merge_runner_analysis.study import Study, in_one_study
 from merge_runner_analysis.wording import TIMES, UNREADABLE
 
+Columns = dict[str, NDArray[Any]]  # of trials
+Comparison = tuple[tuple[float, float], Estimate | None]  # both values and their difference
 PRIMARY = "goes_first"  # in a study's file, and where none is named
 
 
@@ -38,11 +37,9 @@ PRIMARY = "goes_first"  # in a study's file, and where none is named
 class Effect:
     """A level against the reference of its factor, in one measure, in the unit of that.
 
-    ``at_level`` and ``at_reference`` are the estimates within the shared cells, in which the trials
-    count without ``left_out``; their ``difference`` has its interval, p and detectable. Values are
-    None where nothing is compared. The first two of an interaction have no value but their trials;
-    its ``across`` are the same two levels at the reference of the other factor.
-    ``p_corrected`` is by Holm's method, in the family that ``primary`` tells.
+    ``at_level`` and ``at_reference`` are within the shared cells, without the ``left_out`` trials;
+    of an interaction they have no value, and ``across`` are the levels at the other factor's
+    reference. ``p_corrected`` is by Holm in the family that ``primary`` tells.
     """
 
     level: Level
@@ -88,12 +85,10 @@ class Effect:
 
 @remembered
 def effects(study: Study, by: str = "") -> list[Effect]:
-    """Return the effects of every factor, and the interactions of any two of them.
+    """Return the effects of every factor and their interactions, or those at each level of ``by``.
 
-    With ``by``, those of the others at each level of this one, and the interactions with it.
-    Their p are corrected by Holm in two families: of the study's primary measure the main effects
-    of factors other than ``model``, and all others together. Raises UsageError for an unknown
-    factor.
+    Their p are corrected by Holm in two families: the main effects of factors other than ``model``
+    on the primary measure, and all others. Raises UsageError for an unknown factor.
     """
     if not by:
         main = [
@@ -116,11 +111,7 @@ def effects(study: Study, by: str = "") -> list[Effect]:
 
 
 def driver_effects(study: Study, driver: Group, reference: Group) -> list[Effect]:
-    """Compare two drivers with their prompts in every measure, in the conditions of both.
-
-    Their p are corrected by Holm; that of the primary measure is no part of that where the study
-    ``asks_of_models``.
-    """
+    """Compare two drivers with their prompts in every measure, in the conditions of both."""
     levels = []
     for group in (reference, driver):
         cells = pd.Series([(name,) for name in group.trials["condition"]], group.trials.index)
@@ -131,10 +122,7 @@ def driver_effects(study: Study, driver: Group, reference: Group) -> list[Effect
 
 @remembered
 def primary(study: Study) -> Metric:
-    """Return the measure that the study names as its primary one, else who goes first.
-
-    Raises UsageError where there is no such measure.
-    """
+    """Return the study's primary measure, by default who goes first. Raises UsageError."""
     return _measures()[_named(study) or PRIMARY]
 
 
@@ -151,11 +139,7 @@ def _measures() -> dict[str, Metric]:
 
 
 def _named(study: Study) -> str:
-    """Return the primary measure that stands in the study's file: empty without one.
-
-    The file is that of the chosen study, else the one whose parts are in use, else the only one
-    that was played, whose own measures are missing where its plug-ins are not in use.
-    """
+    """Return the primary measure of the study's file, unless its plug-in is missing."""
     file, _ = _file(study)
     if file is None or "primary" not in file.model_fields_set:
         return ""
@@ -176,10 +160,7 @@ def _text_at_hand(study: Study) -> str:
 
 @remembered
 def _file(study: Study) -> tuple[StudyFile | None, str]:
-    """Return the study's file, if there is one, or why the stored one cannot be read.
-
-    A text at hand is the user's to mend: raises UsageError.
-    """
+    """Return the study's file, or why the stored one cannot be read. Raises UsageError."""
     if text := _text_at_hand(study):
         return StudySource(name="", text=text, plugins={}).file, ""
     played = study.frames.studies
@@ -192,10 +173,7 @@ def _file(study: Study) -> tuple[StudyFile | None, str]:
 
 @remembered
 def measured(study: Study) -> list[Metric]:
-    """Return the metrics of which some trial has a value, the primary one first.
-
-    Where the rule that was played is the humans' own, collisions by that are no second measure.
-    """
+    """Return the metrics with values, the primary one first; equal rules are one."""
     trials = [group.trials for group in study.models]
     same = all(rows[COLLISIONS.column].equals(rows[BOXES.column]) for rows in trials)
     return [
@@ -213,10 +191,9 @@ def _of_levels(study: Study, levels: Sequence[Level]) -> Iterator[Effect]:
 
 
 def _interactions(study: Study, by: str = "") -> Iterator[Effect]:
-    """Compare effects between the levels of another factor, or of this one, and its first.
+    """Compare effects between the levels of another factor, or of ``by``, and its first.
 
-    The two differences are those of the factor that stands first, so that the interaction is one
-    number in either order.
+    Both differences are those of the factor listed first, so that either order gives one number.
     """
     factors = levels_of(study.models, study.order)
     varying = [name for name, levels in factors.items() if len(levels) > 1]
@@ -243,16 +220,17 @@ def _effect(
     study: Study, metric: Metric, levels: Sequence[Level], *, swapped: bool = False
 ) -> Effect:
     """Compare two levels; of four, the difference of the first two with that of the others."""
-    frames = trials_by_cell(study, [level.pooled for level in levels], metric)
+    frames = trials_by_cell(study, tuple(level.pooled for level in levels), metric)
     left_out = {copy for level in levels for copy in level.copies}
     for level, frame in zip(levels, frames, strict=False):
-        unused = level.pooled.trials[KEYS].drop(index=frame.index.unique())
-        left_out.update(unused.itertuples(index=False, name=None))
+        unused = np.ones(len(level.keys), bool)
+        unused[frame["row"]] = False
+        left_out.update(compress(level.keys, unused))
     values: tuple[float | None, float | None] = (None, None)
     difference = None
-    if frames and len(frames[0]):
+    if frames and len(frames[0]["row"]):
         if len(frames) == 2:
-            values, difference = _compared(frames[0], frames[1], metric)
+            values, difference = _compared(study, frames[0], frames[1], metric)
         else:
             ordered = [frames[place] for place in ((0, 2, 1, 3) if swapped else range(4))]
             difference = _interaction(ordered, metric)
@@ -271,19 +249,34 @@ def _effect(
     )
 
 
-def _counted(frame: pd.DataFrame, metric: Metric) -> Estimate:
+def _counted(frame: Columns, metric: Metric) -> Estimate:
     """Count the trials, and those in which it is so; not of those read from both sides."""
     from_both = "varies" in frame and not frame["varies"].all()
     k = int(frame["value"].sum()) if metric.rate and not from_both else None
-    return Estimate(n=frame.index.nunique(), k=k)
+    return Estimate(n=len(np.unique(frame["row"])), k=k)
 
 
-def _compared(
-    level: pd.DataFrame, reference: pd.DataFrame, metric: Metric
-) -> tuple[tuple[float, float], Estimate | None]:
-    """Return both values and their difference, None where that is not known."""
+def _compared(study: Study, level: Columns, reference: Columns, metric: Metric) -> Comparison:
+    """Return both values and their difference, None where that is not known.
+
+    Shown by driver, factors compare the same trials again: they are compared once.
+    """
+    names = [name for name in sorted(level) if name != "row"]
+    key = (metric.name, *(of[name].tobytes() for of in (level, reference) for name in names))
+    known = _comparisons(study)
+    if key not in known:
+        known[key] = _compare(level, reference, metric)
+    return known[key]
+
+
+@remembered
+def _comparisons(_: Study) -> dict[tuple[object, ...], Comparison]:
+    return {}
+
+
+def _compare(level: Columns, reference: Columns, metric: Metric) -> Comparison:
     if metric.estimator == "median":
-        medians = float(level["value"].median()), float(reference["value"].median())
+        medians = float(np.median(level["value"])), float(np.median(reference["value"]))
         return medians, Estimate(medians[0] - medians[1])
     if metric.rate and (cells := contrasts.shared_cells(level, reference, "value")):
         first, second = cells.rates
@@ -292,7 +285,7 @@ def _compared(
     return means, contrasts.contrast_means(level, reference, "value")
 
 
-def _interaction(frames: Sequence[pd.DataFrame], metric: Metric) -> Estimate | None:
+def _interaction(frames: Sequence[Columns], metric: Metric) -> Estimate | None:
     """Return the difference of the first two less that of the others; None if one is not known."""
     level, reference, twin, base = frames
     if metric.rate:
@@ -307,10 +300,7 @@ def _interaction(frames: Sequence[pd.DataFrame], metric: Metric) -> Estimate | N
 
 
 def _with_corrected(study: Study, effects: list[Effect]) -> list[Effect]:
-    """Return the effects with their corrected p, in the study's own family or that of all others.
-
-    Where nothing varies and nothing differs, as without a single collision, p is no part of it.
-    """
+    """Correct p in both families; where nothing varies and nothing differs, p is no part of one."""
     of_model = {MODEL, DRIVER} if asks_of_models(study) else set()
     is_primary = [
         effect.metric is primary(study)
@@ -334,28 +324,48 @@ def _with_corrected(study: Study, effects: list[Effect]) -> list[Effect]:
     ]
 
 
-def trials_by_cell(study: Study, groups: Sequence[Group], metric: Metric) -> list[pd.DataFrame]:
-    """Return the ``value`` of each group's trials and their cell as ``condition``, in cells of all.
+def trials_by_cell(study: Study, groups: tuple[Group, ...], metric: Metric) -> list[Columns]:
+    """Return by group the ``condition`` and ``value`` of trials in cells of all, and their ``row``.
 
-    Cells of programs that ignore the groups' difference are left out. Nothing where the
-    groups are of several studies or have undecided trials.
+    Copied cells are left out. Empty for groups of several studies or with undecided trials.
     """
     if not in_one_study(study, *groups) or any(undecided(group, metric) for group in groups):
         return []
-    copied, frames = copied_cells(study, tuple(groups)), []
-    for group in groups:
-        trials = group.trials
-        counted = trials[metric.column].notna().to_numpy()
-        if copied:
-            counted = counted & ~trials["cell"].isin(copied).to_numpy()
-        columns = {"condition": "cell", "value": metric.column, "weight": metric.weight_column}
-        frame = pd.DataFrame(
-            {name: trials[column] for name, column in columns.items() if column in trials}
-        )[counted]
+    is_read_twice, parts = metric is LEFT_FIRST and one_sided(study), []
+    for group, (row, code) in zip(groups, _codes(study, groups), strict=True):
+        values = group.trials[metric.column].to_numpy(float, na_value=np.nan)[row]
+        known = ~np.isnan(values)
+        part = {"condition": code[known], "value": values[known], "row": row[known]}
         if metric.weight:
-            frame["value"] = linear(frame["value"], frame["weight"], frame["condition"])
-        elif metric is LEFT_FIRST and one_sided(study):
-            frame = from_both_sides(study, frame, trials)
-        frames.append(frame)
-    shared = set.intersection(*(set(frame["condition"]) for frame in frames))
-    return [frame[frame["condition"].isin(shared)] for frame in frames]
+            weight = group.trials[metric.weight_column].to_numpy(float)[part["row"]]
+            part["value"] = linear(part["value"], weight, part["condition"])
+        if is_read_twice:
+            trials = group.trials.iloc[part["row"]]
+            frame = pd.DataFrame(part, trials.index).assign(condition=trials["cell"])
+            both = from_both_sides(study, frame, trials)
+            part = {name: both[name].to_numpy() for name in both}
+        parts.append(part)
+    # Codes in the order of the trials, so that equal trials have equal ones.
+    cells, names = pd.factorize(np.concatenate([part["condition"] for part in parts]))
+    of_parts = np.split(cells, np.cumsum([len(part["row"]) for part in parts])[:-1])
+    shared = np.min([np.bincount(codes, minlength=len(names)) for codes in of_parts], axis=0) > 0
+    samples = []
+    for part, codes in zip(parts, of_parts, strict=True):
+        columns = part | {"condition": np.cumsum(shared)[codes] - 1}
+        samples.append({name: column[shared[codes]] for name, column in columns.items()})
+    return samples
+
+
+@remembered
+def _codes(
+    study: Study, groups: tuple[Group, ...]
+) -> list[tuple[NDArray[np.int_], NDArray[np.int_]]]:
+    """Return by group the rows of trials outside copied cells, and codes of these cells."""
+    copied = copied_cells(study, groups)
+    numbers: dict[Cell, int] = {}
+    parts = []
+    for group in groups:
+        rows = [(row, cell) for row, cell in enumerate(group.trials["cell"]) if cell not in copied]
+        codes = [numbers.setdefault(cell, len(numbers)) for _, cell in rows]
+        parts.append((np.array([row for row, _ in rows], int), np.array(codes, int)))
+    return parts

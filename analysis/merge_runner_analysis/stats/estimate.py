@@ -13,16 +13,12 @@ from merge_runner_analysis.wording import Fact
 class Estimate:
     """A number with its interval, what it rests on and its test; what is not known is None.
 
-    The interval has this ``level``, and ``ends_at`` finds the ends at another one, if it is not
-    Student's t.
-
-    ``n`` are the trials that it rests on; a rate counts ``k`` of them and is as good as one of
-    ``weight`` trials. With ``undecided`` trials a rate has no value, and its interval holds whether
-    none or all of them count (Manski 1989). ``se`` is its standard error and ``freedom`` that of
-    its Student's t, infinite where the test is another one. ``p`` is two-sided, against 0, and
-    ``p_holm`` corrected over a family. ``detectable`` is the smallest true value, in either
-    direction, that one test at 5 % finds with a power of 0.8. ``problem`` says why something is
-    missing, and ``source`` that it is published.
+    ``ends_at`` finds the interval's ends at another ``level``, if it is not Student's t. A rate
+    counts ``k`` of ``n`` trials and is as good as one of ``weight``; with ``undecided`` ones it has
+    no value, and its interval holds both worst cases (Manski 1989). ``freedom`` is infinite where
+    the test is not Student's t. ``p`` is two-sided, against 0, ``p_holm`` corrected over a family,
+    ``detectable`` the minimum detectable effect at 80 % power. ``problem`` says why something is
+    missing, ``source`` that it is published.
     """
 
     value: float | None = None

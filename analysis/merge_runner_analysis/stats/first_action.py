@@ -1,8 +1,7 @@
 """First actions: their response to the own relative velocity, and what headway is worth in words.
 
-A first action is the net acceleration of a vehicle over the first step that its driver controls.
-Both of a trial are correlated, so standard errors are clustered by trial, of recorded humans by
-pair.
+It is a vehicle's net acceleration over its first controlled step; errors are clustered by trial or
+human pair.
 """
 
 from __future__ import annotations
@@ -77,8 +76,8 @@ def seats(group: Group) -> list[Seat]:
 def first_actions(study: Study, seat: Seat) -> pd.DataFrame:
     """Return a driver's first actions in trials that ended, one row each.
 
-    ``headway_m`` and ``velocity_mps`` are the driver's own, minus the other's; ``cluster`` numbers
-    trials or pairs; ``tactical`` is the word of the first decision, if it has one.
+    Headway and velocity are the driver's own, minus the other's; ``cluster`` numbers trials or
+    pairs.
     """
     rows = _stored(study, seat)
     if repeats_itself(study, seat):
@@ -93,10 +92,7 @@ def first_actions(study: Study, seat: Seat) -> pd.DataFrame:
 
 
 def repeats_itself(study: Study, seat: Seat) -> bool:
-    """Return whether one of a mixed pair declares no chance, and repeats its first actions.
-
-    The trials of two drivers without chance are equal, and are left out of their group.
-    """
+    """Return whether one of a mixed pair declares no chance, and repeats its first actions."""
     rows = _stored(study, seat)
     sat = np.where(rows["ego"] == seat.side, *SIDES)
     known = set(zip(rows["spec_hash"], sat, strict=True))
@@ -139,11 +135,7 @@ def _least_squares(rows: pd.DataFrame, design: Array) -> Estimate | None:
 
 
 def exchange_rate(rows: pd.DataFrame) -> Estimate | None:
-    """Return how many m of headway are worth 1 m/s of relative velocity in the word M.
-
-    It is minus the ratio of two slopes of a logit, with the interval of Fieller; None where the
-    logit has no finite estimate.
-    """
+    """Return how many m of headway are worth 1 m/s in the word M, by two slopes."""
     spoken = rows[rows["tactical"].notna()]
     points = spoken[["headway_m", "velocity_mps"]].to_numpy(float)
     return _ratio(points, spoken["tactical"] == "M", spoken["cluster"])
@@ -176,8 +168,7 @@ def fieller(
 ) -> tuple[float, float] | None:
     """Return the interval of minus velocity / headway, two slopes with this covariance.
 
-    It holds the ratios r for which velocity + r headway does not differ from 0 (Fieller 1954). None
-    where the slope on headway may be 0 itself: then no ratio is too large.
+    It is that of Fieller (1954); None where the slope on headway may be 0: no ratio is too large.
     """
     t = float(stats.t.ppf((1 + LEVEL) / 2, freedom)) ** 2
     squared = headway**2 - t * float(covariance[0, 0])

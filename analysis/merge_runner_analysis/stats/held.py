@@ -37,9 +37,7 @@ KEY = ["trial_id", "spec_hash", "side"]
 def measure_profiles(speeds: pd.DataFrame) -> pd.DataFrame:
     """Measure vehicles: rows with KEY, lists time_s and velocity_mps, and whether ``resisted``.
 
-    Adds to KEY: ``steady``, no control action, the speed or what it would be without resistance
-    stays within STEADY_MPS of its mean; and ``gain``, NaN where the vehicle was steady or under
-    control for less than 2 s.
+    Adds ``steady``, no control action, and ``gain``, NaN where steady or under control for < 2 s.
     """
     steady = np.zeros(len(speeds), bool)
     gain = np.full(len(speeds), np.nan)
@@ -67,8 +65,7 @@ def at_5_hz(time_s: Array, velocity_mps: Array) -> Array:
 def without_resistance(time_s: Array, velocity_mps: Array) -> Array:
     """Return the speeds without the human simulator's resistance of 0.5 + 0.005 v^2 in m/s^2.
 
-    A pedal that is held gives a straight line here, and an exponential there. A vehicle that stands
-    is slowed by nothing.
+    A pedal that is held gives a straight line here, and an exponential with it.
     """
     moves = velocity_mps[1:] > 0
     lost = moves * (0.5 + 0.005 * velocity_mps[:-1] ** 2) * np.diff(time_s)
@@ -115,10 +112,7 @@ def residuals(velocity_mps: Array) -> tuple[Array, Array]:
 
 
 def _last_piece(sums: list[Array], end: int) -> tuple[Array, Array]:
-    """Return a last piece's sums of squares, (starts, vehicles), where it ends before ``end``.
-
-    By projections on the discrete orthogonal polynomials of degree 0 to 3 (Gram 1883).
-    """
+    """Return a last piece's sums of squares, by orthogonal polynomials (Gram 1883)."""
     start = np.arange(end - LINE_SAMPLES + 1)
     n = (end - start)[:, None].astype(float)
     middle = (end - 1 + start)[:, None] / 2

@@ -1,24 +1,14 @@
 """The qualitative indicators I1 to I5: by the paper's rule, and by tests that hold.
 
-I1: merging first becomes likelier with projected headway. I2: and less likely with relative
-velocity. I3: the gap grows with the size of the projected headway. I4: it does not depend on the
-relative velocity (arXiv 2604.09609, Table V).
+The paper (arXiv 2604.09609, Table V) judges signs and p < 0.05 of Wald tests, I4 by the main effect
+of |dv| alone. Human data are nearly separable, where Wald tests lose their power, and a large p is
+no evidence of no effect. So I1 and I2 are judged again by likelihood-ratio tests of Firth's fit, I3
+by an HC3 test, and I4 by equivalence: of any two played conditions that differ in relative velocity
+alone, the predicted gaps are less than a margin apart, by two one-sided tests (Schuirmann 1987) of
+each, all of which must pass (Berger 1982).
 
-The paper judges signs and p < 0.05 of Wald tests, I4 by the main effect of |dv| alone. Human data
-are nearly separable, where Wald tests lose their power, and a large p is no evidence of no effect.
-So I1 and I2 are judged again by likelihood-ratio tests of Firth's fit, I3 by an HC3 test, and I4 by
-what all terms with relative velocity predict together: of any two played conditions that differ in
-relative velocity alone, the gaps are less than a margin apart. The signed product h dv of the
-paper's own regression (its eq. 2) tells a vehicle that is ahead and faster from one that is ahead
-and slower, so that no further term is needed. Each difference is tested by two one-sided tests
-(Schuirmann 1987) with HC3 errors; all of them must pass, which needs no correction for their number
-(an intersection-union test; Berger 1982).
-
-I5 asks whether the acceleration is piecewise constant. A trial counts once, with the mean gain (see
-``intermittency``) of its vehicles that acted. The test is one-sided: I5 holds where the whole 95 %
-interval of the mean gain lies above 0. How like the humans a driver is in it is a number beside
-that, in human standard deviations, which decides nothing. That difference is taken within
-conditions, as another mix of conditions is none.
+I5 holds where the whole 95 % interval of the mean gain (see ``held``) of trials with control action
+lies above 0: accelerations are piecewise constant.
 """
 
 from __future__ import annotations
@@ -113,20 +103,14 @@ def mean_gain(study: Study, group: Group) -> Estimate:
 
 
 def less_humans(study: Study, group: Group) -> Estimate | None:
-    """Return the mean gain less that of humans in equal conditions, in human standard deviations.
-
-    None for the humans, and without a spread of human trials in every condition.
-    """
+    """Return the mean gain less the humans' in equal conditions, in their SD, if known."""
     if group is study.human or not study.calibrated:
         return None
     return likeness(gains(study, group), gains(study, study.human))
 
 
 def likeness(driver: pd.DataFrame, human: pd.DataFrame) -> Estimate:
-    """Return the difference between rows of ``gains``, with Welch's interval over trials and pairs.
-
-    The standard deviation is that of human trials within conditions.
-    """
+    """Return the difference of ``gains`` in human SDs, by Welch's test over pairs."""
     driver, human = driver.dropna(subset="gain"), human.dropna(subset="gain")
     usual = human.groupby("condition")["gain"].mean()
     human = human.assign(apart=human["gain"] - human["condition"].map(usual))
@@ -199,10 +183,8 @@ class Score(NamedTuple):
 def ceiling(sizes: tuple[int, ...]) -> dict[str, dict[str, float]]:
     """Return by rule the shares of human data sets that pass each indicator, and ``I1-I4`` at once.
 
-    It is that of the mean of ``sizes``, the trials in the conditions of the humans: of a shipped
-    curve, which ``analysis/research/ceiling.py`` computed once from the published counts and the
-    published regression of the gap with normal residuals; linear between its sizes, and constant
-    beyond the largest. Without a trial in some condition there is no share.
+    It is linear between sizes of the shipped curve, which ``analysis/research/ceiling.py``
+    computed. Without a trial in some condition there is no share.
     """
     shares: dict[str, dict[str, float]] = {"paper": {}, "robust": {}}
     if min(sizes):

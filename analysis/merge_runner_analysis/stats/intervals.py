@@ -1,7 +1,6 @@
 """Confidence intervals of proportions, means and differences, and what could have been found.
 
-Every test against Student's t is made here; one with infinite degrees of freedom is a normal one.
-Its functions are those that scipy.stats.t calls, which takes a hundred times as long.
+Tests are Student's t by the functions that scipy.stats.t calls, which takes 100 times as long.
 """
 
 from __future__ import annotations
@@ -30,11 +29,7 @@ NOTHING = Estimate()
 
 
 def proportion(successes: int, n: int) -> Estimate:
-    """Return a proportion with its Wilson score interval (Wilson 1927).
-
-    Not by statsmodels, whose bounds can miss 0, 1 and the proportion by a rounding, and which takes
-    60 times as long and seconds to import; a test holds both against each other.
-    """
+    """Return a proportion with its Wilson interval (1927), exact at 0 and 1."""
     if n == 0:
         return NOTHING
     return Estimate(successes / n, *wilson(successes / n, n), n)
@@ -45,10 +40,8 @@ def melded(
 ) -> tuple[float, float]:
     """Return the interval of one rate less another, (rate, trials) each, that agrees with ``p``.
 
-    The melded interval of Fay, Proschan and Brittain (2015) excludes 0 where a one-sided exact test
-    of Fisher is below half of what the interval leaves out. A two-sided ``p`` is seldom twice the
-    smaller side: where both would disagree, the end next to 0 leaves out the share of that side in
-    ``p``, so that the interval excludes 0 exactly where ``p`` is below 1 - ``level``.
+    The melded interval (Fay, Proschan and Brittain 2015) agrees with one-sided tests. Fisher's p
+    has unequal sides: the end next to 0 leaves out the share of its side, so that both agree.
     """
     alpha = 1 - level
     less, more = _at_most(first, second), _at_most(second, first)
@@ -70,8 +63,7 @@ def _lower(at_most: Callable[[float], float], part: float) -> float:
 def _at_most(first: tuple[float, float], second: tuple[float, float]) -> Callable[[float], float]:
     """Return the chance that a lowest rate exceeds a highest one by at most so much.
 
-    They are the lower and the upper beta distribution of Clopper and Pearson (1934). At 0 it is the
-    p of Fisher's exact test that the first rate is not the larger.
+    They are the beta distributions of Clopper and Pearson (1934).
     """
     (rate, n), (share, m) = first, second
     k, missed = rate * n, m - share * m
@@ -136,11 +128,9 @@ def tested(value: float, se: float, freedom: float) -> Estimate:
 
 
 def difference(first: Estimate, second: Estimate) -> Estimate | None:
-    """Return one independent estimate less another.
+    """Return one independent estimate less another, by the test of Welch (1947).
 
-    It is tested as Welch (1947) does, so that the 5 % hold also where the groups differ in size and
-    in variance, with the degrees of freedom of a sum of variances (Satterthwaite 1946). None where
-    a value or an error is missing, and where neither has an error: there is nothing to test.
+    None where a value or an error is missing, and where neither has an error.
     """
     if first.value is None or second.value is None or first.se is None or second.se is None:
         return None
@@ -151,9 +141,6 @@ def difference(first: Estimate, second: Estimate) -> Estimate | None:
 
 
 def detectable(se: float, freedom: float = inf) -> float:
-    """Return the smallest effect that a two-sided t test at 5 % finds with a power of 0.8.
-
-    It is (t.975 + t.8) standard errors, the usual approximation to the noncentral t.
-    """
+    """Return the minimum detectable effect of a t test: t.975 + t.8 standard errors."""
     quantiles = special.stdtrit(freedom, np.array([(1 + LEVEL) / 2, POWER]))
     return float(quantiles.sum()) * se

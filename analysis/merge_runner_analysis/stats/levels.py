@@ -1,7 +1,4 @@
-"""The levels of factors: which trials each has, and which of them are copies of others.
-
-Levels are compared within cells: a condition with one level of each other factor.
-"""
+"""The levels of factors, and their trials by cell: a condition and the other levels."""
 
 from __future__ import annotations
 
@@ -28,10 +25,9 @@ Cell = tuple[str, ...]
 class Level:
     """A level of a factor: the ids of its groups, and their trials as one group without copies.
 
-    The trials have a column ``cell``: their condition and the levels of all other factors. Cells
-    in which programs play the same trials are one cell. ``pooled.whole`` has the copies, too.
-    ``posing`` is the label of mock models; the ``mark`` distinguishes their level.
-    ``at`` is the level of another factor that all of its trials have, if it is shown by that one.
+    The trials have a column ``cell``; cells with copies of each other are one. ``posing`` is the
+    label of mock models, ``mark`` distinguishes their level, and ``at`` is a level of another
+    factor.
     """
 
     factor: str
@@ -48,6 +44,11 @@ class Level:
         return f"{self.at}/" * bool(self.at) + f"{self.factor}={self.name}{self.mark}"
 
     @cached_property
+    def keys(self) -> list[tuple[str, str]]:
+        """The key of each trial without copies."""
+        return [*self.pooled.trials[KEYS].itertuples(index=False, name=None)]
+
+    @cached_property
     def copies(self) -> tuple[tuple[str, str], ...]:
         """The trials of its groups that are left out as copies (trial_id, spec_hash)."""
         copies = self.pooled.stored.trials.drop(index=self.pooled.trials.index)
@@ -59,12 +60,10 @@ class Level:
 
 @remembered
 def copied_cells(study: Study, groups: tuple[Group, ...]) -> set[Cell]:
-    """Return the cells of programs that ignore the groups' difference.
+    """Return the cells of programs that ignore the groups' difference, whose trials are copies.
 
-    With the same other levels, all trials of one of two groups are copies of the other's there, in
-    every condition that both have. They differ only by how often each was drawn, so that nothing
-    can be tested. Conditions are never left out one by one: which of them stay would depend on
-    what happened there.
+    Conditions are never left out one by one: which of them stay would depend on what happened
+    there.
     """
     ways = [_ways(study, group) for group in groups]
     copied: set[Cell] = set()
@@ -92,6 +91,7 @@ def _are_copies(ways: Mapping[str, set[object]], others: Mapping[str, set[object
     )
 
 
+@remembered
 def copied_of_shared(study: Study, *levels: Level) -> tuple[int, int]:
     """Return the numbers of copied cells and of all cells that levels share."""
     shared = set.intersection(*({*level.pooled.ended["cell"]} for level in levels))
@@ -100,11 +100,7 @@ def copied_of_shared(study: Study, *levels: Level) -> tuple[int, int]:
 
 @remembered
 def levels_by_factor(study: Study, by: str = "", at: str = "", least: int = 2) -> list[list[Level]]:
-    """Return the levels of each factor that has so many of them at ``least``, the reference first.
-
-    Trials of mock models are never pooled with others. With ``by``, the trials are those
-    ``at`` one of its levels.
-    """
+    """Return factors with at ``least`` so many levels, the reference first."""
     chosen = [group for group in study.models if not by or _level_of(group, by) == at]
     kinds = [[g for g in chosen if g.scripted == scripted] for scripted in (False, True)]
     apart = any(g.scripted for g in study.models) and not all(g.scripted for g in study.models)
@@ -143,10 +139,7 @@ def _with_cells(groups: Sequence[Group], apart_from: set[str]) -> Group:
 
 
 def crossing(study: Study, factors: Sequence[str], levels: Mapping[str, str]) -> list[Level]:
-    """Return the trials at these levels of several factors, as a level of their crossing.
-
-    Those of mock models are another one.
-    """
+    """Return the trials at levels of several factors; mock models have another level."""
     chosen = [g for g in study.models if all(_level_of(g, f) == at for f, at in levels.items())]
     crossed = []
     for scripted in (False, True):
@@ -178,11 +171,7 @@ def _distinct(study: Study, levels: list[Level]) -> list[Level]:
 
 
 def _with_copies(study: Study, group: Group) -> Iterator[Iterable[Cell]]:
-    """Yield cells that have copies of each other's trials.
-
-    Cells of programs have them in a condition with any equal trials. A mock model plays with
-    chance: a few equal trials of two levels that it reads are no copies.
-    """
+    """Yield cells with copies of each other; a mock model's few equal trials are chance."""
     if not group.scripted:
         yield from (cells for _, cells in group.trials.groupby(["condition", "way"])["cell"])
         return
@@ -204,9 +193,7 @@ def distinct(study: Study, group: Group) -> Group:
 def _without_copies(level: Level, first: Callable[[tuple[str, ...]], tuple[str, ...]]) -> Level:
     """Return the level with each trial once.
 
-    Where the copies of one have their ego on both sides, nobody was given anything that is read:
-    it is a trial of two with the same prompt, and read from both sides (``sides``). That is so
-    where all trials of one side are among the other's: here and there a mock model's are by chance.
+    Copies with their ego on both sides were read by nobody: such a trial is of two with one prompt.
     """
     every = level.pooled.trials
     every = every.assign(cell=pd.Series([first(cell) for cell in every["cell"]], dtype=object))

@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 from scipy import stats
 
 from merge_runner_analysis.cache import remembered
@@ -19,6 +20,7 @@ from merge_runner_analysis.stats.intervals import estimate as interval_of
 from merge_runner_analysis.stats.score_interval import wilson
 from merge_runner_analysis.wording import Fact, Why
 
+Array = NDArray[np.float64]
 PAPER = "paper_ablation_quantitative"
 
 
@@ -42,8 +44,7 @@ def counts(group: Group, metric: Metric) -> tuple[int, int]:
 def estimate(group: Group, metric: Metric) -> Estimate:
     """Return the metric of a group with its 95 % interval, rates in percent.
 
-    Where trials end undecided a rate has no value, and the interval is that of both worst cases
-    (Manski 1989): from none of them to all of them.
+    With undecided trials a rate has an interval of both worst cases, and no value (Manski 1989).
     """
     if metric.estimator == "mean":
         trials = trials_of(group, metric)
@@ -63,28 +64,21 @@ def _ratio(trials: pd.DataFrame, metric: Metric) -> Estimate:
     """Return a mean in which trials have weights, with the interval of a ratio of their sums."""
     known = trials[[metric.column, metric.weight_column]].dropna()
     value, weight = known[metric.column], known[metric.weight_column]
-    sample = linear(value, weight, pd.Series("", known.index)).to_numpy(float)
+    sample = linear(value.to_numpy(), weight.to_numpy(), np.zeros(len(known), int))
     k = round(float((value * weight).sum()) / 100)
     return replace(mean(sample), k=k, weight=float(weight.sum()))
 
 
-def linear(value: pd.Series, weight: pd.Series, cells: pd.Series) -> pd.Series:
-    """Return values with the weighted mean of each cell as their mean, and its error as theirs.
-
-    The usual linear approximation of a ratio (Cochran, Sampling Techniques, 1977, 6.3), so that
-    what clusters in a trial, as its replies do, counts as one observation.
-    """
-    sums = pd.DataFrame({"value": value * weight, "weight": weight}).groupby(cells)
-    ratio = sums["value"].transform("sum") / sums["weight"].transform("sum")
-    return ratio + (value - ratio) * weight / sums["weight"].transform("mean")
+def linear(value: Array, weight: Array, cells: NDArray[np.int_]) -> Array:
+    """Return values with a cell's ratio as their mean (linearised; Cochran 1977)."""
+    _, cells = np.unique(cells, return_inverse=True)
+    sums, weights = np.bincount(cells, value * weight), np.bincount(cells, weight)
+    ratio, mean_weight = (sums / weights)[cells], (weights / np.bincount(cells))[cells]
+    return np.asarray(ratio + (value - ratio) * weight / mean_weight)
 
 
 def mean_of(trials: pd.DataFrame, column: str, shares: pd.Series | None = None) -> Estimate:
-    """Return the mean of trials with its interval; with ``shares`` conditions weigh so.
-
-    Trials of human pairs hang together: there the error is a jackknife over the pairs, with t on a
-    degree of freedom less than there are.
-    """
+    """Return the mean by ``shares`` of conditions, with a jackknife over human pairs."""
     known = trials[column].notna()
     pairs = trials.loc[known, "pair"].dropna().unique() if "pair" in trials else ()
     if not len(pairs):
@@ -119,10 +113,7 @@ def median(sample: np.ndarray) -> Estimate:
 
 @cache
 def _ranks(n: int) -> tuple[int, int]:
-    """Return the places of the ordered values between which the median is, 95 times in 100.
-
-    They are those of scipy's quantile_test, which makes a distribution anew for every sample.
-    """
+    """Return the places of a median's ends, faster than scipy's quantile_test."""
     outside = (1 - LEVEL) / 2
     return int(stats.binom.ppf(outside, n, 0.5)) - 1, int(stats.binom.isf(outside, n, 0.5))
 

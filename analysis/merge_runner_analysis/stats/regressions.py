@@ -1,8 +1,6 @@
 """The regressions of arXiv 2604.09609 (eqs. 1 and 2), and tests that hold where theirs do not.
 
-A fit that the data do not allow has no terms but a ``problem``. Data frames have the
-columns of ``load_trials``; only finished trials count. Firth's penalised logit is finite under
-separation (Firth 1993; Heinze and Schemper 2002).
+A fit that the data do not allow has a ``problem`` in place of terms; only finished trials count.
 """
 
 from __future__ import annotations
@@ -65,10 +63,9 @@ class Counts:
     def climb(self, starts: Array, term: int | None = None, value: float = 0.0) -> Fit | None:
         """Return the best fit that is reached from ``starts``, (starts, terms), if one converges.
 
-        One ``term`` may be held at a value. The steps are Newton's with the curvature of the
-        penalty, too: far from the estimate and under separation the information misses it. Where
-        the likelihood bends upwards, a step goes uphill all the same (Nocedal and Wright 2006,
-        section 3.4); each is halved until it gains.
+        One ``term`` may be held at a value. Newton's steps have the curvature of the penalty, too,
+        go uphill where the likelihood bends upwards (Nocedal and Wright 2006), and are halved until
+        they gain.
         """
         b = starts.copy()
         free = np.array([place != term for place in range(b.shape[1])])
@@ -97,11 +94,7 @@ class Counts:
         return Fit(self, b[best], float(reached.likelihood[best]), reached.information[best])
 
     def infinite(self) -> NDArray[np.bool_]:
-        """Return which coefficients have no finite maximum likelihood estimate, (terms,).
-
-        Separation is a direction in which no row's outcome becomes less likely; the linear program
-        of Konis (2007) finds the one that gains most.
-        """
+        """Return which coefficients have no finite estimate (Konis 2007)."""
         signed = np.vstack([self.design[self.chosen > 0], -self.design[self.chosen < self.n]])
         solution = linprog(
             -signed.sum(axis=0), A_ub=-signed, b_ub=np.zeros(len(signed)), bounds=(-1, 1)
@@ -109,10 +102,9 @@ class Counts:
         return np.asarray(np.abs(solution.x) > 1e-4)
 
     def likelihood(self, b: Array) -> tuple[Array, Array, Array, Array]:
-        """Return of ``b`` (starts, terms) penalised log-likelihoods, chances, weights, information.
+        """Return penalised log-likelihoods at ``b`` (starts, terms), chances, weights, information.
 
-        The penalty is half the logarithm of the determinant of the information: Jeffreys' prior.
-        Where that is singular the likelihood is minus infinity.
+        The penalty is Jeffreys' prior; where the information is singular, it is minus infinity.
         """
         linear = b @ self.design.T
         p = expit(linear)
@@ -126,8 +118,7 @@ class Counts:
     def penalised(self, b: Array) -> Penalised:
         """Return the penalised log-likelihoods at ``b``, (starts, terms), with their derivatives.
 
-        Firth's score adds to each residual the leverage times (1/2 - p): as if each trial were
-        split, and half of its leverage had gone either way (Heinze and Schemper 2002).
+        Firth's score adds the leverage times (1/2 - p) to residuals (Heinze and Schemper 2002).
         """
         design = self.design
         likelihood, p, weights, information = self.likelihood(b)
@@ -144,11 +135,7 @@ class Counts:
 
 
 class Penalised(NamedTuple):
-    """Penalised log-likelihoods (starts,), gradients (starts, terms) and less Hessians.
-
-    These and Fisher's ``information`` without the penalty are (starts, terms, terms). Where the
-    information is singular the likelihood is minus infinity, and the rest has no meaning.
-    """
+    """Penalised log-likelihoods (starts,), gradients, curvatures and informations."""
 
     likelihood: Array
     score: Array
@@ -158,10 +145,7 @@ class Penalised(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """The coefficients ``b`` (terms,) where the penalised log-likelihood is maximal, ``best``.
-
-    ``information`` is Fisher's, (terms, terms), without the penalty.
-    """
+    """Coefficients ``b`` (terms,) at the ``best`` penalised log-likelihood."""
 
     counts: Counts
     b: Array
@@ -183,10 +167,7 @@ class Fit:
         return self.counts.climb(self.starts(term, value), term, value)
 
     def interval(self, term: int, level: float) -> tuple[float, float] | None:
-        """Return the profile interval: what the penalised likelihood ratio does not reject.
-
-        None where no bound is found.
-        """
+        """Return the interval that the penalised likelihood ratio does not reject."""
         lost, error = stats.chi2.ppf(level, 1) / 2, self.errors[term]
         try:
             low, high = (self._bound(term, lost, width) for width in (-error, error))
@@ -197,8 +178,8 @@ class Fit:
     def _bound(self, term: int, lost: float, width: float) -> float:
         """Return the first value to one side whose profile loses so much log-likelihood.
 
-        Followed from value to value, a profile may miss a higher maximum elsewhere, which is
-        therefore looked for at the bound. Raises ValueError where none is found.
+        A profile followed by steps may miss a higher maximum: it is looked for at the bound. Raises
+        ValueError where none is found.
         """
         followed = self.b[None].copy()
         # The last two points of the profile: on the line through them is almost the next.
@@ -233,9 +214,9 @@ class Fit:
     def starts(self, term: int | None = None, value: float = 0.0) -> Array:
         """Return from where all maxima are reached, perhaps with a term held: (starts, terms).
 
-        There may be several of few trials. Far out they lie where two conditions have even chances:
-        of such coefficients, and of all, those nearest to the fit by its information. The latter
-        are also scaled, down to 0, where the likelihood is always known.
+        Of few trials there are several. Far out they lie where two conditions have even chances:
+        nearest to the fit by its information, and scaled down to 0, where the likelihood is always
+        known.
         """
         fixed = np.eye(len(self.b))[[] if term is None else [term]]
         pairs = self.counts.design[[*combinations(range(len(self.counts.design)), 2)]]
@@ -251,10 +232,7 @@ class Fit:
         return np.asarray(starts[likeliest[near]])
 
     def _nearest(self, rows: Array, linear: Array) -> Array:
-        """Return the coefficients nearest to the fit at which rows have these linear predictors.
-
-        ``rows`` are (sets, rows, terms), and the result (sets, terms).
-        """
+        """Return the coefficients nearest to the fit with these linear predictors."""
         spread = rows @ np.linalg.inv(self.information)
         # The solution of dependent rows is far off, and unlikely.
         square = spread @ rows.transpose(0, 2, 1) + FLAT * np.eye(len(linear))
@@ -274,14 +252,11 @@ class Term:
 
 @dataclass(frozen=True, slots=True)
 class Regression:
-    """A fit to ``n`` trials; ``problem`` says why there are no terms.
+    """A fit to ``n`` trials; ``problem`` says why there are no terms, ``remark`` is a caution.
 
-    ``freedom`` is the residual degrees of freedom of a linear fit, infinite where tests are normal;
-    ``remark`` is a caution on a fit that has terms. Fits of a gap alone have the ``covariance`` of
-    their terms, (terms, terms); ``equivalence_p``, that relative velocity alone moves it by less
-    than GAP_MARGIN_M, and ``velocity_p``, that no term with relative velocity has an effect (an F
-    test of all of them). These are None where no two played conditions differ in relative velocity
-    alone, and where the errors of the terms are not two, as without residuals.
+    ``freedom`` is infinite where tests are normal. Of gaps ``equivalence_p`` is that relative
+    velocity alone moves them by less than GAP_MARGIN_M, and ``velocity_p`` that it has no effect;
+    None without two played conditions that differ in it alone, or without residuals.
     """
 
     n: int
@@ -295,19 +270,13 @@ class Regression:
     profile: Fit | None = field(default=None, compare=False)
 
     def interval(self, term: str, level: float) -> tuple[float, float] | None:
-        """Return the profile interval of a term of Firth's fit, which agrees with its test.
-
-        None where there is no fit, or its profile does not converge.
-        """
+        """Return the profile interval of a term of Firth's fit, if its profile converges."""
         if self.profile is None:
             return None
         return self.profile.interval([*self.terms].index(term), level)
 
     def moved(self, conditions: pd.DataFrame) -> Moved | None:
-        """Return how far relative velocity alone moves the gap between any of these conditions.
-
-        None where no two of them differ in relative velocity alone, and where there is no fit.
-        """
+        """Return how far relative velocity alone moves the gap, if two conditions tell."""
         headway, velocity = conditions[CONDITION].drop_duplicates().to_numpy(float).T
         design = gap_design(headway, velocity)
         more, less = np.nonzero((headway[:, None] == headway) & (velocity[:, None] > velocity))
@@ -324,10 +293,7 @@ class Regression:
 
 @dataclass(frozen=True, slots=True)
 class Moved:
-    """The ``sizes`` of differences of predicted gaps with their ``errors``, in m, (pairs,).
-
-    They are combinations of ``rank`` coefficients, with so many degrees of ``freedom``.
-    """
+    """The ``sizes`` of differences of predicted gaps in m, (pairs,), of ``rank`` coefficients."""
 
     sizes: Array
     errors: Array
@@ -342,9 +308,8 @@ class Moved:
     def interval(self, level: float) -> tuple[float, float]:
         """Return an interval of the largest difference in m.
 
-        It ends where an intersection-union test of all of them does (Berger 1982), as the largest
-        is below a bound only if all are, and begins where one of them is above in simultaneous
-        intervals (Scheffé 1953), as any of them may be the largest.
+        It ends where an intersection-union test does (Berger 1982), as all must be below a bound,
+        and begins where one is above in simultaneous intervals (Scheffé 1953).
         """
         together = sqrt(self.rank * float(stats.f.ppf(level, self.rank, self.freedom)))
         alone = float(stats.t.ppf((1 + level) / 2, self.freedom))
@@ -390,8 +355,7 @@ def gap_design(headway_m: Array, velocity_mps: Array) -> Array:
 def equivalence_p(b: float, se: float, freedom: float) -> float:
     """Return the p of |difference| < GAP_MARGIN_M by two one-sided t tests (Schuirmann 1987).
 
-    It is the larger of the two, that against the nearer margin. A difference without an error, as
-    of a driver without spread, is sure: it lies within the margin or it does not.
+    Without an error it is sure.
     """
     inside = GAP_MARGIN_M - abs(b)
     return float(stats.t.sf(inside / se, freedom)) if se else float(inside <= 0)
@@ -412,10 +376,10 @@ def who_first_logit(trials: pd.DataFrame) -> Regression:
 
 
 def who_first_firth(trials: pd.DataFrame, less: pd.DataFrame | None = None) -> Regression:
-    """Return the same by Firth's penalised likelihood (1993), which is finite under separation.
+    """Return the same by Firth's penalised likelihood (1993) and its ratio tests.
 
-    Its tests are penalised likelihood ratios (Heinze and Schemper 2002). With other trials its
-    terms are the coefficients ``less`` theirs, of one model of both in which every term may differ.
+    With ``less`` its terms are those less theirs, of one model of both in which every term may
+    differ.
     """
     design, left = who_first_data(trials)
     n, problem = len(left), _unidentified(design, left)
@@ -436,10 +400,7 @@ def who_first_firth(trials: pd.DataFrame, less: pd.DataFrame | None = None) -> R
 
 
 def gap_ols(trials: pd.DataFrame, measure: str = "gap_m", *, robust: bool = False) -> Regression:
-    """Fit a gap on |h|, |dv| and h*dv by OLS (eq. 2); ``robust`` takes HC3 standard errors.
-
-    HC3 holds under unequal variances (MacKinnon and White 1985).
-    """
+    """Fit a gap on |h|, |dv| and h*dv by OLS (eq. 2); ``robust`` errors are HC3."""
     from statsmodels.regression.linear_model import OLS
 
     design, gap, chosen = gap_data(trials, measure)
@@ -473,8 +434,7 @@ def by_pairs(
 ) -> Regression:
     """Return a fit to those trials that have the measure, with errors clustered by human pair.
 
-    Errors are a jackknife over the pairs (CV3 of MacKinnon, Nielsen and Webb 2023), whose
-    correction holds for as few clusters as there are; tests are t on pairs - 1 degrees of freedom.
+    They are a jackknife (CV3 of MacKinnon, Nielsen and Webb 2023), with t on pairs - 1 degrees.
     """
     used = trials[(trials["status"] == "finished") & trials[measure].notna()]
     whole, pairs = fit(used), used["pair"].dropna().unique()

@@ -1,7 +1,6 @@
 """First merger read from both sides, where one of two equal drivers is given something.
 
-The other trials, in which both are given the same, have no driver that is asked about: each is read
-from the left and from the right, and counts half for either.
+Trials in which both are given the same are read from left and right, and count half for either.
 """
 
 from __future__ import annotations
@@ -28,11 +27,7 @@ def one_sided(study: Study) -> bool:
 
 @remembered
 def level_estimate(study: Study, level: Level, metric: Metric) -> Estimate:
-    """Return a metric of all trials of a level, with its 95 % interval.
-
-    Who goes first is read from both sides where equal drivers read the same prompt: each of these
-    trials counts half for either, and has no variance.
-    """
+    """Return a metric of all trials of a level; those read from both sides have no variance."""
     group = level.pooled
     trials = group.trials
     same = trials[metric.column].notna() & _have_same_prompts(trials)
@@ -68,11 +63,7 @@ def _of_equals(trials: pd.DataFrame) -> pd.Series:
 
 
 def from_both_sides(study: Study, frame: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
-    """Return who goes first by cell and side; trials with equal prompts are read from both.
-
-    So whoever is given something on the left is compared with the left ones who are not, and on the
-    right with the right ones: no side is favoured.
-    """
+    """Return who goes first by cell and side, so that no side is favoured."""
     trials = trials.loc[frame.index]
     sided = [(*cell, ego) for cell, ego in zip(frame["condition"], trials["ego"], strict=True)]
     images = [(_mirrored(study, cell[0]), *cell[1:], "right") for cell in frame["condition"]]
@@ -82,10 +73,7 @@ def from_both_sides(study: Study, frame: pd.DataFrame, trials: pd.DataFrame) -> 
 
 
 def read_twice(frame: pd.DataFrame, images: pd.Series) -> pd.DataFrame:
-    """Return trials by cell, and once more those with a cell from the right in ``images``.
-
-    Both readings of a trial are opposite, so that their sum does not vary.
-    """
+    """Return trials by cell, and once more the opposite of those with an image."""
     again = images.notna()
     right = frame.assign(condition=images, value=1 - frame["value"])[again]
     return pd.concat([frame.assign(varies=~again), right.assign(varies=False)])

@@ -1,18 +1,14 @@
 """Drivers beside the humans: estimate, interval and test of each measure from one model.
 
-- Who goes first: Firth's penalised logit of left-first on h and dv, finite also under separation,
-  with profile likelihood intervals and likelihood-ratio tests (Heinze and Schemper 2002); of a
-  difference one model of both, in which every term may differ.
-- Collisions: Fisher's exact test within conditions, with the melded interval that agrees with it.
-- The mean gap: Student's t over trials, the humans' over their nine pairs, in the conditions of the
-  driver's trials; Welch's test.
-- The slope of the gap on headway: least squares with HC3 errors, the humans' as published or by
-  pairs. I4: the largest difference of predicted gaps that relative velocity alone makes.
-- I5: how far accelerations are held, in human standard deviations (see ``likeness``).
+- Who goes first: Firth's penalised logit; of a difference one model of both (see ``regressions``).
+- Collisions: Fisher's exact test within conditions, with the melded interval that agrees with it. -
+The mean gap: Student's t over trials, of humans over their nine pairs; Welch's test. - The slope of
+the gap on headway: least squares with HC3 errors, the humans' as published or by pairs. I4: the
+largest difference of predicted gaps that relative velocity alone makes. - I5: how far accelerations
+are held, in human standard deviations (see ``likeness``).
 
-The p of a driver's measures are corrected together by Holm (1979), and a driver differs in those
-with a corrected p below 5 %. The interval that such a state rests on has the level at which Holm
-tested it, so that both agree.
+The p of a driver's measures are corrected together by Holm (1979). The interval that a state rests
+on has the level at which Holm tested it, so that both agree.
 """
 
 from __future__ import annotations
@@ -55,10 +51,7 @@ WITHIN_LEVEL = 1 - 2 * ALPHA
 
 
 class Both(NamedTuple):
-    """A driver's trials in conditions of humans, and the humans.
-
-    ``likeness`` is how far the driver's accelerations are held, less the humans' (I5).
-    """
+    """A driver in conditions of humans, the humans, and its likeness to them in I5."""
 
     group: Group
     human: Group
@@ -78,8 +71,8 @@ class Counted(NamedTuple):
 class Statistic:
     """Estimators of a measure for a driver and for humans, and its test: by default Welch's.
 
-    The test is of the difference, or of a value with a margin against that. ``indicator`` is the
-    one whose own test shows the trait.
+    It is of the difference, or of a value against a margin; an ``indicator``'s test shows the
+    trait.
     """
 
     driver: Callable[[Both], Estimate]
@@ -96,11 +89,10 @@ class Statistic:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """A driver beside the humans in one measure.
+    """A driver beside the humans in one measure, and its raw counts.
 
-    ``tested`` is what the state rests on, at the level of its test: driver minus humans, or the
-    driver's value where the measure has a margin. It is empty where there is no test. ``counted``
-    is what a person sees of it at once.
+    ``tested`` is the difference, or the driver's value where the measure has a margin, at the level
+    of its test; it is empty without one.
     """
 
     measure: Measure
@@ -145,10 +137,7 @@ def of_humans(study: Study) -> dict[str, Estimate]:
 
 
 def counted(both: Both) -> dict[str, Counted]:
-    """Return what a person counts, by measure; nothing where no trial could go so.
-
-    First mergers are counted for the vehicle ahead or, side by side, for the slower one.
-    """
+    """Return raw counts by measure, of those with trials that could go so."""
     played = both.human.outcomes["condition"].isin(both.group.ended["condition"])
     humans = both.human.outcomes[played]
     crashed = measures.values(replace(both.human, published_outcomes=humans), BOXES).astype(bool)
@@ -162,10 +151,9 @@ def counted(both: Both) -> dict[str, Counted]:
 
 
 def went_so(group: Group, measure: str) -> pd.Series:
-    """Return whether each trial of a driver went as a measure counts it, of those that could.
+    """Return whether each trial went as a measure counts it, of those that could.
 
-    Only those in conditions of humans count. Collisions are those by the humans' rule, or by the
-    rule that was played where that of the humans does not decide all trials.
+    Collisions are by the humans' rule, or by that which was played if theirs leaves some undecided.
     """
     alike = comparable(group)
     if measure == "collisions":
@@ -231,11 +219,7 @@ def _within(measure: Measure, test: Estimate) -> bool:
 
 
 def holm_levels(p: Mapping[str, float], p_holm: Mapping[str, float]) -> dict[str, float]:
-    """Return the levels of intervals that exclude 0 exactly where the corrected p are below ALPHA.
-
-    Holm tests the smallest of m p-values at ALPHA / m, the next at ALPHA / (m - 1), and so on; all
-    from the first that fails are as at that step.
-    """
+    """Return levels of intervals that exclude 0 exactly where Holm's p are below ALPHA."""
     sure = sum(value < ALPHA for value in p_holm.values())
     order = sorted(p, key=lambda name: p[name])
     return {name: 1 - ALPHA / (len(order) - min(place, sure)) for place, name in enumerate(order)}
@@ -323,9 +307,8 @@ def _gap(group: Group) -> Estimate:
 def human_gap(human: Group, group: Group) -> Estimate:
     """Return the humans' mean gap in the conditions of a group's trials with one, as these weigh.
 
-    The published mean is moved by what the published regression predicts for these conditions. It
-    has the spread of the nine pairs: of their random intercepts, which are shrunken, so that it is
-    rather too small.
+    The published mean is moved by the published regression; its error is the spread of the pairs'
+    random intercepts, which are shrunken, so that it is rather too small.
     """
     gaps = group.finished[group.finished[GAP.column].notna()] if group.measured else None
     if _imported(human):
@@ -357,8 +340,7 @@ def _gap_design(trials: pd.DataFrame) -> regressions.Array:
 def human_fit(human: Group) -> Regression:
     """Return the humans' regression of the gap: by pairs, or as published.
 
-    The errors that are published follow from the published outcomes and one standard deviation of
-    the gaps about their regression; so do the covariances that are not.
+    Covariances that are not published follow from the outcomes and one standard deviation.
     """
     if _imported(human):
         return regressions.by_pairs(regressions.gap_ols, human.trials, "gap_m")

@@ -100,11 +100,7 @@ def finished_tables(
     study: Study | None = None,
     selection: Selection | None = None,
 ) -> list[Table]:
-    """Return the named tables of a database, or all: read where they are kept, else computed.
-
-    ``study`` stands in the place of a ``selection``, if the caller already has it.
-    Raises UsageError for an unknown name.
-    """
+    """Return a database's tables, cached or computed. Raises UsageError."""
     chosen, selection = _valid(names), selection or Selection()
     options = study.options if study else selection.key(db)
     state = study.state if study else present_state(db)
@@ -123,13 +119,13 @@ def finished_tables(
 
 
 def table(study: Study | Path | str, name: str, selection: Selection | None = None) -> pd.DataFrame:
-    """Return a table of a study, or of a database's ``selection``, as a data frame.
+    """Return a table of a study, or of a database's ``selection``, as its CSV has it.
 
-    It has the rows of the table's CSV at full precision, and what the study adds that this process
-    has planned into the database. Raises UsageError.
+    Values have full precision, and plug-ins of the study are in use. Raises UsageError.
     """
     import pandas as pd
 
+    from merge_runner.results.frames import TEXT
     from merge_runner_analysis.study import Study
 
     with using(in_use_for(study.db if isinstance(study, Study) else Path(study))):
@@ -137,8 +133,9 @@ def table(study: Study | Path | str, name: str, selection: Selection | None = No
         (made,) = make_tables(read, [name])
         frame = pd.DataFrame(value_rows(made), columns=names_of(made)).set_index("row")
     # pandas cannot infer the type of a column without a value.
+    texts = {"note", *(column.name for column in made.columns if column.kind == "text")}
     missing = [name for name in frame if frame[name].isna().all()]
-    return frame.astype(dict.fromkeys(missing, "float64"))
+    return frame.astype({name: TEXT if name in texts else "float64" for name in missing})
 
 
 def _valid(names: Sequence[str]) -> Sequence[str]:

@@ -4,13 +4,8 @@ from __future__ import annotations
 
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.metrics import INTERVALS, RULES_NOTE, Metric, shown_in
+from merge_runner_analysis.stats import measures
 from merge_runner_analysis.stats.estimate import Estimate
-from merge_runner_analysis.stats.measures import (
-    estimate_or_reference,
-    no_human_value,
-    outcomes_note,
-    undecided_note,
-)
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.model import (
     ENDED,
@@ -62,12 +57,12 @@ def metric_table(name: str, groups: list[Group], place: str, *notes: str) -> Tab
 def measured(group: Group, metrics: list[Metric]) -> tuple[dict[str, Estimate], list[object]]:
     """Return a group's estimates by metric, and remarks on those that are published or missing."""
     estimates: dict[str, Estimate] = {}
-    remarks: list[object] = [outcomes_note(group)]
+    remarks: list[object] = [measures.outcomes_note(group)]
     reasons: dict[str, list[str]] = {}
     for metric in metrics:
-        estimate = estimate_or_reference(group, metric)
+        estimate = measures.estimate_or_reference(group, metric)
         if estimate is None:
-            remarks.append(no_human_value(metric))
+            remarks.append(measures.no_human_value(metric))
             continue
         estimates[metric.name] = estimate
         if estimate.source:
@@ -75,5 +70,5 @@ def measured(group: Group, metrics: list[Metric]) -> tuple[dict[str, Estimate], 
         elif estimate.value is None and estimate.bounds() is None:
             reasons.setdefault("no trial has it", []).append(metric.heading)
         else:
-            remarks.append(undecided_note(group, metric))
+            remarks.append(measures.undecided_note(group, metric))
     return estimates, [*remarks, *(f"{', '.join(names)}: {why}" for why, names in reasons.items())]

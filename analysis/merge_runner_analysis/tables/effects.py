@@ -75,8 +75,7 @@ def effects_table(study: Study) -> Table:
 def comparison(study: Study, driver: str, reference: str) -> Table:
     """Return a driver with its prompt less another, by their groups' ids: a row per measure.
 
-    ``k`` of ``n`` trials and the value are of the situations of both, of which the difference is;
-    of all of a driver's trials where nothing is compared. Without rows where one is not judged.
+    Values are of the cells of both, or of all trials where nothing is compared.
     """
     known = {group.id: group for group in study.models}
     are_judged = {driver, reference} <= {*known}

@@ -1,7 +1,4 @@
-"""Tables as text, CSV, JSON, Markdown and LaTeX: at full precision in CSV and JSON, else rounded.
-
-Rich and pandas would take eight times as long, and 1.5 s to import their templates.
-"""
+"""Tables as text, CSV, JSON, Markdown and LaTeX; Rich and pandas would take 1.5 s to start."""
 
 from __future__ import annotations
 
@@ -231,10 +228,7 @@ def shown_columns(table: Table) -> list[Column]:
 
 
 def notes_of(table: Table) -> list[str]:
-    """Return the notes of rows, then of the table; equal notes of rows are one, with its owners.
-
-    They are a group's, or where a row rests on several those of the row without its measure.
-    """
+    """Return the notes of rows, equal ones once with all names, then the table's."""
     owners: dict[str, dict[str, None]] = {}
     for row in table.rows:
         if row.note:
@@ -275,8 +269,7 @@ def _rounded(value: float, column: Column, row: Row) -> str:
 def table_view(table: Table, link: Callable[[Table, Row, Column], object]) -> dict[str, object]:
     """Return a table as templates need it: headings, cells with what ``link`` returns, notes.
 
-    The text cells before a row's first other cell are its headers: a screen reader announces them
-    with each of its cells. A value leads to trials unless it is published or a count of zero.
+    The text cells before a row's first other cell are its headers, for screen readers.
     """
     columns = shown_columns(table)
     headers = [*takewhile(lambda column: column.kind == "text", columns)]

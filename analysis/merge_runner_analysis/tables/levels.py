@@ -1,7 +1,4 @@
-"""Results at each level of each factor, and in the crossings of those that a study varies.
-
-The first page draws its chart and counts its trials from this table.
-"""
+"""Results at each level of each factor, and in crossings; the first page draws this table."""
 
 from __future__ import annotations
 

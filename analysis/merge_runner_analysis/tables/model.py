@@ -1,7 +1,4 @@
-"""A table as data: typed columns, rows with ids, and notes.
-
-The output formats and ``explain`` read nothing else.
-"""
+"""A table as data for output formats and ``explain``: columns, rows, notes."""
 
 from __future__ import annotations
 
@@ -31,10 +28,9 @@ COUNTED = "counted"
 class Column:
     """One column.
 
-    ``meaning`` describes its values in words. ``counts`` is the column of the trials, or of their
-    calls, that a share or a count counts, and ``rests_on`` is as of a row, where its values rest on
-    other trials. If ``optional``, a value may be missing without a note. One that is ``noted``
-    stands in the values alone: the notes say it to a reader. ``digits`` are decimals.
+    ``counts`` is the column of trials or calls that a share or count counts, ``rests_on`` as of a
+    row. An ``optional`` value may be missing without a note; a ``noted`` column is not shown to a
+    reader.
     """
 
     name: str
@@ -60,10 +56,9 @@ def interval(name: str, meaning: str, rests_on: str = "", digits: int = DECIMALS
 class Row:
     """One row: its readable id, the groups whose trials it rests on, values by column, a note.
 
-    ``rests_on`` says which of these: STORED, ENDED, FINISHED, or the column in which they have a
-    value; empty where it rests on none. They are in these ``conditions``, if there are any, and
-    not among the ``copies`` of others (trial_id, spec_hash). An ``untested`` one has no value, and
-    its note says why: a reader sees the note alone.
+    ``rests_on`` says which of these: STORED, ENDED, FINISHED, or a column in which they have a
+    value; empty for none. They are in these ``conditions``, if any, without ``copies`` (trial_id,
+    spec_hash). Of an ``untested`` row a reader sees the note alone.
     """
 
     id: str
@@ -86,10 +81,7 @@ def row_of(
     item: str = "",
     rests_on: str = FINISHED,
 ) -> Row:
-    """Return a group's row with its GROUP_COLUMNS, named ``o3/A2/item``, and the joined remarks.
-
-    The published values of humans rest on no trials here.
-    """
+    """Return a group's row, named ``o3/A2/item``; published values rest on no trials here."""
     return Row(
         f"{group.id}/{item}" if item else group.id,
         (group.id,),

@@ -1,7 +1,4 @@
-"""Every driver beside the humans, by every measure.
-
-Headlines, sentences, the report and the pages read this table and nothing else.
-"""
+"""Every driver beside the humans, by every measure: all that headlines, pages and report read."""
 
 from __future__ import annotations
 

@@ -112,6 +112,8 @@ def test_several_csv_tables_carry_their_names_and_one_without_rows_its_columns(s
     frame = table_of(small, "factors")
     assert frame.empty
     assert [frame.index.name, *frame] == as_csv(made(small, "factors")).split(",")
+    assert {str(frame[name].dtype) for name in ("factor", "note")} == {"str"}
+    assert frame["value"].dtype == float
 
 
 def test_a_data_frame_may_be_of_a_part_of_a_database(small):
