@@ -75,7 +75,7 @@ def records(count: int) -> list[TrialRecord]:
             slot=question.slot,
         )
         attempt = Attempt(1, "ok", http_status=200, reply=json.dumps(payload))
-        return question.decide(question.prompt, ChatReply(text, "ok", request, (attempt,), 0))
+        return question.decision(question.prompt, ChatReply(text, "ok", request, (attempt,), 0))
 
     trials = TrialMaker(plan)
     return [play_trial(trials.make(spec), decide) for spec in plan.trial_specs()[:count]]

@@ -112,14 +112,14 @@ class Trial:
             world.drive(left.actions(steps), right.actions(steps))
 
 
-def play_trial(trial: Trial, decide: Callable[[Question], Decision]) -> TrialRecord:
+def play_trial(trial: Trial, answer: Callable[[Question], Decision]) -> TrialRecord:
     """Play a trial to its end with an answer for each question; a CallFailed ends the trial."""
     while questions := trial.pending():
         decisions: dict[Side, Decision] = {}
         for question in questions:
             side = question.slot.side
             try:
-                decisions[side] = decide(question)
+                decisions[side] = answer(question)
             except CallFailed as failure:
                 trial.fail(side, failure)
         trial.answer(decisions)

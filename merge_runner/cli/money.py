@@ -30,7 +30,7 @@ def ledger(
     """
     from merge_runner.llm.cache import ResponseCache
     from merge_runner.llm.cache_file import require
-    from merge_runner.llm.ledger import APART, Ledger, scopes
+    from merge_runner.llm.ledger import APART, Ledger, reasons, scopes
     from merge_runner.run.summary import as_table
 
     require(cache)
@@ -43,7 +43,11 @@ def ledger(
             names = [release]
         ledgers = [Ledger(opened, name) for name in names]
         rows = [
-            {"sweep": ledger.scope, **asdict(ledger.read()), "reasons": ledger.reasons()}
+            {
+                "sweep": ledger.scope,
+                **asdict(ledger.read()),
+                "reasons": reasons(opened, ledger.scope),
+            }
             for ledger in ledgers
         ]
         # Without a live run only batches are in flight, and the next run asks for them.
@@ -54,8 +58,8 @@ def ledger(
     if as_json:
         print_out(json.dumps(rows, ensure_ascii=False))
         return
-    reasons = [{"sweep": row["sweep"], **reason} for row in rows for reason in row.pop("reasons")]
-    text = "\n".join(filter(None, map(as_table, (_shown_spending(rows), reasons))))
+    why = [{"sweep": row["sweep"], **reason} for row in rows for reason in row.pop("reasons")]
+    text = "\n".join(filter(None, map(as_table, (_shown_spending(rows), why))))
     print_out(f"{text}\n{APART}" if text else "Nothing is spent.")
 
 

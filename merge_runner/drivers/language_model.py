@@ -17,7 +17,7 @@ from merge_runner.trial_records import TrialSpec
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """Prompt for the model of a driver; ``decide`` turns prompt and reply into the decision.
+    """Prompt for the model of a driver; ``decision`` makes the decision of prompt and reply.
 
     ``older`` is the prompt as earlier versions worded it for a driver without a valid plan: "this
     is your first decision". A stored reply to it is replayed in place of a new call.
@@ -27,7 +27,7 @@ class Question:
     slot: Slot
     prompt: str
     older: str | None
-    decide: Callable[[str, ChatReply], Decision]
+    decision: Callable[[str, ChatReply], Decision]
 
 
 @dataclass(frozen=True, slots=True)

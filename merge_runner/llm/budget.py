@@ -4,7 +4,8 @@ A trial is admitted only if its expected cost, and what the running trials are s
 cost, fit under the cap. So money finishes trials instead of beginning more. Expectations err, so
 an attempt leaves room only for older trials: the oldest trial is suspended only where the money
 left does not pay for a single attempt. A call that several trials share is paid by the oldest
-running one, so that a running trial never waits for the admission of another.
+running one, so that a running trial never waits for the admission of another. A probe comes before
+all others and leaves no room: older trials may wait for its reply.
 
 The worst case of an attempt is reserved in this process while it waits for its turn, and in the
 ledger right before it is sent. A server may ignore the output cap. So several attempts are in
@@ -16,6 +17,7 @@ from __future__ import annotations
 import asyncio
 import math
 from asyncio import Future
+from bisect import insort
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -36,7 +38,7 @@ class Reservation:
     """Worst case of one attempt, from its reservation to ``close``, the end of the attempt.
 
     While ``queued``, ``usd`` is reserved in this process, and after ``begin`` in the ledger. An
-    attempt that ends before ``begin`` returns all of it to its trial. After ``settle`` the
+    attempt that ends before ``begin`` returns all of it to its trial. After ``book`` the
     difference to the cost is returned. Where the cost is unknown the attempt may have been charged:
     all of it stays in the ledger until a user releases it.
     """
@@ -52,7 +54,7 @@ class Reservation:
     def __post_init__(self) -> None:
         self.budget.in_flight += 1
         self.budget.queued_usd += self.usd if self.queued else 0.0
-        self._charge(self.usd)
+        self._take(self.usd)
 
     @classmethod
     def resume(cls, budget: Budget, trial: int, key: str, label: CallLabel) -> Reservation:
@@ -64,7 +66,8 @@ class Reservation:
 
         Nothing is sent or durable here yet, so the wait can be cancelled.
         """
-        if not await self.budget.ledger.ask_coordinator(self.key, self.usd, self.label):
+        coordinator = self.budget.ledger.coordinator
+        if coordinator and not await coordinator.reserve(self.key, self.usd, self.label):
             raise TrialSuspended(USED_UP)
 
     async def begin(self, number: int) -> None:
@@ -79,11 +82,11 @@ class Reservation:
         self.budget.queued_usd -= self.usd
         self.budget.queue.wake()
 
-    def settle(self, attempt: Attempt, keep: Callable[[Execute], ResultT]) -> Future[ResultT]:
+    def book(self, attempt: Attempt, keep: Callable[[Execute], ResultT]) -> Future[ResultT]:
         """Keep what the attempt brought and book its cost, in one durable transaction."""
         self.cost_usd, ledger = attempt.cost_usd, self.budget.ledger
-        settle = partial(ledger.settle, self.key, attempt, self.label.driver)
-        return ledger.store.write(partial(both, keep, settle))
+        book = partial(ledger.book, self.key, attempt, self.label.driver)
+        return ledger.store.write(partial(both, keep, book))
 
     def close(self) -> None:
         """Return what the attempt, which has ended, did not spend."""
@@ -91,16 +94,16 @@ class Reservation:
         if self.queued:
             self.budget.queued_usd -= self.usd
             self.cost_usd = 0.0
-        if self.budget.ledger.is_shared_out:
-            self.budget.ledger.report_cost(self.key, self.cost_usd)
+        if coordinator := self.budget.ledger.coordinator:
+            coordinator.report_cost(self.key, self.cost_usd)
         if self.cost_usd is not None:
-            self._charge(self.cost_usd - self.usd)
+            self._take(self.cost_usd - self.usd)
         self.budget.queue.wake()
 
-    def _charge(self, usd: float) -> None:
-        """Add to what the trial, if it still runs, has spent and reserved."""
-        if self.trial in self.budget.charged_usd:
-            self.budget.charged_usd[self.trial] += usd
+    def _take(self, usd: float) -> None:
+        """Take from what is kept for the trial, if it still runs."""
+        if self.trial in self.budget.running:
+            self.budget.running[self.trial] -= usd
 
 
 @dataclass(slots=True, eq=False)
@@ -108,12 +111,13 @@ class Waiter:
     """Call that waits for money, with the trials that share it: they may change meanwhile."""
 
     trials: Sequence[int]
-    is_admission: bool
+    is_admission: bool = False
+    is_probe: bool = False
     changed: asyncio.Event = field(default_factory=asyncio.Event)
 
 
 class MoneyQueue:
-    """Priority queue: calls of ``running`` trials before trials that wait for admission.
+    """Priority queue: probes, calls of ``running`` trials, trials that wait for admission.
 
     A call of a running trial has the place of the oldest one, whatever it waits for.
     """
@@ -123,24 +127,26 @@ class MoneyQueue:
         self._ledger = ledger
         self._running = running
 
-    def place(self, waiter: Waiter) -> tuple[bool, float]:
-        """Return the place of a waiter; the lowest is first."""
+    def _place(self, waiter: Waiter) -> tuple[bool, float]:
+        if waiter.is_probe:
+            return False, -math.inf
         running = self._running.keys() & waiter.trials
         return waiter.is_admission and not running, min(running or waiter.trials, default=math.inf)
 
     def wake(self) -> None:
-        """Let the first in the queue check whether it may go on.
-
-        The order depends on the trials that run, and on those that share a call.
-        """
+        """Let the first in the queue check whether it may go on."""
         if self.waiters:
-            self.waiters.sort(key=self.place)
             self.waiters[0].changed.set()
+
+    def reorder(self, trial: int | None = None) -> None:
+        """Sort the queue, since a trial begins or ends; None: since one joins or leaves a call."""
+        if trial is None or any(trial in waiter.trials for waiter in self.waiters):
+            self.waiters.sort(key=self._place)
+        self.wake()
 
     async def wait(self, waiter: Waiter, may_go: Callable[[], bool]) -> None:
         """Wait in the queue until ``may_go`` is True."""
-        self.waiters.append(waiter)
-        self.waiters.sort(key=self.place)
+        insort(self.waiters, waiter, key=self._place)
         try:
             while self.waiters[0] is not waiter or not may_go():
                 waiter.changed.clear()
@@ -159,7 +165,8 @@ class Budget:
 
     A trial is named by its order in the sweep; ``trial_usd`` returns its expected cost.
     ``in_flight`` counts reservations, ``queued_usd`` is reserved in this process alone.
-    ``charged_usd`` has, by running trial, what it has spent and reserved.
+    ``running`` has, by admitted trial, what is kept for it: the rest of its expected cost in USD,
+    below 0 where it has cost more.
     """
 
     def __init__(self, ledger: Ledger, trial_usd: Callable[[int], float] = lambda _: 0.0) -> None:
@@ -167,11 +174,11 @@ class Budget:
         self.trial_usd = trial_usd
         self.in_flight = 0
         self.queued_usd = 0.0
-        self.charged_usd: dict[int, float] = {}
+        self.running: dict[int, float] = {}
         self._largest_usd = 0.0
         self._spent_before = ledger.spending.committed_usd > 0
         self._left: set[int] = set()
-        self.queue = MoneyQueue(ledger, self.charged_usd)
+        self.queue = MoneyQueue(ledger, self.running)
 
     @property
     def waiting(self) -> set[int]:
@@ -180,7 +187,7 @@ class Budget:
 
     def is_running(self, trials: Sequence[int]) -> bool:
         """Return whether one of the trials is admitted."""
-        return not self.charged_usd.keys().isdisjoint(trials)
+        return not self.running.keys().isdisjoint(trials)
 
     async def admit(self, trials: Sequence[int]) -> None:
         """Wait until one of the trials that share a call runs, or the oldest of them may begin.
@@ -192,29 +199,31 @@ class Budget:
                 Waiter(trials, is_admission=True),
                 lambda: self.is_running(trials) or self._may_begin(min(trials)),
             )
+            self.queue.reorder(min(trials))
 
     def readmit(self, trial: int) -> None:
         """Admit a trial at once: an earlier run has asked for it."""
         if self.ledger.cap is not None and trial not in self._left:
-            self.charged_usd.setdefault(trial, 0.0)
-            self.queue.wake()
+            self.running.setdefault(trial, self.trial_usd(trial))
+            self.queue.reorder(trial)
 
     def leave(self, trial: int) -> None:
         """Free the money of a trial that has ended or is suspended."""
         self._left.add(trial)
-        if self.charged_usd.pop(trial, None) is not None:
-            self.queue.wake()
+        if self.running.pop(trial, None) is not None:
+            self.queue.reorder(trial)
 
-    async def reserve(self, trials: Sequence[int], key: str, label: CallLabel) -> Reservation:
+    async def reserve(
+        self, trials: Sequence[int], key: str, label: CallLabel, *, is_probe: bool = False
+    ) -> Reservation:
         """Reserve an attempt's worst case for the oldest running trial of those that share a call.
 
         It is scaled where the server ignores the output cap. Waits while other attempts or older
         trials may free money, then raises TrialSuspended. The caller closes the reservation.
         """
-        has_cap = self.ledger.cap is not None
-        if has_cap and (self.queue.waiters or not self._may_reserve(trials, label)):
-            waiter = Waiter(trials, is_admission=False)
-            await self.queue.wait(waiter, lambda: self._may_reserve(trials, label))
+        may_reserve = partial(self._may_reserve, trials, label, is_probe)
+        if self.ledger.cap is not None and (self.queue.waiters or not may_reserve()):
+            await self.queue.wait(Waiter(trials, is_probe=is_probe), may_reserve)
         usd = self._worst_usd(label)
         self._largest_usd = max(self._largest_usd, usd)
         return Reservation(self, self._payer(trials), key, label, usd)
@@ -223,23 +232,25 @@ class Budget:
         """Admit a trial if its expected cost fits beside those running; raise TrialSuspended."""
         if trial in self._left:
             raise TrialSuspended("its trial is suspended")
-        needed_usd, left_usd = self.trial_usd(trial), self._left_usd()
-        if left_usd < needed_usd and not self.charged_usd and not self.in_flight:
+        needed_usd = self.trial_usd(trial)
+        left_usd = self._left_usd(needed_usd)
+        if left_usd < needed_usd and not self.running and not self.in_flight:
             # The first trial begins all the same: it may cost less, and each attempt must still
             # fit.
             if self._spent_before or self._largest_usd:
                 raise self._suspended(f"a whole trial may cost {needed_usd:.2f} USD")
-        elif left_usd < needed_usd + self._needed_usd():
+        elif left_usd < needed_usd + self._kept_usd():
             return False
-        self.charged_usd[trial] = 0.0
+        self.running[trial] = needed_usd
         return True
 
-    def _may_reserve(self, trials: Sequence[int], label: CallLabel) -> bool:
+    def _may_reserve(self, trials: Sequence[int], label: CallLabel, is_probe: bool) -> bool:
         """Return whether an attempt's worst case fits; raise TrialSuspended where it never will."""
-        left_usd, worst_usd = self._left_usd(), self._worst_usd(label)
+        worst_usd = self._worst_usd(label)
+        left_usd = self._left_usd(worst_usd)
         if left_usd < worst_usd and not self.in_flight:
             raise self._suspended(f"the next call may cost {worst_usd:.4f} USD")
-        older_usd = self._needed_usd(before=self._payer(trials))
+        older_usd = 0.0 if is_probe else self._kept_usd(before=self._payer(trials))
         # Only the first expensive reply shows that a server ignores the output cap, when the others
         # are sent already: all in flight may cost twice as much.
         twice_usd = (self.in_flight + 1) * max(worst_usd, self._largest_usd)
@@ -247,38 +258,43 @@ class Budget:
 
     def _payer(self, trials: Sequence[int]) -> int:
         """Return the oldest running trial of those that share a call, else the oldest."""
-        return min(self.charged_usd.keys() & trials or trials)
+        return min(self.running.keys() & trials or trials)
 
     def _worst_usd(self, label: CallLabel) -> float:
         """Return the worst case, scaled by this driver's largest observed cost overrun."""
         return label.worst_usd * self.ledger.spending.overruns.get(label.driver, 1.0)
 
-    def _left_usd(self) -> float:
+    def _left_usd(self, needed_usd: float) -> float:
+        """Return the USD left under the cap.
+
+        They are summed anew before a trial is suspended: other processes may have freed some.
+        """
         cap, ledger = self.ledger.cap, self.ledger
         assert cap is not None
+        if not self.in_flight and cap.usd - ledger.committed_usd < needed_usd:
+            ledger.read()
         return cap.usd - ledger.committed_usd - self.queued_usd + TOLERANCE_USD
 
-    def _needed_usd(self, before: float = math.inf) -> float:
-        """Return the remaining expected cost of the running trials ``before`` another."""
-        needed_usd = 0.0
-        for trial, charged_usd in self.charged_usd.items():
-            if trial < before:
-                needed_usd += max(0.0, self.trial_usd(trial) - charged_usd)
-        return needed_usd
+    def _kept_usd(self, before: float = math.inf) -> float:
+        """Return the USD that are kept for the running trials ``before`` another."""
+        kept_usd = 0.0
+        for trial, usd in self.running.items():
+            if usd > 0 and trial < before:
+                kept_usd += usd
+        return kept_usd
 
     def _suspended(self, what: str) -> TrialSuspended:
-        """Return the error of a trial for which the money left is too little."""
-        spending, expected_usd = self.ledger.read(), self._needed_usd()
-        assert self.ledger.cap is not None
+        spending, cap = self.ledger.spending, self.ledger.cap
+        assert cap is not None
         reserved_usd = max(0.0, spending.reserved_usd + self.queued_usd)  # never -0.0000
         elsewhere_usd = self.ledger.committed_usd - spending.committed_usd
         is_elsewhere = elsewhere_usd > TOLERANCE_USD
         elsewhere = f", {elsewhere_usd:.4f} by others under this cap" if is_elsewhere else ""
         total_usd = self.ledger.committed_usd + self.queued_usd
         return TrialSuspended(
-            f"{what}, and {total_usd:.4f} of {self.ledger.cap.usd:g} USD are spent or reserved "
+            f"{what}, and {total_usd:.4f} of {cap.usd:g} USD are spent or reserved "
             f"({spending.spent_usd:.4f} spent, {reserved_usd:.4f} reserved for "
             f"{spending.open_attempts} attempts whose cost is not known{elsewhere}: "
             "`merge-runner ledger`); "
-            f"{expected_usd:.4f} more are kept for the trials that have begun"
+            f"{self._kept_usd():.4f} more are kept for the trials that have begun"
         )

@@ -13,7 +13,16 @@ from pathlib import Path
 from merge_runner.errors import RecordingError
 from merge_runner.llm.cache_file import FAILURES, FOREIGN_KEY
 from merge_runner.llm.durable import Execute, Operation
-from merge_runner.llm.store import UNANSWERED, Attempts, CachedCall, CallStore, text_of, verified
+from merge_runner.llm.store import (
+    ATTEMPTS,
+    UNANSWERED,
+    Attempts,
+    CachedCall,
+    CallStore,
+    attempts_of,
+    text_of,
+    verified,
+)
 from merge_runner.records import DAMAGED, check_body
 
 BATCH = 1_000
@@ -59,6 +68,13 @@ class ResponseCache(CallStore):
             seen += len(batch)
         return added, seen - added
 
+    def keep_attempts(self, key: str, attempts: Attempts, execute: Execute) -> None:
+        """Store the attempts of a call that has no answer yet; an operation."""
+        self.replace(UNANSWERED + key, ATTEMPTS.dump_json(attempts).decode(), execute)
+
+    def _unanswered(self, key: str) -> Attempts:
+        return attempts_of(self.read(UNANSWERED + key) or "[]")
+
     def all_unanswered(self) -> dict[str, Attempts]:
         """Return the attempts of all calls without an answer, by call key."""
         keys = (name.removeprefix(UNANSWERED) for name in self.names(UNANSWERED))
@@ -71,7 +87,7 @@ class ResponseCache(CallStore):
         ``left_out``.
         """
         try:
-            for row in self._reading.execute(_CALLS):
+            for row in self.reading.execute(_CALLS):
                 try:
                     ((key, raw, *value),) = self.rows(_CALL, *row)
                     if not (raw and isinstance(key, str)):
@@ -83,7 +99,7 @@ class ResponseCache(CallStore):
                     if left_out is not None:
                         left_out.append(str(exc))
         except FAILURES as exc:
-            raise self._failure("read", exc) from exc
+            raise self.failure("read", exc) from exc
         yield from self.recording[0].values()
 
     def newest(self, most: int) -> Iterator[CachedCall]:

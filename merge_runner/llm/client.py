@@ -1,7 +1,7 @@
 """Client for one model: returns the recorded reply to a prompt, or calls the API.
 
-A call is: look up, admit, reserve, send, judge, finish. ``Sender.send`` waits for the rate limiter
-and makes the reservation durable.
+A call is: look up, admit, reserve, send, judge, finish. Its sender waits for the rate limiter and
+makes the reservation durable.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -17,20 +18,19 @@ from merge_runner.llm.attempts import Meter, record
 from merge_runner.llm.budget import Budget, Reservation
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.call import Call, Calls, Wait
-from merge_runner.llm.delays import TryAgain
+from merge_runner.llm.delays import TryAgain, next_wait_s
 from merge_runner.llm.endpoint_state import EndpointState
 from merge_runner.llm.http_outcome import AttemptOutcome
 from merge_runner.llm.ledger import CallLabel
 from merge_runner.llm.prices import attempt_usd, worst_case
-from merge_runner.llm.probe import Probe
+from merge_runner.llm.probe import LONG_WAIT_S, Probe
 from merge_runner.llm.recorded import RecordedReplies
-from merge_runner.llm.retry import Retry
-from merge_runner.llm.sender import DirectSender, Sender
+from merge_runner.llm.sender import DirectSender
 from merge_runner.llm.store import Attempts, CachedCall
 from merge_runner.records import Attempt, ChatReply, ChatRequest, Slot
 
 if TYPE_CHECKING:
-    from merge_runner.llm.batch.sender import BatchSender
+    from merge_runner.llm.batch.rounds import BatchSender
 
 NO_ROOM = "calls: the cap leaves money for few trials at a time"
 NO_MONEY = "for calls in flight to be paid, under --max-cost"
@@ -54,7 +54,6 @@ class LlmClient:
     calls: Calls = field(default_factory=Calls)
     recorded: RecordedReplies = field(init=False)
     probe: Probe = field(init=False)
-    retry: Retry = field(init=False)
 
     def __post_init__(self) -> None:
         """Make the parts that all calls share."""
@@ -63,7 +62,6 @@ class LlmClient:
             endpoint.name, entry, endpoint.identity, endpoint.wire, self.cache
         )
         self.probe = Probe(endpoint, self.calls, self.meter)
-        self.retry = Retry(endpoint, self.calls, self.meter)
 
     @property
     def meter(self) -> Meter:
@@ -104,14 +102,14 @@ class LlmClient:
         call.trials.append(order)
         call.order = min(call.order, order)
         if is_shared:
-            self.budget.queue.wake()
+            self.budget.queue.reorder()
         try:
             # Shielded: the call may be paid for already when its trial is cancelled.
             reply = await asyncio.shield(call.task)
         finally:
             call.trials.remove(order)
             if call.trials:
-                self.budget.queue.wake()
+                self.budget.queue.reorder()
             elif call.wait is not None and not call.wait.charged:
                 call.give_up()  # or it would take money for a trial that is left
         # The attempts are counted once, for the first trial that asked.
@@ -141,7 +139,7 @@ class LlmClient:
             call.pending_batch = self.batch.rounds.pending.get(call.request.key)
         if call.pending_batch:
             self.budget.readmit(call.order)
-        if self.budget.charged_usd.keys().isdisjoint(call.trials):  # none of them is admitted
+        if not self.budget.is_running(call.trials):
             self.calls.wait(call, Wait(NO_ROOM, blocked=True))
             await self.budget.admit(call.trials)
             call.wait = None
@@ -155,7 +153,6 @@ class LlmClient:
         return await self._attempts(call)
 
     async def _quarantine(self, call: Call) -> None:
-        """Quarantine the damaged rows of a call, and reload its valid attempts."""
         key = call.request.key
         for name in await self.cache.write(partial(self.cache.quarantine, key)):
             self.meter.damaged.append(name)
@@ -167,16 +164,45 @@ class LlmClient:
         call.attempts, call.earlier = [*earlier], len(earlier)
 
     async def _attempts(self, call: Call) -> ChatReply:
-        """Make attempts until one brings an answer."""
+        """Make attempts, with backoff, until one brings an answer."""
         try:
             return await self._attempt(call)
         except TryAgain as exc:
             failures = [exc]
-        return await self.retry.until_answered(call, failures, self._attempt)
+        # Only here, since it costs time and memory that most calls need not spend.
+        from tenacity import AsyncRetrying, retry_if_exception_type
+
+        async def next_attempt() -> ChatReply:
+            if failures:
+                raise failures.pop()
+            return await self._attempt(call)
+
+        again = AsyncRetrying(
+            retry=retry_if_exception_type(TryAgain),
+            wait=next_wait_s,
+            stop=lambda state: state.upcoming_sleep >= call.left_s,
+            sleep=partial(self._sleep, call),
+            reraise=True,
+        )
+        try:
+            return await again(next_attempt)
+        except TryAgain as exc:
+            raise self.endpoint.out_of_time(call, exc.delay_s or 0.0) from exc
+
+    async def _sleep(self, call: Call, seconds: float) -> None:
+        call.left_s -= seconds
+        until = datetime.now(UTC) + timedelta(seconds=seconds)
+        why = f"after {call.last_failure}"
+        self.calls.wait(call, Wait(why, until))
+        if seconds >= LONG_WAIT_S:
+            self.meter.notes.append(
+                f"{self.endpoint.driver}: {call.label.slot} waits until {until:%H:%M:%S} UTC {why}"
+            )
+        await asyncio.sleep(seconds)
+        call.wait = None
 
     async def _attempt(self, call: Call) -> ChatReply:
-        """Make one attempt: reserve, send, judge, finish."""
-        sender: Sender = self.direct
+        sender: DirectSender | BatchSender = self.direct
         if self.batch is not None and self.batch.takes(call):
             sender = self.batch
         label, key = call.label, call.request.key
@@ -188,7 +214,8 @@ class LlmClient:
             reservation = Reservation.resume(self.budget, call.order, key, label)
         else:
             call.wait = Wait(NO_MONEY, blocked=True)
-            reservation = await self.budget.reserve(call.trials, key, label)
+            is_probe = not self.endpoint.verified
+            reservation = await self.budget.reserve(call.trials, key, label, is_probe=is_probe)
         with closing(reservation):
             sent = await sender.send(call, reservation)
             usd = attempt_usd(sent, call.worst, self.endpoint, sender.price_factor)
@@ -208,10 +235,10 @@ class LlmClient:
         attempts, key = tuple(call.attempts), call.request.key
         if error is not None:
             keep = partial(self.cache.keep_attempts, key, attempts)
-            await reservation.settle(attempt, keep)  # before the error, which may end the run
+            await reservation.book(attempt, keep)  # before the error, which may end the run
             raise error
         answered = CachedCall(call.request, attempts)
-        kept = await reservation.settle(attempt, partial(self.cache.keep, answered))
+        kept = await reservation.book(attempt, partial(self.cache.keep, answered))
         self.calls.answered.add(key)
         if kept is not answered:  # an import has stored another reply first, which is used
             return self.recorded.read(kept, call.earlier)

@@ -11,8 +11,8 @@ import ssl
 from base64 import b64encode
 from collections.abc import Iterator, Mapping
 from contextlib import aclosing, suppress
-from dataclasses import asdict
 from functools import lru_cache
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 from urllib.request import getproxies_environment, proxy_bypass
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from aiohttp.client_proto import ResponseHandler
     from aiohttp.connector import Connection
 
+SLOT_FIELDS = ("condition", "decision", "repetition", "sample_set", "side")
 # Many servers and gateways echo one of these.
 ID_HEADERS = ("x-request-id", "x-client-request-id")
 MOST_BYTES = 16_000_000
@@ -103,7 +104,8 @@ class HttpTransport:
         headers = request.headers
         if self._sends_slot:
             # In the canonical form: the emulator's replies depend on it.
-            slot = json.dumps(asdict(request.slot), sort_keys=True, separators=(",", ":"))
+            values = dict(zip(SLOT_FIELDS, attrgetter(*SLOT_FIELDS)(request.slot), strict=True))
+            slot = json.dumps(values, separators=(",", ":"))
             headers = {**headers, SLOT_HEADER: slot, ATTEMPT_HEADER: str(attempt)}
         body = request.body.encode()
         return await self.ask("POST", request.path, headers, body, timeout_s=timeout_s)
@@ -129,8 +131,10 @@ class HttpTransport:
             async with asyncio.timeout(timeout_s):
                 reply = await self._carrier.handle_async_request(request)
                 async with aclosing(reply):
-                    self._refuse_others(reply, request_id)
-                    return await self._read(reply, most_bytes or self._most_bytes)
+                    headers = dict(reply.headers.items())  # httpx has their names in lower case
+                    self._refuse_others(headers, request_id)
+                    text = await self._read(reply, most_bytes or self._most_bytes)
+                    return RawReply(reply.status_code, headers, text)
         except TransportFailure:
             self.doubted = True
             raise
@@ -144,18 +148,18 @@ class HttpTransport:
         """Close all connections."""
         await self._carrier.aclose()
 
-    def _refuse_others(self, reply: httpx.Response, request_id: str) -> None:
+    def _refuse_others(self, headers: Mapping[str, str], request_id: str) -> None:
         """Raise TransportFailure where a reply echoes the id of another request."""
         self._echoes_ids = False
         for header in ID_HEADERS:
-            for part in reply.headers.get(header, "").split(","):
+            for part in headers.get(header, "").split(","):
                 echoed = part.strip()
                 self._echoes_ids |= echoed.startswith(self._id_prefix)
                 if echoed.startswith(self._id_prefix) and echoed != request_id:
                     why = "the server sent the answer to another request"
                     raise TransportFailure("wrong_answer", why)
 
-    async def _read(self, reply: httpx.Response, most_bytes: int) -> RawReply:
+    async def _read(self, reply: httpx.Response, most_bytes: int) -> str:
         body = bytearray()
         async for piece in reply.aiter_bytes():
             body += piece
@@ -165,16 +169,12 @@ class HttpTransport:
                     f"the reply is longer than {most_bytes / 1e6:g} MB (max_reply_mb)",
                     action="fail",
                 )
-        headers = dict(reply.headers.items())  # httpx has their names in lower case
         # JSON is UTF-8, whatever a header says. A provider may echo the key in an error, and no log
         # or database may contain it.
         text = body.decode("utf-8-sig", errors="replace")
-        if self._has_secrets:
-            text = self._mask(text)
-        return RawReply(reply.status_code, headers, text)
+        return self._mask(text) if self._has_secrets else text
 
     def _failure(self, error: Exception) -> TransportFailure:
-        """Return the TransportFailure for an error of the libraries."""
         # httpx reports refused, reset and cut connections alike; aiohttp's error is its cause.
         reason = self._mask(str(error)) or type(error).__name__
         cause = error if isinstance(error, aiohttp.ClientError) else error.__cause__ or error

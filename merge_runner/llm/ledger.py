@@ -16,12 +16,12 @@ import json
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, Protocol
 
 from merge_runner.errors import CacheFailed, RecordingError, UsageError
 from merge_runner.llm.cache_file import FILE
 from merge_runner.llm.durable import Execute, Rows
-from merge_runner.llm.store import CallStore
+from merge_runner.llm.store import CacheFile
 from merge_runner.records import Attempt
 
 TOLERANCE_USD = 1e-9  # sums of floats
@@ -109,10 +109,28 @@ class Spending:
         return ", ".join(f"{driver} up to {ratio:.2f} times as much" for driver, ratio in ratios)
 
 
-def scopes(store: CallStore) -> list[str]:
+def scopes(store: CacheFile) -> list[str]:
     """Return the names of all ledgers in a cache."""
     rows = store.rows("SELECT scope FROM spent UNION SELECT scope FROM open ORDER BY 1")
     return [scope for (scope,) in rows]
+
+
+def reasons(store: CacheFile, scope: str) -> list[dict[str, Any]]:
+    """Return a ledger's reservations by driver and outcome, with UTC times and one of the slots."""
+    names = ("driver", "outcome", "attempts", "usd", "first", "last", "slot")
+    return [dict(zip(names, row, strict=True)) for row in store.rows(_REASONS, scope)]
+
+
+class Coordinator(Protocol):
+    """Coordinator of a cluster, which reserves each attempt of a chunk before it is sent."""
+
+    async def reserve(self, key: str, usd: float, label: CallLabel) -> bool:
+        """Return whether an attempt is reserved; False if it exceeds the cap."""
+        ...
+
+    def report_cost(self, key: str, usd: float | None) -> None:
+        """Report what an attempt has cost; None: unknown."""
+        ...
 
 
 class Ledger:
@@ -123,12 +141,17 @@ class Ledger:
     has no name and keeps no record.
     """
 
-    is_shared_out = False  # a coordinator reserves each attempt first
-
-    def __init__(self, store: CallStore, scope: str, cap: Cap | None = None) -> None:
+    def __init__(
+        self,
+        store: CacheFile,
+        scope: str,
+        cap: Cap | None = None,
+        coordinator: Coordinator | None = None,
+    ) -> None:
         self.store = store
         self.scope = scope
         self.cap = cap
+        self.coordinator = coordinator
         self.spending = Spending()
         self.committed_usd = 0.0
         self._in_transaction_usd = 0.0  # as committed_usd; no read() of another thread changes it
@@ -192,14 +215,7 @@ class Ledger:
         self.committed_usd = self._in_transaction_usd
         return True
 
-    async def ask_coordinator(self, key: str, usd: float, label: CallLabel) -> bool:
-        """Return whether the coordinator reserves an attempt; True without a coordinator."""
-        return True
-
-    def report_cost(self, key: str, usd: float | None) -> None:
-        """Report to the coordinator what an attempt has cost; None: unknown."""
-
-    def settle(self, key: str, attempt: Attempt, driver: str, execute: Execute) -> None:
+    def book(self, key: str, attempt: Attempt, driver: str, execute: Execute) -> None:
         """Book the cost of an attempt; an operation.
 
         Its reservation stays where the cost is unknown.
@@ -252,11 +268,6 @@ class Ledger:
             execute(_PAY, (self.scope, *row))
         for row in opened:
             execute(_OPEN, (self.scope, *row))
-
-    def reasons(self) -> list[dict[str, Any]]:
-        """Return the reservations by driver and outcome, with times in UTC and one of the slots."""
-        names = ("driver", "outcome", "attempts", "usd", "first", "last", "slot")
-        return [dict(zip(names, r, strict=True)) for r in self.store.rows(_REASONS, self.scope)]
 
     def release(self) -> None:
         """Drop all reservations; no run may be live."""

@@ -3,8 +3,8 @@
 asyncio-throttle counts the requests. It polls for every waiter and keeps no order among them, so
 only the dispatcher calls it, and only when it has room: a turn that was taken early, and delayed by
 a pause, would be counted at the wrong time. Tokens are counted in a sliding window of a minute: an
-estimate at dispatch, settled to the actual usage afterwards. Each process counts for itself: where
-several use one key, the server refuses the excess, which is retried.
+estimate at dispatch, the actual usage afterwards. Each process counts for itself: where several use
+one key, the server refuses the excess, which is retried.
 """
 
 from __future__ import annotations
@@ -102,14 +102,14 @@ class Limiter:
             if self._dispatcher is None or self._dispatcher.done():
                 self._dispatcher = asyncio.create_task(self._dispatch())
             await turn.given
-        return None if self._tpm is None else partial(self._settle, turn)
+        return None if self._tpm is None else partial(self._correct, turn)
 
     def pause(self, seconds: float) -> None:
         """Dispatch nothing for a while: the server asked all on this key to wait."""
         now = asyncio.get_running_loop().time()
         self._pause.until = max(self._pause.until, now + seconds)
 
-    def _settle(self, turn: _Turn, tokens: int) -> None:
+    def _correct(self, turn: _Turn, tokens: int) -> None:
         """Replace the estimate of a turn by the tokens that its request used."""
         if asyncio.get_running_loop().time() - turn.dispatched_at < self._window_s:
             self._tokens_in_window += tokens - turn.tokens
@@ -117,7 +117,6 @@ class Limiter:
         self._changed.set()
 
     async def _dispatch(self) -> None:
-        """Serve the queue until it is empty."""
         loop = asyncio.get_running_loop()
         while self._waiting:
             turn = self._waiting[0]
@@ -127,7 +126,7 @@ class Limiter:
                 continue
             wait = self._blocked_for(turn, loop.time())
             if wait > 0:
-                # A new request, or a settlement, may change the head of the queue.
+                # A new request, or a correction, may change the head of the queue.
                 self._changed.clear()
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(wait):

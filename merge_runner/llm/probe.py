@@ -52,7 +52,6 @@ class Probe:
                 self._alone.release()
 
     def _note_wait(self, call: Call) -> None:
-        """Note that a probe has waited for LONG_WAIT_S."""
         driver, entry = self.endpoint.driver, self.endpoint.entry
         left = timedelta(seconds=entry.deadline_s - LONG_WAIT_S)
         last = f"after {call.last_failure}" if call.own_attempts else "nothing has come yet"

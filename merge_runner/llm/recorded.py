@@ -59,7 +59,7 @@ class RecordedReplies:
         """Derive the names that a reply may give its model."""
         self.own_names = frozenset({None, self.entry.id, *self.entry.aliases})
 
-    def decide(self, question: Question) -> Decision:
+    def answer(self, question: Question) -> Decision:
         """Return the decision of the recorded reply; raise ReplayMiss or CallFailed."""
         prompt = self.prompt(question)
         request = self.request(prompt, question.slot)
@@ -71,7 +71,7 @@ class RecordedReplies:
             raise ReplayMiss("no recorded reply", request)
         reply = self.read(recorded, len(recorded.attempts))
         self.count(reply)
-        return question.decide(prompt, reply)
+        return question.decision(prompt, reply)
 
     def prompt(self, question: Question) -> str:
         """Return the prompt of a question, or its older wording if only that is recorded."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.budget import Reservation
@@ -30,19 +30,6 @@ class Sent(NamedTuple):
     error: MergeRunnerError | None = None
 
 
-class Sender(Protocol):
-    """Sender of attempts at ``price_factor`` times the normal price."""
-
-    price_factor: float
-
-    async def send(self, call: Call, reservation: Reservation) -> Sent:
-        """Begin the reservation, send the next attempt of a call, and return its outcome.
-
-        Raises TrialSuspended where the money cannot be reserved.
-        """
-        ...
-
-
 @dataclass(slots=True)
 class DirectSender:
     """Sender of normal (synchronous) requests to one model, under its rate limits."""
@@ -54,13 +41,16 @@ class DirectSender:
     price_factor: float = 1.0
 
     async def send(self, call: Call, reservation: Reservation) -> Sent:
-        """Wait for a turn, begin the reservation, and send the attempt."""
+        """Wait for a turn, begin the reservation, send the next attempt, and return its outcome.
+
+        Raises TrialSuspended where the money cannot be reserved.
+        """
         # The wait comes first: a turn must be used at once, or the limits do not hold.
         call.wait = Wait("for a turn under the rate limits")
         # Providers count a request when they admit it: about four bytes a token, and the whole cap.
         estimate = (call.worst.input_tokens or 0) // 4 + self.entry.max_output_tokens
-        settle = await self.limiter.acquire(estimate, order=call.order)
-        if reservation.budget.ledger.is_shared_out:
+        correct = await self.limiter.acquire(estimate, order=call.order)
+        if reservation.budget.ledger.coordinator:
             call.wait = Wait("for the coordinator, which shares --max-cost out")
             await reservation.ask_coordinator()
         call.wait = None
@@ -78,8 +68,8 @@ class DirectSender:
         took_s = clock_s() - began_s
         call.left_s -= took_s
         usage = outcome.reading.usage
-        if settle is not None and usage.output_tokens is not None:
-            settle((usage.input_tokens or 0) + usage.output_tokens)
+        if correct is not None and usage.output_tokens is not None:
+            correct((usage.input_tokens or 0) + usage.output_tokens)
         if outcome.pause:
             self.limiter.pause(outcome.delay_s or backoff_s(len(call.own_attempts) + 1))
         return Sent(outcome, began, took_s)

@@ -14,7 +14,7 @@ import hashlib
 import os
 import sqlite3
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, closing
+from contextlib import AbstractContextManager, ExitStack, closing
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -85,12 +85,104 @@ Overlay = tuple[Mapping[str, CachedCall], "TemplateCounts"]
 """A recording: its entries by key, and their counts by request template."""
 
 
-class CallStore:
-    """Store of calls in a cache folder, read directly and written by a thread in groups.
+class CacheFile:
+    """Open file of a cache folder, read directly and written by a thread in groups.
 
     ``locks`` keep other live runs from asking the same model. ``write`` runs an operation in the
-    next durable transaction, and returns its future result.
+    next durable transaction, and returns its future result. ``closing`` closes what is opened with
+    the folder.
     """
+
+    def __init__(self, folder: Path, *, read_only: bool, allow_previous: bool) -> None:
+        """Open or make the folder; ``read_only`` changes nothing in it, and it must exist.
+
+        A folder of the previous format is upgraded, or read as it is if ``read_only`` and
+        ``allow_previous``. Raises UsageError for a folder that cannot be used.
+        """
+        self.folder = folder
+        self.locks = ModelLocks(folder)
+        self.closing = ExitStack()
+        self._writer = GroupWriter(self._run_each)
+        self.write = self._writer.write
+        self.summed: object = None  # the ledger that knows its sums in the transaction under way
+        try:
+            prepare(folder, read_only=read_only, allow_previous=allow_previous)
+            self._opened = self._file
+            self._one_query = Lock()
+            with ExitStack() as unless_opened:
+                self.reading = unless_opened.enter_context(closing(connect(folder / FILE)))
+                self.texts: Any = None if read_only else open_texts(folder)
+                unless_opened.pop_all()
+        except FAILURES as exc:
+            raise UsageError(f"the cache {folder} cannot be used: {exc}. {NEW_CACHE}") from exc
+
+    def rows(self, sql: str, *values: object) -> Rows:
+        """Return the rows of a query; raise CacheFailed, or RecordingError for invalid text."""
+        try:
+            with self._one_query:
+                return self.reading.execute(sql, values).fetchall()
+        except FAILURES as exc:
+            raise self.failure("read", exc) from exc
+
+    def run_now(self, operations: Sequence[Operation]) -> list[Any]:
+        """Run operations in one durable transaction, in this thread."""
+        try:
+            with self.texts.transact():
+                execute, self.summed = self.texts._sql, None
+                results = [operation(execute) for operation in operations]
+                if self._file != self._opened:
+                    raise FileNotFoundError("it is no longer there")
+                return results
+        except (diskcache.Timeout, *FAILURES) as exc:
+            # On a full disk SQLite rolls back itself, and diskcache's own attempt hides the reason.
+            hidden = exc.__context__ if isinstance(exc, sqlite3.Error) else None
+            raise self.failure("written", hidden or exc) from exc
+
+    def _run_each(self, operations: Sequence[Operation]) -> list[Any]:
+        """Run operations in one durable transaction; if that fails, each in its own.
+
+        The result of one that fails is its error.
+        """
+        try:
+            return self.run_now(operations)
+        except CacheFailed:
+            raise
+        except (MergeRunnerError, *DAMAGED) as exc:
+            alone = len(operations) == 1
+            return [exc] if alone else [self._run_each([operation])[0] for operation in operations]
+
+    def close(self) -> None:
+        """Close the folder and its recording, and free its locks."""
+        self.closing.close()
+        self._writer.close()
+        self.locks.close()
+        self.reading.close()  # first, since the last one to write ends the journal
+        if self.texts is not None:
+            close_texts(self.texts)
+
+    def failure(self, done: str, why: BaseException) -> CacheFailed | RecordingError:
+        """Return the error of a folder that cannot be used, or of invalid text."""
+        if "utf-8" in str(why).lower():  # the only trace in SQLite's message
+            return RecordingError("the recorded reply is damaged: it is no text")
+        reason = f"cannot be {done}: {str(why) or 'another program writes'}"
+        if self._file != self._opened:
+            reason = "was removed, moved or replaced while it was in use"
+        return CacheFailed(
+            f"the cache {self.folder} {reason}. When that is mended, or a copy of it put back, "
+            "run the same command again: what is in no cache is asked again"
+        )
+
+    @property
+    def _file(self) -> tuple[int, int] | None:
+        """Identity of the file in the folder, since SQLite goes on with a deleted one."""
+        with contextlib.suppress(OSError):
+            status = os.stat(self.folder / FILE)
+            return status.st_dev, status.st_ino
+        return None
+
+
+class CallStore(CacheFile):
+    """Recorded calls in a cache folder, and texts under other names."""
 
     def __init__(
         self,
@@ -100,34 +192,15 @@ class CallStore:
         read_only: bool = False,
         allow_previous: bool = False,
     ) -> None:
-        """Open or make the folder; ``overlay`` opens a recording, which takes precedence.
-
-        ``read_only`` changes nothing in the folder, which must exist. A folder of the previous
-        format is upgraded, or read as it is if ``read_only`` and ``allow_previous``. Raises
-        UsageError for a folder that cannot be used.
-        """
-        self.folder = folder
-        self.locks = ModelLocks(folder)
-        self._open_overlay, self._with_overlay = overlay, contextlib.ExitStack()
-        self._writer = GroupWriter(self._run_each)
-        self.write = self._writer.write
-        self.summed: object = None  # the ledger that knows its sums in the transaction under way
-        try:
-            prepare(folder, read_only=read_only, allow_previous=allow_previous)
-            self._opened = self._file
-            self._one_query = Lock()
-            with contextlib.ExitStack() as unless_opened:
-                self._reading = unless_opened.enter_context(closing(connect(folder / FILE)))
-                self._texts: Any = None if read_only else open_texts(folder)
-                unless_opened.pop_all()
-        except FAILURES as exc:
-            raise UsageError(f"the cache {folder} cannot be used: {exc}. {NEW_CACHE}") from exc
+        """Open or make the folder; ``overlay`` opens a recording, which takes precedence."""
+        super().__init__(folder, read_only=read_only, allow_previous=allow_previous)
+        self._open_overlay = overlay
 
     @cached_property
     def recording(self) -> Overlay:
         """The recording, opened on first use."""
         opened = self._open_overlay
-        return self._with_overlay.enter_context(opened()) if opened else ({}, {})
+        return self.closing.enter_context(opened()) if opened else ({}, {})
 
     def get(self, key: str, request: ChatRequest | None = None) -> CachedCall | None:
         """Return the entry of a call, checked against its ``request`` where that is given.
@@ -155,40 +228,13 @@ class CallStore:
         texts = {name: row for name, *row in rows if name is not None}
         if key in texts:
             return verified(key, text_of(*texts[key]), request), ()
-        earlier = _attempts(text_of(*texts[UNANSWERED + key])) if texts else ()
+        earlier = attempts_of(text_of(*texts[UNANSWERED + key])) if texts else ()
         begun = sorted(row for row in rows if row[0] is None and row[1] > len(earlier))
         unseen = (
             Attempt(number, "unknown", started_at=since, error=UNSEEN)
             for number, (*_, since) in enumerate(begun, len(earlier) + 1)
         )
         return None, (*earlier, *unseen)
-
-    def run_now(self, operations: Sequence[Operation]) -> list[Any]:
-        """Run operations in one durable transaction, in this thread."""
-        try:
-            with self._texts.transact():
-                execute, self.summed = self._texts._sql, None
-                results = [operation(execute) for operation in operations]
-                if self._file != self._opened:
-                    raise FileNotFoundError("it is no longer there")
-                return results
-        except (diskcache.Timeout, *FAILURES) as exc:
-            # On a full disk SQLite rolls back itself, and diskcache's own attempt hides the reason.
-            hidden = exc.__context__ if isinstance(exc, sqlite3.Error) else None
-            raise self._failure("written", hidden or exc) from exc
-
-    def _run_each(self, operations: Sequence[Operation]) -> list[Any]:
-        """Run operations in one durable transaction; if that fails, each in its own.
-
-        The result of one that fails is its error.
-        """
-        try:
-            return self.run_now(operations)
-        except CacheFailed:
-            raise
-        except (MergeRunnerError, *DAMAGED) as exc:
-            alone = len(operations) == 1
-            return [exc] if alone else [self._run_each([operation])[0] for operation in operations]
 
     def read(self, name: str) -> str | None:
         """Return the text under a name, or None; raise RecordingError where it is damaged."""
@@ -197,25 +243,16 @@ class CallStore:
 
     def replace(self, name: str, text: str, _: Execute) -> None:
         """Store a text under a name that is no call key, after a checksum; an operation."""
-        self._texts.set(name, _behind_checksum(text))
+        self.texts.set(name, _behind_checksum(text))
 
     def remove(self, name: str, _: Execute) -> None:
         """Delete the text under a name that is no call key; an operation."""
-        self._texts.delete(name)
+        self.texts.delete(name)
 
     def names(self, prefix: str) -> list[str]:
         """Return the names with a prefix; none is a call key."""
         rows = self.rows(_KEYS, prefix, prefix + chr(0x10FFFF))
         return [name.decode(errors="replace") for (name,) in rows]
-
-    def close(self) -> None:
-        """Close the folder and its recording, and free its locks."""
-        self._with_overlay.close()
-        self._writer.close()
-        self.locks.close()
-        self._reading.close()  # first, since the last one to write ends the journal
-        if self._texts is not None:
-            close_texts(self._texts)
 
     def keep(self, entry: CachedCall, execute: Execute) -> CachedCall:
         """Store an entry unless there is one, and return the stored one; an operation.
@@ -230,12 +267,8 @@ class CallStore:
                 self._quarantine_row(key, execute)
                 execute(_ADD, (key, text))
         if len(entry.attempts) > 1:
-            self._texts.delete(UNANSWERED + key)
+            self.texts.delete(UNANSWERED + key)
         return entry
-
-    def keep_attempts(self, key: str, attempts: Attempts, execute: Execute) -> None:
-        """Store the attempts of a call that has no answer yet; an operation."""
-        self.replace(UNANSWERED + key, ATTEMPTS.dump_json(attempts).decode(), execute)
 
     def _quarantine_row(self, name: str, execute: Execute) -> None:
         """Rename a damaged row and keep its content; an operation."""
@@ -248,37 +281,6 @@ class CallStore:
         text = self.read(key)
         return None if text is None else verified(key, text, request)
 
-    def _unanswered(self, key: str) -> Attempts:
-        return _attempts(self.read(UNANSWERED + key) or "[]")
-
-    def rows(self, sql: str, *values: object) -> Rows:
-        """Return the rows of a query; raise CacheFailed, or RecordingError for invalid text."""
-        try:
-            with self._one_query:
-                return self._reading.execute(sql, values).fetchall()
-        except FAILURES as exc:
-            raise self._failure("read", exc) from exc
-
-    def _failure(self, done: str, why: BaseException) -> CacheFailed | RecordingError:
-        """Return the error of a folder that cannot be used, or of invalid text."""
-        if "utf-8" in str(why).lower():  # the only trace in SQLite's message
-            return RecordingError("the recorded reply is damaged: it is no text")
-        reason = f"cannot be {done}: {str(why) or 'another program writes'}"
-        if self._file != self._opened:
-            reason = "was removed, moved or replaced while it was in use"
-        return CacheFailed(
-            f"the cache {self.folder} {reason}. When that is mended, or a copy of it put back, "
-            "run the same command again: what is in no cache is asked again"
-        )
-
-    @property
-    def _file(self) -> tuple[int, int] | None:
-        """Identity of the file in the folder, since SQLite goes on with a deleted one."""
-        with contextlib.suppress(OSError):
-            status = os.stat(self.folder / FILE)
-            return status.st_dev, status.st_ino
-        return None
-
 
 def both(first: Operation, then: Operation, execute: Execute) -> Any:  # noqa: ANN401 # of any
     """Run two operations as one, and return the result of the first."""
@@ -287,7 +289,8 @@ def both(first: Operation, then: Operation, execute: Execute) -> Any:  # noqa: A
     return result
 
 
-def _attempts(text: str) -> Attempts:
+def attempts_of(text: str) -> Attempts:
+    """Return the attempts in a text; raise RecordingError where it is damaged."""
     try:
         return ATTEMPTS.validate_json(text)
     except ValidationError as exc:

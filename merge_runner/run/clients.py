@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 
 from merge_runner.errors import UsageError
 from merge_runner.llm.batch.providers import SERVICES, batch_terms
-from merge_runner.llm.batch.rounds import Rounds
-from merge_runner.llm.batch.sender import BatchSender
+from merge_runner.llm.batch.rounds import BatchSender, Rounds
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.call import Calls

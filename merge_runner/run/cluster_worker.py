@@ -97,26 +97,21 @@ class Played:
             self.error, self.exit_code = _described(error), SweepStopped.exit_code
 
 
-class RemoteLedger(Ledger):
-    """Ledger of a chunk, whose attempts the coordinator reserves before they are sent.
+class RemoteCoordinator:
+    """Coordinator of a chunk, which reserves its attempts before they are sent.
 
     ``tell`` sends it ``"reserve"`` with an attempt's worst case, and then ``"cost"`` with its cost,
     each with the attempt's number.
     """
 
-    is_shared_out = True
-
-    def __init__(
-        self, store: ResponseCache, scope: str, cap: Cap | None, tell: Callable[..., object]
-    ) -> None:
-        super().__init__(store, scope, cap)
+    def __init__(self, tell: Callable[..., object]) -> None:
         self._tell = tell
         self._numbers = count(1)
         self._waiting: dict[int, asyncio.Future[bool]] = {}
         self._reserved: dict[str, tuple[int, CallLabel]] = {}  # a call has one attempt at a time
 
-    async def ask_coordinator(self, key: str, usd: float, label: CallLabel) -> bool:
-        """Let the coordinator reserve an attempt; False if that exceeds the cap."""
+    async def reserve(self, key: str, usd: float, label: CallLabel) -> bool:
+        """Return whether an attempt is reserved; False if it exceeds the cap."""
         number = next(self._numbers)
         answer = self._waiting[number] = asyncio.get_running_loop().create_future()
         try:
@@ -157,7 +152,7 @@ class WorkerRun:
     limiters: dict[float, dict[str, Limiter]] = field(default_factory=dict)
     plan: Plan | None = None
     # By the name of the chunk under way.
-    ledgers: dict[str, RemoteLedger] = field(default_factory=dict)
+    coordinators: dict[str, RemoteCoordinator] = field(default_factory=dict)
 
 
 def _state(run: str, worker: Worker) -> WorkerRun:
@@ -167,9 +162,9 @@ def _state(run: str, worker: Worker) -> WorkerRun:
 
 def answer(run: str, name: str, answers: Mapping[int, bool], *, dask_worker: Worker) -> None:
     """Give a chunk the coordinator's answers."""
-    ledger = _state(run, dask_worker).ledgers.get(name)
-    if ledger is not None:
-        ledger.answer(answers)
+    coordinator = _state(run, dask_worker).coordinators.get(name)
+    if coordinator is not None:
+        coordinator.answer(answers)
 
 
 def stop(run: str, *, dask_worker: Worker) -> None:
@@ -218,7 +213,7 @@ async def play_chunk(program: str, pickled: bytes, *, dask_worker: Worker) -> Pl
         try:
             return await _play(chunk, state, tell)
         finally:
-            state.ledgers.pop(chunk.name, None)
+            state.coordinators.pop(chunk.name, None)
 
 
 def _with_code(plan: Plan) -> Plan:
@@ -239,8 +234,8 @@ async def _play(chunk: Chunk, state: WorkerRun, tell: Callable[..., object]) -> 
     async with AsyncExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="merge-runner-")))
         replies = stack.enter_context(closing(ResponseCache(folder)))
-        ledger = RemoteLedger(replies, setup.plan.ledger, chunk.cap, tell)
-        state.ledgers[chunk.name] = ledger
+        coordinator = state.coordinators[chunk.name] = RemoteCoordinator(tell)
+        ledger = Ledger(replies, setup.plan.ledger, chunk.cap, coordinator)
         overruns = [(driver, 0, 0, ratio) for driver, ratio in chunk.overruns]
         replies.put_now(*chunk.recorded, [partial(ledger.share, "", overruns, [])])
         try:

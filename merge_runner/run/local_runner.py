@@ -160,7 +160,7 @@ class LocalRunner:
             return None
         finally:
             self._asking[order] -= 1
-        decision = question.decide(prompt, reply)
+        decision = question.decision(prompt, reply)
         if question.model not in self.first.valid:
             self.first.count(question.model, decision)
         return side, decision

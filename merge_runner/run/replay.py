@@ -46,7 +46,7 @@ class Replay:
     def play_one(self, spec: TrialSpec) -> TrialRecord:
         """Play a trial."""
         played = self._ahead.pop(spec.order, None)
-        return played or play_trial(self._trials.make(spec), self._decide)
+        return played or play_trial(self._trials.make(spec), self._answer)
 
     async def look_ahead(self, specs: Sequence[TrialSpec]) -> list[TrialRecord]:
         """Play trials until one has a recorded reply; return all if none has, else no trial.
@@ -78,5 +78,5 @@ class Replay:
     async def drain(self) -> None:
         """Do nothing: no call is in flight."""
 
-    def _decide(self, question: Question) -> Decision:
-        return self._models[question.model].decide(question)
+    def _answer(self, question: Question) -> Decision:
+        return self._models[question.model].answer(question)

@@ -36,7 +36,7 @@ def begin(left, right, condition="N_0_0", **scenario):
 
 
 def decide(question):
-    return question.decide(question.prompt, None)
+    return question.decision(question.prompt, None)
 
 
 def play(*drivers, **scenario):

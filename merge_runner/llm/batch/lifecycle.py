@@ -179,7 +179,7 @@ class Lifecycle:
         if exc.kind == "lost":
             raise exc
         if exc.kind == "again" and outcome == "not_created":
-            # It may exist all the same: the next run looks for it, and nothing is settled.
+            # It may exist all the same: the next run looks for it, and nothing is booked.
             raise ProviderDown(
                 f"{model}: no batch can be submitted ({exc}): nothing else is asked. When the "
                 "service answers again, run the same command"

@@ -69,6 +69,7 @@ class BatchStatus:
     failure: BatchFailed | None = None
 
 
+@dataclass
 class BatchService(ABC):
     """Batch mode of one model at one endpoint; every request raises BatchFailed.
 
@@ -88,10 +89,9 @@ class BatchService(ABC):
     next_member: ClassVar[str]
     mark_member: ClassVar[str]
 
-    def __init__(self, transport: HttpTransport, endpoint: Endpoint, wire: WireFormat) -> None:
-        self.transport = transport
-        self.endpoint = endpoint
-        self.wire = wire
+    transport: HttpTransport
+    endpoint: Endpoint
+    wire: WireFormat
 
     def line(self, request: ChatRequest) -> bytes:
         """Return the line of a request, with its hashed body."""
@@ -121,7 +121,7 @@ class BatchService(ABC):
             exc.sent = False  # an uploaded file is not a batch
             raise
         created = await self._ask("POST", *self._creation(requests, file, mark))
-        return self._batch_id(json_object(created))
+        return batch_id_of(json_object(created))
 
     async def find(self, mark: str) -> str | None:
         """Return the id of the batch with this mark."""
@@ -130,16 +130,18 @@ class BatchService(ABC):
         while cursor is not None and cursor not in seen:  # ends where a server knows no pages
             seen.add(cursor)
             after = f"&{self.cursor}={quote(cursor, safe='')}" if cursor else ""
-            page = await self._get_json(f"{self.path}?{self.pages}{after}")
+            listed = await self._ask("GET", f"{self.path}?{self.pages}{after}", gone=NO_BATCH)
+            page = json_object(listed)
             cursor = as_text(page.get(self.next_member))
             for batch in as_dicts(page.get(self.list_member)):
                 if as_dict(batch.get("metadata")).get(self.mark_member) == mark:
-                    return self._batch_id(batch)
+                    return batch_id_of(batch)
         return None
 
     async def status(self, batch_id: str) -> BatchStatus:
         """Return the status of a batch."""
-        return self._status_of(await self._get_json(f"{self.path}/{batch_id}"))
+        described = await self._ask("GET", f"{self.path}/{batch_id}", gone=NO_BATCH)
+        return self._status_of(json_object(described))
 
     @abstractmethod
     def _status_of(self, batch: dict[str, Any]) -> BatchStatus:
@@ -206,12 +208,6 @@ class BatchService(ABC):
         failure.sent |= self.takes_mark and raw.status >= 500
         raise failure
 
-    async def _get_json(self, path: str) -> dict[str, Any]:
-        return json_object(await self._ask("GET", path, gone=NO_BATCH))
-
-    def _batch_id(self, batch: dict[str, Any]) -> str:
-        return id_of({"id": batch.get("id", batch.get("name"))}).rpartition("/")[2]
-
 
 def json_object(raw: RawReply) -> dict[str, Any]:
     """Return the body of a reply as a JSON object; raise BatchFailed."""
@@ -226,3 +222,8 @@ def id_of(reply: Mapping[str, Any], member: str = "id") -> str:
     if not isinstance(value, str) or not ID.fullmatch(value):
         raise BatchFailed("again", f"the reply cannot be used: it has no {member} of a known form")
     return value
+
+
+def batch_id_of(batch: Mapping[str, Any]) -> str:
+    """Return the id of a batch by its server's description; raise BatchFailed."""
+    return id_of({"id": batch.get("id", batch.get("name"))}).rpartition("/")[2]

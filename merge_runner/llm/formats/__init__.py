@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from merge_runner.llm.formats.anthropic import AnthropicMessages
-from merge_runner.llm.formats.gemini import GeminiGenerateContent
-from merge_runner.llm.formats.responses import OpenAIResponses
+from merge_runner.llm.formats.others import (
+    AnthropicMessages,
+    GeminiGenerateContent,
+    OpenAIResponses,
+)
 from merge_runner.llm.formats.server_error import ServerError
 from merge_runner.llm.formats.wire import (
     OpenAIChat,

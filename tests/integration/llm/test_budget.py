@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from merge_runner.errors import CacheFailed, RecordingError, TrialSuspended, UsageError
 from merge_runner.llm.attempts import Meter
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.ledger import CallLabel, Cap, Ledger
+from merge_runner.llm.ledger import CallLabel, Cap, Ledger, reasons
 from merge_runner.llm.store import CachedCall
 from merge_runner.records import Attempt, Slot, make_request
 from merge_runner.run.local_runner import LocalRunner
@@ -64,7 +64,7 @@ async def attempt(budget, trial, worst, actual, turns=0, model="m"):
         await paid.begin(1)
         for _ in range(turns):
             await asyncio.sleep(0)
-        await paid.settle(tried(actual), nothing)
+        await paid.book(tried(actual), nothing)
 
 
 def nothing(execute):
@@ -189,6 +189,16 @@ async def test_the_ledger_refuses_what_two_processes_reserved_at_once(ledger, ca
     assert both[1].ledger.read().committed_usd == 0.75
 
 
+async def test_what_another_process_has_freed_meanwhile_suspends_no_trial(ledger, cache):
+    other = budget_of(ledger, 1.0)
+    with contextlib.closing(await set_aside(other, 1, 0.75)) as paid:
+        await paid.begin(1)
+        budget = budget_of(Ledger(cache, ledger.scope), 1.0, each(0.5))
+        await paid.book(tried(0.25), nothing)
+    await budget.admit([2])
+    assert (await set_aside(budget, 2, 0.5)).usd == 0.5
+
+
 async def test_a_running_trial_never_waits_for_the_admission_of_another_that_shares_its_call(
     ledger,
 ):
@@ -200,11 +210,11 @@ async def test_a_running_trial_never_waits_for_the_admission_of_another_that_sha
     await asyncio.sleep(0)
     assert not admitted.done()
     shared.append(1)
-    budget.queue.wake()
+    budget.queue.reorder()
     await asyncio.wait_for(admitted, 5)
     assert not ahead.done()
     paid = await budget.reserve(shared, "key", asked(1.5))  # of the money that is kept for 1
-    assert (paid.trial, budget.charged_usd) == (1, {1: 1.5})
+    assert (paid.trial, budget.running) == (1, {1: 0.5})
     paid.close()
     budget.leave(1)
     await ahead
@@ -214,11 +224,11 @@ LABEL = asked(1.0)
 # In each a running trial shares a call: who begins, which calls wait, who joins them, which go on.
 SHARED = {
     "an admission behind that of an older trial": (
-        14.0, {7: 0.0}, [("admit", [3]), ("admit", [5])], [(1, 7)], {1}),
+        14.0, [7], [("admit", [3]), ("admit", [5])], [(1, 7)], {1}),
     "an attempt that a trial joins which does not run": (
-        9.5, {5: 0.0, 7: 0.0}, [("reserve", [7]), ("reserve", [5])], [(0, 3)], {1}),
+        9.5, [5, 7], [("reserve", [7]), ("reserve", [5])], [(0, 3)], {1}),
     "an admission behind an attempt": (
-        9.5, {5: 0.0, 7: 0.0}, [("admit", [3]), ("reserve", [7])], [(0, 5)], {0}),
+        9.5, [5, 7], [("admit", [3]), ("reserve", [7])], [(0, 5)], {0}),
 }  # fmt: skip
 
 
@@ -229,7 +239,7 @@ async def test_a_call_of_a_running_trial_has_its_place_whatever_it_waits_for(
     ledger, cap, running, calls, joined, go_on
 ):
     budget = budget_of(ledger, cap, each(10.0))
-    budget.charged_usd.update(running)
+    budget.running.update(dict.fromkeys(running, 10.0))
     budget._spent_before = True
     tasks = []
     for number, (wait, trials) in enumerate(calls):
@@ -239,7 +249,7 @@ async def test_a_call_of_a_running_trial_has_its_place_whatever_it_waits_for(
         for call, trial in joined:
             if call == number:
                 trials.append(trial)
-                budget.queue.wake()
+                budget.queue.reorder()
     done, _ = await asyncio.wait(tasks, timeout=0.1)
     assert {tasks.index(task) for task in done} == go_on
     for task in tasks:
@@ -277,7 +287,7 @@ async def test_an_attempt_takes_the_place_of_the_oldest_running_trial_that_share
     await asyncio.sleep(0)
     assert not waiting.done()
     shared.append(1)
-    budget.queue.wake()
+    budget.queue.reorder()
     assert (await asyncio.wait_for(waiting, 5)).trial == 1
 
 
@@ -309,25 +319,25 @@ async def test_spending_that_nobody_can_have_spent_is_not_believed(ledger, cache
 O3 = CallLabel("o3 at gateway", "L_4_0 rep 1 left, decision 3", 0.25)
 
 
-async def test_what_is_set_aside_is_told_with_the_reason_of_each_attempt(ledger):
+async def test_what_is_set_aside_is_told_with_the_reason_of_each_attempt(ledger, cache):
     retried = enumerate(("timeout", "connection_lost", "server_error"), 1)
     for key, number, outcome in (("a", 1, "timeout"), *(("b", *one) for one in retried)):
         now(ledger, ledger.reserve, key, number, 0.25, O3)
         actual = 0.0 if outcome == "connection_lost" else None
         ended = Attempt(number, outcome, cost_usd=actual)
-        now(ledger, ledger.settle, key, ended, O3.driver)
+        now(ledger, ledger.book, key, ended, O3.driver)
     now(ledger, ledger.reserve, "d", 1, 0.125, O3)
     now(ledger, ledger.reserve, "paid", 1, 0.25, O3)
-    now(ledger, ledger.settle, "paid", tried(0.1), O3.driver)
-    reasons = ledger.reasons()
-    assert [(r["outcome"], r["attempts"], r["usd"]) for r in reasons] == [
+    now(ledger, ledger.book, "paid", tried(0.1), O3.driver)
+    why = reasons(cache, ledger.scope)
+    assert [(r["outcome"], r["attempts"], r["usd"]) for r in why] == [
         ("timeout", 2, 0.5),
         ("server_error", 1, 0.25),
         ("in flight", 1, 0.125),
     ]
-    assert sum(r["usd"] for r in reasons) == pytest.approx(ledger.read().reserved_usd)
-    assert {(r["driver"], r["slot"]) for r in reasons} == {(O3.driver, O3.slot)}
-    assert reasons[0]["first"] <= reasons[0]["last"]
+    assert sum(r["usd"] for r in why) == pytest.approx(ledger.read().reserved_usd)
+    assert {(r["driver"], r["slot"]) for r in why} == {(O3.driver, O3.slot)}
+    assert why[0]["first"] <= why[0]["last"]
 
 
 async def test_what_is_released_counts_no_longer(ledger, cache):
@@ -336,20 +346,20 @@ async def test_what_is_released_counts_no_longer(ledger, cache):
         await set_aside(budget_of(ledger, 1.0), 1, 0.5)
     ledger.release()
     again = Ledger(cache, ledger.scope)
-    assert (again.spending.committed_usd, again.reasons()) == (0, [])
+    assert (again.spending.committed_usd, reasons(cache, again.scope)) == (0, [])
     await set_aside(budget_of(again, 1.0), 1, 0.5)
 
 
-def test_what_is_settled_counts_at_once_whoever_has_reserved_or_released_it(ledger, cache):
+def test_what_is_booked_counts_at_once_whoever_has_reserved_or_released_it(ledger, cache):
     other = Ledger(cache, "another sweep")
     for key in ("line", "released", "own"):
         now(other, other.reserve, key, 1, 0.25, O3)
-    now(ledger, ledger.settle, "line", tried(0.125), O3.driver)
+    now(ledger, ledger.book, "line", tried(0.125), O3.driver)
     assert (ledger.committed_usd, other.read().committed_usd) == (0, 0.625)
-    now(other, other.settle, "own", tried(0.125), O3.driver)
+    now(other, other.book, "own", tried(0.125), O3.driver)
     assert other.committed_usd == other.read().committed_usd == 0.5
     other.release()
-    now(other, other.settle, "released", tried(0.0625), O3.driver)
+    now(other, other.book, "released", tried(0.0625), O3.driver)
     assert other.committed_usd == other.read().committed_usd == 0.3125
 
 
@@ -358,7 +368,7 @@ async def test_a_task_s_share_gives_way_to_what_the_task_has_spent_and_open(ledg
     task = Ledger(cache, "task")
     for key in ("a", "b"):
         now(task, task.reserve, key, 1, 0.25, O3)
-    now(task, task.settle, "a", tried(0.5), O3.driver)
+    now(task, task.book, "a", tried(0.5), O3.driver)
     now(ledger, ledger.reserve, "task 1", 1, 2.0, O3)
     now(ledger, ledger.share, "task 1", *task.rows())
     assert ledger.read() == task.read()
@@ -367,7 +377,7 @@ async def test_a_task_s_share_gives_way_to_what_the_task_has_spent_and_open(ledg
     cache.close()
 
 
-@pytest.mark.parametrize("fails", ["keep", "settle"])
+@pytest.mark.parametrize("fails", ["keep", "book"])
 async def test_a_reply_and_its_cost_are_kept_together_or_not_at_all(ledger, cache, fails):
     named = dict.fromkeys(("provider", "endpoint", "model", "path"), "openai")
     slot = Slot("N_0_0", 1, "left", 0, 0)
@@ -375,7 +385,7 @@ async def test_a_reply_and_its_cost_are_kept_together_or_not_at_all(ledger, cach
     answer = Attempt(1, "ok", 200, cost_usd=0.125, reply="{}")
     operations = {
         "keep": partial(cache.keep, CachedCall(request, (answer,))),
-        "settle": partial(ledger.settle, request.key, answer, O3.driver),
+        "book": partial(ledger.book, request.key, answer, O3.driver),
     }
 
     def raising(execute):
@@ -406,7 +416,7 @@ async def test_after_a_reply_that_cost_more_than_its_worst_case_as_much_is_set_a
     budget = budget_of(ledger, 10.0)
     with contextlib.closing(await budget.reserve([1], "key", O3)) as paid:
         await paid.begin(1)
-        await paid.settle(tried(0.75), nothing)
+        await paid.book(tried(0.75), nothing)
     assert (ledger.spending.spent_usd, ledger.spending.overrun_usd) == (0.75, 0.5)
     assert ledger.spending.largest_overruns == "o3 at gateway up to 3.00 times as much"
     next_run = budget_of(Ledger(cache, ledger.scope), 10.0)
@@ -415,7 +425,7 @@ async def test_after_a_reply_that_cost_more_than_its_worst_case_as_much_is_set_a
         assert paid.usd == 0.75
         await paid.begin(1)
         # A reply within what is now set aside does not count as another overrun of it.
-        await paid.settle(tried(0.5), nothing)
+        await paid.book(tried(0.5), nothing)
     assert ledger.spending.overruns[O3.driver] == 3
 
 
@@ -457,7 +467,7 @@ async def test_however_an_attempt_ends_its_money_ends_in_the_right_place(
             if begun:
                 await paid.begin(1)
             if tried:
-                await paid.settle(tried, nothing)
+                await paid.book(tried, nothing)
             raise error("whatever")
 
     with pytest.raises(error):

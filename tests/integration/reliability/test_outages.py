@@ -169,7 +169,7 @@ async def test_nobody_listens(merge_runner, tmp_path):
 
 
 async def test_waits_are_told(merge_runner, tmp_path, monkeypatch):
-    monkeypatch.setattr("merge_runner.llm.retry.LONG_WAIT_S", 0.5)
+    monkeypatch.setattr("merge_runner.llm.client.LONG_WAIT_S", 0.5)
 
     async def middle(request, handler):
         if server.requests > 1:

@@ -23,11 +23,11 @@ import pytest
 
 from merge_runner.errors import SweepStopped, UsageError
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.ledger import CallLabel, Ledger
+from merge_runner.llm.ledger import CallLabel, Ledger, reasons
 from merge_runner.records import SLOT_HEADER, ReplayMiss
 from merge_runner.run.cluster_assignment import Assignment
 from merge_runner.run.cluster_connection import connected
-from merge_runner.run.cluster_worker import Chunk, Played, RemoteLedger
+from merge_runner.run.cluster_worker import Chunk, Played, RemoteCoordinator
 from tests.support.cluster import SIX, SMALL, all_held, ended, held_from, repetition_of, workers_of
 from tests.support.crossed_study import MODEL
 from tests.support.gate import HANGS_S, Gate
@@ -70,11 +70,9 @@ BEGIN SELECT RAISE(ABORT, 'the disk is full'); END
 
 
 @in_virtual_time
-async def test_a_coordinator_that_says_nothing_ends_its_workers_tasks(tmp_path):
-    with closing(ResponseCache(tmp_path)) as cache:
-        ledger = RemoteLedger(cache, "baseline", None, lambda *_: None)
-        with pytest.raises(SweepStopped, match="the coordinator has said nothing for 300 s"):
-            await ledger.ask_coordinator("a key", 1.0, CallLabel())
+async def test_a_coordinator_that_says_nothing_ends_its_workers_tasks():
+    with pytest.raises(SweepStopped, match="the coordinator has said nothing for 300 s"):
+        await RemoteCoordinator(lambda *_: None).reserve("a key", 1.0, CallLabel())
     assert now_s() == 300
 
 
@@ -89,8 +87,8 @@ async def test_an_attempt_whose_event_is_lost_asks_again_and_is_reserved_once(
         events.append((*event[:-1], astuple(event[-1])))
 
     with closing(ResponseCache(tmp_path)) as cache:
-        ledger, worker = Ledger(cache, "baseline"), RemoteLedger(cache, "", None, tell)
-        asking = asyncio.create_task(worker.ask_coordinator("a key", 1.0, CallLabel("o3")))
+        ledger, worker = Ledger(cache, "baseline"), RemoteCoordinator(tell)
+        asking = asyncio.create_task(worker.reserve("a key", 1.0, CallLabel("o3")))
         while len(events) < 4:
             await asyncio.sleep(0.01)
         for late in (events[1:3], events[:1]):
@@ -271,7 +269,8 @@ def test_the_share_of_a_task_stays_reserved_until_the_task_is_kept(tmp_path):
         spending = Ledger(cache, "baseline").read()
         assert (spending.spent_usd, spending.reserved_usd, spending.open_attempts) == (1.5, 5.5, 2)
         assert spending.overruns == {"o3": 2.0}
-        assert [reason["driver"] for reason in ledger.reasons()] == ["Dask worker tcp://1", "o3"]
+        why = reasons(cache, ledger.scope)
+        assert [reason["driver"] for reason in why] == ["Dask worker tcp://1", "o3"]
 
 
 async def test_a_coordinator_that_is_killed_takes_its_workers_along_and_goes_on(

@@ -42,7 +42,7 @@ def ask(*replies, seen=SEEN, variant="baseline", begins=0, **scenario):
         question = driver.decide(seen, number)
         assert (question.model, question.slot) == ("model", replace(SLOT, decision=number))
         answer = chat_reply(reply) if isinstance(reply, str) else reply
-        yield question, question.decide(question.prompt, answer)
+        yield question, question.decision(question.prompt, answer)
 
 
 def decide(*replies, **how):

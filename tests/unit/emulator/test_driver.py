@@ -53,7 +53,7 @@ def play(condition, repetition):
 
     def decide(question):
         text = answer(question.prompt, question.slot)
-        return question.decide(question.prompt, ChatReply(text, "ok", None, (), earlier=0))
+        return question.decision(question.prompt, ChatReply(text, "ok", None, (), earlier=0))
 
     spec = spec_of(condition, repetition=repetition, variant="baseline")
     model = LanguageModel("emulator", {"baseline": prompt_of("baseline")})

@@ -17,7 +17,7 @@ from merge_runner.llm.ledger import CallLabel
 from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.llm.store import CachedCall
 from merge_runner.records import Attempt, CallFailed, ReplayMiss, Usage
-from merge_runner.run.cluster_worker import RemoteLedger
+from merge_runner.run.cluster_worker import RemoteCoordinator
 from tests.support.clients import PRICE, answer, begun, error, raw, slot, ticks
 from tests.support.virtual_time import now_s
 
@@ -149,7 +149,7 @@ async def test_a_damaged_reply_is_told_set_aside_and_asked_again(make, cache):
         damaged = stock[key] = stock[key].replace("old", "odd")
     client = make(answer("new"))
     with pytest.raises(CallFailed, match=key) as caught:  # a replay asks nothing again
-        client.recorded.decide(question())
+        client.recorded.answer(question())
     assert caught.value.request.key == key
     assert (await client.ask("prompt", slot())).text == "new"
     assert client.meter.damaged == [key]
@@ -315,11 +315,10 @@ async def test_drain_gives_up_calls_that_wait_for_their_turn(make):
 
 
 @pytest.mark.parametrize("drains", [False, True])
-async def test_a_call_that_waits_for_its_coordinator_can_be_given_up(make, cache, drains):
+async def test_a_call_that_waits_for_its_coordinator_can_be_given_up(make, drains):
     client, events = make(answer(), price=PRICE), []
-    client.budget.ledger = RemoteLedger(
-        cache, "test", None, lambda *event: events.append(event[:2])
-    )
+    tell = RemoteCoordinator(lambda *event: events.append(event[:2]))
+    client.budget.ledger.coordinator = tell
     asked = await begun(client.ask("prompt", slot()))
     (waits,) = client.calls.waits
     assert "coordinator" in waits.what
@@ -475,10 +474,10 @@ async def test_a_limit_longer_than_the_deadline_ends_the_run_and_an_outage_its_c
 async def test_a_replay_misses_what_is_not_recorded(make):
     client = make(answer("recorded"))
     await client.ask("prompt", slot())
-    prompt, reply = client.recorded.decide(question())
+    prompt, reply = client.recorded.answer(question())
     assert (prompt, reply.text, reply.cached) == ("prompt", "recorded", True)
     with pytest.raises(ReplayMiss) as caught:
-        client.recorded.decide(question(repetition=2))
+        client.recorded.answer(question(repetition=2))
     assert caught.value.request.slot == slot(2)
     assert (client.meter.calls_live, client.meter.calls_cached) == (1, 1)
 
@@ -499,7 +498,7 @@ def test_an_answer_that_an_earlier_version_kept_is_read_by_the_rules_of_now(make
     recorded = make(None).recorded
     kept = Attempt(1, "ok", http_status=200, reply=body.body)
     cache.put_now([CachedCall(recorded.request("prompt", slot()), (kept,))], [])
-    _, reply = recorded.decide(question())
+    _, reply = recorded.answer(question())
     assert (reply.outcome, reply.attempts[-1].outcome) == ("truncated", "truncated")
     assert reply.attempts[-1].usage == Usage(10, output_tokens=5), "it was kept without"
 

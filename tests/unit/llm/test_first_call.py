@@ -207,3 +207,15 @@ async def test_where_a_model_has_answered_before_one_refused_prompt_does_not_end
     await changed.calls.drain()
     await asyncio.gather(*tasks, return_exceptions=True)
     assert len(changed.direct.transport.sent) == 3
+
+
+async def test_a_first_call_takes_the_money_that_is_kept_for_a_trial_that_waits_for_it(begin):
+    """Two attempts of unknown cost leave no money beside that of the older trial."""
+    lost = TransportFailure("timeout", "no reply")
+    client = begin(lost, lost, answer(), price=PRICE, cap=0.0032)
+    client.budget.trial_usd = lambda _: 0.001
+    await client.budget.admit([0])
+    first = await begun(client.ask("prompt", slot(), order=1))
+    older = await begun(client.ask("prompt", slot(2), order=0))
+    assert [reply.text for reply in await asyncio.gather(first, older)] == ["M", "M"]
+    assert now_s() < 60

@@ -27,11 +27,11 @@ class Queue:
         return task
 
     async def _ask(self, name, tokens, order):
-        settle = await self.limiter.acquire(tokens, order=order)
+        correct = await self.limiter.acquire(tokens, order=order)
         self.names.append(name)
         self.times.append(now_s())
         self.tokens.append(tokens)
-        return settle
+        return correct
 
     async def all_served(self):
         await asyncio.gather(*self.tasks)
@@ -135,18 +135,18 @@ async def test_a_heavy_request_at_the_head_is_not_overtaken():
     assert queue.names == ["filling", "heavy", "light", "lighter"]
 
 
-async def test_settling_lower_frees_tokens_for_those_who_wait():
+async def test_correcting_lower_frees_tokens_for_those_who_wait():
     queue = Queue(Limiter(tpm=100))
-    settle = await queue.ask("first", 90)
+    correct = await queue.ask("first", 90)
     waiting = queue.ask("second", 50)
     await ticks()
     assert not waiting.done()
-    settle(50)
+    correct(50)
     await queue.all_served()
     assert queue.times == [0, 0]
 
 
-async def test_settling_higher_holds_others_back():
+async def test_correcting_higher_holds_others_back():
     queue = Queue(Limiter(tpm=100))
     (await queue.ask("first", 10))(80)
     queue.ask("second", 50)
@@ -154,13 +154,13 @@ async def test_settling_higher_holds_others_back():
     assert queue.times == [0, MINUTE]
 
 
-async def test_settling_after_the_window_changes_nothing():
+async def test_correcting_after_the_window_changes_nothing():
     queue = Queue(Limiter(tpm=100))
-    settle = await queue.ask("first", 50)
+    correct = await queue.ask("first", 50)
     await asyncio.sleep(MINUTE)
     await queue.ask("second", 50)
-    settle(0)
-    settle(100)
+    correct(0)
+    correct(100)
     queue.ask("third", 50)
     queue.ask("fourth", 1)
     await queue.all_served()
@@ -172,14 +172,14 @@ async def test_settling_after_the_window_changes_nothing():
     st.lists(st.tuples(st.integers(0, 100), st.integers(0, 100), st.integers(0, 90)), max_size=20)
 )
 @in_virtual_time
-async def test_settled_tokens_are_what_counts(asked):
-    """With every request settled at once, the actual tokens alone fill the window."""
+async def test_corrected_tokens_are_what_counts(asked):
+    """With every request corrected at once, the actual tokens alone fill the window."""
     queue = Queue(Limiter(tpm=100))
     times, actual = [], []
     for estimate, share, pause in asked:
-        settle = await queue.ask(tokens=estimate)
+        correct = await queue.ask(tokens=estimate)
         used = estimate * share // 100
-        settle(used)
+        correct(used)
         times.append(now_s())
         actual.append(used)
         await asyncio.sleep(pause)

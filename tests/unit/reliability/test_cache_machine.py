@@ -131,11 +131,11 @@ class CacheMachine(RuleBasedStateMachine):
         question = data.draw(st.sampled_from(sorted(calls)))
         return question, *calls.pop(question)
 
-    def settled(self, paid, attempt, keep):
-        async def settle():
-            return await paid.settle(attempt, keep)
+    def booked(self, paid, attempt, keep):
+        async def book():
+            return await paid.book(attempt, keep)
 
-        return self.wait(settle())
+        return self.wait(book())
 
     @precondition(in_flight)
     @rule(data=st.data(), cost=costs)
@@ -146,7 +146,7 @@ class CacheMachine(RuleBasedStateMachine):
         reply = f'{{"text": "ä {self.made}"}}'
         attempts.append(Attempt(len(attempts) + 1, "ok", 200, reply=reply, cost_usd=float(cost)))
         entry = CachedCall(REQUESTS[question], tuple(attempts))
-        kept = self.settled(paid, attempts[-1], partial(cache.keep, entry))
+        kept = self.booked(paid, attempts[-1], partial(cache.keep, entry))
         paid.close()
         assert kept == entry
         self.answered[question] = entry
@@ -161,7 +161,7 @@ class CacheMachine(RuleBasedStateMachine):
         told = float(cost) if known else None
         attempts.append(Attempt(len(attempts) + 1, "server_error", 500, cost_usd=told))
         key = REQUESTS[question].key
-        self.settled(paid, attempts[-1], partial(cache.keep_attempts, key, tuple(attempts)))
+        self.booked(paid, attempts[-1], partial(cache.keep_attempts, key, tuple(attempts)))
         paid.close()
         self.tried[question] = tuple(attempts)
 

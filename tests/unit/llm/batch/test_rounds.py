@@ -14,8 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from merge_runner.errors import CacheFailed, EndpointRefused, ProviderDown, QuotaExhausted
-from merge_runner.llm.batch.rounds import Rounds
-from merge_runner.llm.batch.sender import BatchSender
+from merge_runner.llm.batch.rounds import BatchSender, Rounds
 from merge_runner.llm.batch.service import BatchFailed, BatchStatus
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.formats import FORMATS
@@ -486,7 +485,7 @@ async def test_a_run_that_asks_singly_waits_for_what_is_in_a_batch(cache, servic
     assert later.alone.asked == [3]
 
 
-async def test_another_sweeps_batch_is_settled_in_that_sweeps_ledger(cache, service):
+async def test_another_sweeps_batch_is_booked_in_that_sweeps_ledger(cache, service):
     first = await left_behind(cache, service, repetitions=2, scope="first")
     second = Run(cache, service, scope="second")
     assert texts(await second.ask(2)) == ["batched 1", "batched 2"]
