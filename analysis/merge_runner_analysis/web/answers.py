@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 OF = " of"  # behind a column that counts: all of which it counts some
 FOUND = 3  # findings of a run that its page shows
 COUNT = "trials"  # by this name the number of trials is kept
+TABLES = {"table": 1, "comparison": 2}  # requests of tables, and how many names they have
 Request = tuple[str, ...]
 """``table NAME [SWEEP CONDITION]``, ``comparison GROUP GROUP SWEEP CONDITION``,
 ``cell TABLE ROW COLUMN SWEEP CONDITION``, ``figure NAME FORM``, ``digest``, ``audit``."""
@@ -44,23 +45,21 @@ def answer(db: Path, request: Request) -> dict[str, Any]:
 
 def kept_answer(db: Path, request: Request) -> dict[str, Any] | None:
     """Return a table that is kept beside the database, at once; None where it is not."""
-    match request:
-        case ["table", name, *part]:
-            pass
-        case ["comparison", first, second, *part]:
-            name = _name_of(first, second)
-        case _:
-            return None
-    state = present_state(db)
-    tables = finished(db, state, _selected(*part).key(db), [name])
+    if request[0] not in TABLES:
+        return None
+    (name, selection), state = _kept_as(*request), present_state(db)
+    tables = finished(db, state, selection.key(db), [name])
     counts = finished(db, state, "", [COUNT])
     if not tables or not counts:
         return None
     return {"counted": int(counts[COUNT]), "table": tables[name]}
 
 
-def _name_of(first: str, second: str) -> str:
-    return f"comparison {first} {second}"
+def _kept_as(kind: str, *named: str) -> tuple[str, Selection]:
+    """Return the name of a requested table in the file of finished ones, and its trials."""
+    names, part = named[: TABLES[kind]], named[TABLES[kind] :]
+    name = names[0] if kind == "table" else " ".join((kind, *names))
+    return name, _selected(*part)
 
 
 def _selected(sweep: str = "", condition: str = "") -> Selection:
@@ -79,10 +78,8 @@ class Numbers:
         ``absent`` says that no table has a cell. Raises MergeRunnerError.
         """
         match request:
-            case ["table", name, *part]:
-                result: dict[str, Any] = {"table": self._table(name, *part)}
-            case ["comparison", first, second, *part]:
-                result = {"table": self._comparison(first, second, *part)}
+            case ["table" | "comparison", *_]:
+                result: dict[str, Any] = {"table": self._table(*request)}
             case ["cell", table, row, column, *part]:
                 result = self._cell(table, row, column, *part)
             case ["figure", name, "svg" | "png" as form]:
@@ -120,25 +117,19 @@ class Numbers:
     def _kept(self, name: str, make: Callable[[], str], options: str = "") -> str:
         return kept(self.db, self._state, options or Selection().key(self.db), name, make)
 
-    def _table(self, name: str, sweep: str = "", condition: str = "") -> str:
-        """Return a table of all trials, or of those of a sweep and a condition."""
-        part = _selected(sweep, condition)
-        return self._kept(
-            name,
-            lambda: to_text(make_tables(self._part(part), [name])[0]),
-            part.key(self.db),
-        )
-
-    def _comparison(self, first: str, second: str, sweep: str = "", condition: str = "") -> str:
-        """Return how two drivers differ, each with its prompt, as ``_table`` does."""
-        part = _selected(sweep, condition)
+    def _table(self, kind: str, *named: str) -> str:
+        """Return a table, or a comparison of two drivers, each with its prompt."""
+        name, selection = _kept_as(kind, *named)
 
         def make() -> str:
             from merge_runner_analysis.tables.effects import comparison
 
-            return to_text(comparison(self._part(part), first, second))
+            study = self._part(selection)
+            if kind == "comparison":
+                return to_text(comparison(study, *named[:2]))
+            return to_text(make_tables(study, [name])[0])
 
-        return self._kept(_name_of(first, second), make, part.key(self.db))
+        return self._kept(name, make, selection.key(self.db))
 
     def _part(self, selection: Selection) -> Study:
         from merge_runner_analysis.study import Study
@@ -173,7 +164,7 @@ class Numbers:
         """Return a cell's explanation and trials; a column that ends in OF has its denominator."""
         from merge_runner_analysis.explain import explain
 
-        table = from_text(self._table(name, sweep, condition))
+        table = from_text(self._table("table", name, sweep, condition))
         study = self._part(_selected(sweep, condition))
         column, of, _ = column.partition(OF)
         try:

@@ -6,7 +6,7 @@ import logging
 import shutil
 import socket
 import sys
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from functools import partial
 from pathlib import Path
@@ -32,7 +32,6 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from merge_runner.errors import MergeRunnerError, UsageError
-from merge_runner_analysis.web.filters import sort_of
 from merge_runner_analysis.web.glossary import sections
 from merge_runner_analysis.web.guard import LOOPBACK, Guard
 from merge_runner_analysis.web.pages import (
@@ -55,7 +54,6 @@ from merge_runner_analysis.web.site import (
     NotThere,
     Site,
     TooMuch,
-    download,
 )
 from merge_runner_analysis.web.urls import whole
 
@@ -165,11 +163,6 @@ def _redirect(asked: Request) -> Response:
     return RedirectResponse(f"/{quote(page)}" + (f"?{asked.url.query}" if asked.url.query else ""))
 
 
-def _trials_csv(site: Site, asked: Mapping[str, str]) -> Response:
-    filters = trials.export_filter(site, asked)
-    return download(site.catalogue.export(filters, sort_of(asked)), "trials.csv")
-
-
 # Functions that render the pages, from the names and the query of an address.
 PAGES: dict[str, Callable[..., str | Response]] = {
     "/": home.home_page,
@@ -180,7 +173,7 @@ PAGES: dict[str, Callable[..., str | Response]] = {
     "/sweeps/{name:path}": sweep.sweep_page,
     "/trials": trials.trials_page,
     "/trials/": lambda site, asked: RedirectResponse(site.at.to("trials", **asked)),
-    "/trials.csv": _trials_csv,
+    "/trials.csv": trials.trials_csv,
     "/trials/{name:path}": trial.trial_page,
     "/others/{name:path}": lambda *asked: JSONResponse(trial.others(*asked)),
     "/glossary": lambda site, _: site.render("glossary.html", view="glossary", glossary=sections()),

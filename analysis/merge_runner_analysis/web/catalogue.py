@@ -15,13 +15,11 @@ import duckdb
 from merge_runner.errors import UsageError
 from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
-from merge_runner.served_model import Pair
 from merge_runner.text_safety import csv_writer, first_line
-from merge_runner_analysis.web.database_copy import Copies, Copy
 from merge_runner_analysis.web.display_text import csv_cell
 from merge_runner_analysis.web.listing import FACTOR, Listing, columns_of, list_trials
 from merge_runner_analysis.web.phrases import condition_text
-from merge_runner_analysis.web.reading import Row, records
+from merge_runner_analysis.web.reading import Copies, Copy, Row, records
 
 PAGE = 100
 # While a run goes on the database changes all the time: a list of MANY trials, which takes half a
@@ -135,7 +133,7 @@ class Catalogue:
     copies: Copies = field(init=False)
     _copy: Copy | None = None
     _read_at: float = 0.0
-    _listing: Listing = field(init=False)
+    listing: Listing = field(init=False)
     _lock: threading.RLock = field(default_factory=threading.RLock)
     _tags: tuple[tuple[str, str, str], ...] = ()
     _counted: dict[str, Any] = field(default_factory=dict)
@@ -157,26 +155,16 @@ class Catalogue:
             if copy is self._copy:
                 return False
             try:
-                self._listing, self._tags, self._counted = list_trials(copy), (), {}
+                self.listing, self._tags, self._counted = list_trials(copy), (), {}
             except duckdb.Error as exc:
                 raise UsageError(f"{self.db} cannot be read: {first_line(exc)}") from exc
             self._copy, self._read_at = copy, time.monotonic()
             return True
 
     @property
-    def is_locked(self) -> bool:
-        """Return whether another program holds the database, so that the list may be old."""
-        return self.copies.is_locked
-
-    @property
     def state(self) -> Row:
         """State of the list, which differs wherever the listed ``trials`` or their values do."""
-        return self._listing.state
-
-    @property
-    def others(self) -> list[Pair]:
-        """Pairs of the requested and the served model that differ."""
-        return self._listing.others
+        return self.listing.state
 
     @property
     def has_humans(self) -> bool:
@@ -186,12 +174,12 @@ class Catalogue:
     def ask(self, sql: str, *values: object) -> list[Row]:
         """Return the rows of a query of ours."""
         with self._lock:
-            return records(self._listing.connection, sql, values)
+            return records(self.listing.connection, sql, values)
 
     def cursor(self) -> duckdb.DuckDBPyConnection:
         """Return another connection: its queries keep no page waiting."""
         with self._lock:
-            return self._listing.cursor()
+            return self.listing.cursor()
 
     def keep(self, numbers: Sequence[int]) -> None:
         """List no trials but those with these numbers."""
@@ -219,7 +207,7 @@ class Catalogue:
 
         def count() -> Facets:
             names = (*FACETS, *(f"{FACTOR}{name}" for name in self.factors()))
-            return facets_of(self._listing.connection, "listed", names, filters)
+            return facets_of(self.listing.connection, "listed", names, filters)
 
         return self._once(("facets", filters), count)
 

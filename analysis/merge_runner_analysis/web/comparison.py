@@ -8,7 +8,6 @@ from typing import Any
 
 from merge_runner_analysis.metrics import COLLISIONS, LEFT_FIRST
 from merge_runner_analysis.tables.model import Row, Table, from_text
-from merge_runner_analysis.web.computed import computed
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.effect_rows import (
     amount,
@@ -80,7 +79,7 @@ def compared(
     """
     groups = (f"{driver.name}/{driver.prompt}" for driver in (first, second))
     named = short_names([first.name, second.name])
-    job = computed(site, ("comparison", *groups, scope.sweep, scope.condition))
+    job = site.computed(("comparison", *groups, scope.sweep, scope.condition))
     if (content := job.content) is None:
         return job, True, None
     trials = trials_of(first, scope), trials_of(second, scope)

@@ -1,4 +1,4 @@
-"""A study as a folder of pages that open without a server: those of the explorer, crawled."""
+"""Pages that open without a server: a study's in a folder, crawled, and one page with trials."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
 from fnmatch import fnmatchcase
 from functools import cache, lru_cache
-from heapq import heappop, heappush
 from html import escape
 from itertools import chain, count
 from pathlib import Path, PurePosixPath
@@ -27,17 +26,16 @@ from merge_runner.paths import refuse_another_kind
 from merge_runner_analysis.cache import stamp_of
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.tables import TABLES
-from merge_runner_analysis.web.answers import Request
 from merge_runner_analysis.web.app import explorer
 from merge_runner_analysis.web.catalogue import FACETS
 from merge_runner_analysis.web.computing import processes
 from merge_runner_analysis.web.guard import LOOPBACK
 from merge_runner_analysis.web.leaks import refuse_leaks
 from merge_runner_analysis.web.listing import FACTOR
-from merge_runner_analysis.web.offline import linked, page_of_trials, site_of_a_page
 from merge_runner_analysis.web.pages.trial import READ_AT_ONCE, trial_pages
 from merge_runner_analysis.web.reading import Row
-from merge_runner_analysis.web.site import SCOPE, Site
+from merge_runner_analysis.web.rendering import STYLE, inlined_texts, policy_of
+from merge_runner_analysis.web.site import REPLAY, SCOPE, Site
 from merge_runner_analysis.web.urls import Links, query_of
 
 MOST = 1_000  # trials of drivers; of humans there are at most 990
@@ -63,6 +61,7 @@ POLICY = (
 HTML = b"<!doctype html"
 OURS = f'{HTML.decode()}>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'.encode()
 INDEX, FILES = "index.html", "files"
+SCRIPTS = ["lists.js", "keys.js", *REPLAY, "single.js"]  # of one page
 MARK = "\0"  # stands before and after the address of a page until its file is known
 _ODD = re.compile(r"[^A-Za-z0-9_.]+")
 LONGEST_NAME = 120
@@ -93,7 +92,10 @@ def export_folder(
         if patterns:
             site.catalogue.keep([row["number"] for row in rows])
         else:
-            _begin_to_compute(site)
+            # All that pages wait for; what takes long comes last.
+            figures = (("figure", name, "svg") for name in FIGURES)
+            for request in (*(("table", name, "", "") for name in TABLES), ("audit",), *figures):
+                site.computing.ask(request, stamp_of(db))
         try:
             asyncio.run(_crawl(site, rows, begin, heads, stage, progress))
         except BrokenProcessPool:
@@ -105,19 +107,44 @@ def export_page(db: Path, file: Path, patterns: Sequence[str]) -> Path:
     """Write one page with the trials of these names; returns its path. Raises UsageError."""
     refuse_another_kind(file, HTML, "page of HTML")
     trials: set[tuple[str, str]] = set()
-    site = site_of_a_page(db, trials)
+    site = _site_of_a_page(db, trials)
     with _opened(site, patterns) as rows, _staged(file.parent) as stage:
         trials.update((row["trial_id"], row["spec_hash"]) for row in rows)
-        (stage / file.name).write_text(page_of_trials(site, rows), encoding="utf-8")
+        (stage / file.name).write_text(_page_of_trials(site, rows), encoding="utf-8")
     return file
 
 
-def _begin_to_compute(site: Site) -> None:
-    """Ask for all that pages wait for; what takes long comes last."""
-    requests: list[Request] = [("table", name, "", "") for name in TABLES]
-    requests += [("audit",), *(("figure", name, "svg") for name in FIGURES)]
-    for request in requests:
-        site.computing.ask(request, stamp_of(site.db))
+def _linked(page: str) -> str:
+    """Return a page in which a link that leads nowhere is a text."""
+    return page.replace(' href=""', "")
+
+
+def _site_of_a_page(db: Path, trials: Collection[tuple[str, str]]) -> Site:
+    """Return a site for one page, which links to those trials alone that it holds: name, spec."""
+
+    def leads(address: str) -> str:
+        parts = urlsplit(address)
+        trial, asked = unquote(parts.path.removeprefix("/trials/")), dict(parse_qsl(parts.query))
+        is_there = (trial, asked.get("spec", "")) in trials
+        return query_of({"trial": trial, **asked}) if is_there else ""
+
+    inlined = inlined_texts([STYLE, *SCRIPTS])
+    return Site(db, Links(leads), policy=policy_of(inlined), inlined=inlined)
+
+
+def _page_of_trials(site: Site, rows: Sequence[Row]) -> str:
+    """Return one page with trials; raises UsageError."""
+    template = "trial.html" if len(rows) == 1 else "_trial.html"
+    pages = list(trial_pages(site, rows, template))
+    page = pages[0]
+    if len(rows) > 1:
+        # Rendered by templates of ours.
+        trials = zip(rows, map(Markup, pages), strict=True)
+        page = site.render(
+            "several.html", view="trials", trials=list(trials), scripts=[*REPLAY, "single.js"]
+        )
+    refuse_leaks(site.db, "the page", page)
+    return _linked(page)
 
 
 async def _crawl(
@@ -129,7 +156,7 @@ async def _crawl(
     progress: Callable[[int], object],
 ) -> None:
     """Save the pages to which links lead, and those of all trials."""
-    files, waiting = {begin: INDEX}, [(False, 0, begin)]
+    files, waiting = {begin: INDEX}, [begin]
     names, done = {INDEX}, count(1)
     transport = httpx.ASGITransport(explorer(site), raise_app_exceptions=False)
     plain = {"accept-encoding": "identity"}
@@ -147,7 +174,7 @@ async def _crawl(
             return files[page]
         name = named(page)
         if name.endswith(".html"):
-            heappush(waiting, (page.startswith(LAST), len(files), page))
+            waiting.append(page)
             return name
         # A style, a script, a table; a figure that cannot be drawn has no file.
         file = await client.get(page)
@@ -167,7 +194,7 @@ async def _crawl(
             file = await file_of(parts[place])
             parts[place] = escape(root + file) if file else ""
         (stage / files[page]).parent.mkdir(exist_ok=True)
-        (stage / files[page]).write_text(linked("".join(parts)), encoding="utf-8")
+        (stage / files[page]).write_text(_linked("".join(parts)), encoding="utf-8")
         progress(next(done))
 
     for row in rows:
@@ -185,7 +212,8 @@ async def _crawl(
                 for page, text in (await asyncio.wrap_future(rendering.popleft())).items():
                     await save(page, text)
             else:
-                *_, page = heappop(waiting)
+                page = min(waiting, key=lambda page: page.startswith(LAST))
+                waiting.remove(page)
                 await save(page, await _served(client, page))
 
 

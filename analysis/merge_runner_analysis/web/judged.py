@@ -9,7 +9,6 @@ from typing import Any
 
 from merge_runner_analysis.published import HUMAN, human_counts
 from merge_runner_analysis.tables.model import Table
-from merge_runner_analysis.web.computed import computed_table
 from merge_runner_analysis.web.marks import Cell, band, cells, measures_of
 from merge_runner_analysis.web.phrases import ordered
 from merge_runner_analysis.web.reading import Row
@@ -59,7 +58,7 @@ class Driver:
 
 def judged(site: Site, bar: Bar, asked: Mapping[str, str]) -> tuple[list[Driver], dict[str, Any]]:
     """Return the drivers of a scope, and the values of every page that shows their verdicts."""
-    job, table = computed_table(site, TABLE, bar.scope.sweep, bar.scope.condition)
+    job, table = site.table(TABLE, bar.scope.sweep, bar.scope.condition)
     return drivers_of(site, table, bar.scope), {
         "bar": bar,
         "carried": carried(asked),

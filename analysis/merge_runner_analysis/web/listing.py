@@ -21,8 +21,7 @@ from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.served_model import Pair, other_models, sql_of
 from merge_runner_analysis.calls import COUNTED
 from merge_runner_analysis.drivers import language_models, stand_in, unresponsive
-from merge_runner_analysis.web.database_copy import Copy
-from merge_runner_analysis.web.reading import Row, records
+from merge_runner_analysis.web.reading import Copy, Row, records
 from merge_runner_analysis.web.trial.account import (
     ALONE,
     OTHER_ACCOUNTS,

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
-from merge_runner.prompts.blocks import BLOCKS, Variant
+from merge_runner.prompts.blocks import BLOCKS
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 UNKNOWN = "no meaning is known here"
@@ -60,15 +60,6 @@ def ordered(names: Iterable[str]) -> list[str]:
     """Return conditions in their usual order, those without human data last."""
     places = {name: place for place, name in enumerate(HUMAN_CONDITIONS)}
     return sorted(names, key=lambda name: (places.get(name, len(places)), name))
-
-
-def changes_text(variant: Variant, shown: Callable[[str], str]) -> str:
-    """Describe the blocks that a variant's prompt leaves out and adds, each as ``shown``."""
-    return " and ".join(
-        f"{word} {', '.join(shown(name) for name in sorted(names))}"
-        for word, names in (("without", variant.removes), ("with", variant.adds))
-        if names
-    )
 
 
 def block_meaning(name: str) -> str:

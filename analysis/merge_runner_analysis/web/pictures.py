@@ -6,8 +6,6 @@ Only the replay draws in the browser, since it moves.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import lru_cache
 from math import ceil, floor
 
 from merge_runner.records import SIDES
@@ -15,24 +13,6 @@ from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.wording import MINUS
 
 SPARK_WIDTH, SPARK_HEIGHT = 96.0, 22.0
-
-
-@dataclass(frozen=True, slots=True)
-class Scale:
-    """A linear scale of a picture: ``low`` at ``from_``, ``high`` at ``to``.
-
-    Values beyond are drawn at the edge.
-    """
-
-    low: float
-    high: float
-    from_: float
-    to: float
-
-    def __call__(self, value: float) -> float:
-        """Return the place of a value."""
-        inside = min(max(value, self.low), self.high)
-        return self.from_ + (self.to - self.from_) * (inside - self.low) / (self.high - self.low)
 
 
 def speed_range(rows: Sequence[Row]) -> tuple[int, int]:
@@ -61,27 +41,15 @@ def sparkline(row: Row, speeds: tuple[int, int]) -> dict[str, str] | None:
 
 def _spark_points(values: Sequence[float], speeds: tuple[int, int]) -> str:
     low, high = speeds  # of all, so that none lies beyond
-    down = SPARK_HEIGHT / (high - low)
-    return _spark_pattern(len(values)) % tuple([(high - value) * down for value in values])
-
-
-@lru_cache(64)
-def _spark_pattern(points: int) -> str:
-    """Return a pattern of points with their places across, to be filled with those down."""
-    across = SPARK_WIDTH / max(points - 1, 1)
-    return " ".join(f"{i * across:.0f},%.1f" for i in range(points))
+    across, down = SPARK_WIDTH / max(len(values) - 1, 1), SPARK_HEIGHT / (high - low)
+    return " ".join([f"{i * across:.0f},{(high - v) * down:.1f}" for i, v in enumerate(values)])
 
 
 def step_points(values: Sequence[float], width: float, height: float, steps: int) -> str:
     """Return the points of a step line from -1 to 1, ``steps`` across the width."""
-    across = _steps_across(len(values), width, steps)
+    across = [f"{width * min(i, steps) / steps:.1f}" for i in range(len(values) + 1)]
     down = [f"{height - height * (min(max(v, -1), 1) + 1) / 2:.1f}" for v in values]
     return " ".join([f"{across[i]},{y} {across[i + 1]},{y}" for i, y in enumerate(down)])
-
-
-@lru_cache(64)
-def _steps_across(values: int, width: float, steps: int) -> list[str]:
-    return [f"{width * min(i, steps) / steps:.1f}" for i in range(values + 1)]
 
 
 def accelerations(values: Sequence[float], most_mps2: float) -> str:

@@ -16,8 +16,8 @@ from merge_runner.results.database import fetched
 from merge_runner.results.instance import SETTINGS, in_memory
 from merge_runner.results.store import answering
 from merge_runner.text_safety import csv_writer, in_spreadsheet
-from merge_runner_analysis.web.database_copy import Copies
 from merge_runner_analysis.web.display_text import csv_cell, text_of
+from merge_runner_analysis.web.reading import Copies
 
 AT_ONCE = 2
 WAITING = 8  # in addition to those that run: each keeps a thread of the server

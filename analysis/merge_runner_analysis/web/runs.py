@@ -146,12 +146,7 @@ def ended_as(run: Row) -> str:
 
 def assessment_of(run: Row) -> tuple[str, str]:
     """Say whether a run is finished, and can be trusted: of what kind that is, and a sentence."""
-    ended, planned, code, state = (
-        run["ended"],
-        run["planned"],
-        run["row"]["exit_code"],
-        run["state"],
-    )
+    ended, planned, state, row = (run[name] for name in ("ended", "planned", "state", "row"))
     counted = f"{ended} of {planned or '?'} trials"
     failures = f", {run['failed']} failed" if run["failed"] else ""
     if state == "checking":
@@ -164,7 +159,7 @@ def assessment_of(run: Row) -> tuple[str, str]:
         if ended < planned:
             text = f"It had finished, but the database holds only {ended} of its {planned} trials."
             return "stopped", text
-        row, text = run["row"], f"Finished: all {ended} trials ended"
+        text = f"Finished: all {ended} trials ended"
         if why := not_judged(run["driver"], row["invalid"], row["asked"]):
             return "doubtful", f"{text}; {why}."
         troubles = {"failed requests (retried)": row["faults"], "invalid replies": row["invalid"]}
@@ -178,12 +173,12 @@ def assessment_of(run: Row) -> tuple[str, str]:
     if state == "lost":
         gone = "The run was cut off: its process is gone, or frozen."
         return "stopped", f"{gone} {counted} are stored{failures}."
-    if code in REASONS:
-        return "stopped", f"Stopped: {REASONS[code]}. {counted} have an outcome{failures}."
+    if reason := REASONS.get(row["exit_code"]):
+        return "stopped", f"Stopped: {reason}. {counted} have an outcome{failures}."
     if ended == planned:
         text = f"Ended with faults: {counted} have an outcome, but what is stored does not hold "
         audit = f"merge-runner audit --sweep {run['sweep_id']}"
-        at = command_at(audit, "--db", run["row"].get("db", DEFAULT_DB), DEFAULT_DB)
+        at = command_at(audit, "--db", row.get("db", DEFAULT_DB), DEFAULT_DB)
         return "stopped", f"{text}together. See: {at}"
     if run["failed"]:
         return "stopped", f"Ended: {counted} have an outcome{failures}."

@@ -1,4 +1,4 @@
-"""Scope of a page's numbers: a sweep, drivers, a prompt and conditions, in its address."""
+"""Parts of the trials in an address: the scope of a page's numbers, and a list's filter."""
 
 from __future__ import annotations
 
@@ -11,13 +11,30 @@ from typing import Any
 from starlette.datastructures import QueryParams
 
 from merge_runner.prompts.blocks import BASELINE, title_of
-from merge_runner_analysis.web.catalogue import Facets
+from merge_runner_analysis.web.catalogue import FACETS, SORTS, Facets
+from merge_runner_analysis.web.listing import FACTOR
 from merge_runner_analysis.web.phrases import called, ordered
-from merge_runner_analysis.web.site import SCOPE, NotThere, Site
+from merge_runner_analysis.web.search import LONGEST_QUERY, MOST_TERMS
+from merge_runner_analysis.web.site import SCOPE, NotThere, Site, TooMuch
 
 # Marks that the analysis adds to names of drivers with several tasks, prompts or mock models.
 MARKS = re.compile(r"( \[([0-9a-f]{8}|scripted)\])+$")
 
+# Facets that may be chosen at once, and characters of their values. A longer filter is a fault
+# within DuckDB, or the end of the process.
+MOST_CHOSEN, LONGEST_VALUE = 30, 1_000
+# Labels of facets that have another name in an address.
+HEADINGS = {
+    "sweep": "run",
+    "run": "name of run",
+    "who": "kind of driver",
+    "model": "driver",
+    "variant": "prompt",
+    "condition": "start",
+    "account": "why",
+    "validity": "replies",
+    "cause": "error",
+}
 # The question of each study in a database.
 DESCRIPTIONS = """
 SELECT config->>'$.description' AS description FROM sweeps
@@ -123,6 +140,34 @@ def facets_shown(site: Site, facets: Facets) -> dict[str, list[tuple[str, Any]]]
 def carried(asked: Mapping[str, str]) -> dict[str, list[str]]:
     """Return the scope in an address, as the addresses of other pages take it on."""
     return {name: values for name in SCOPE if (values := every(asked, name))}
+
+
+def filter_of(asked: Mapping[str, str]) -> dict[str, str]:
+    """Return the filter in an address; raises TooMuch."""
+    filters = {
+        name: value
+        for name, value in asked.items()
+        if value and (name in {*FACETS, "q"} or name.startswith(FACTOR))
+    }
+    words = filters.get("q", "")
+    if len(words) > LONGEST_QUERY or len(words.split()) > MOST_TERMS:
+        raise TooMuch(
+            f"a search has up to {MOST_TERMS} words and {LONGEST_QUERY} characters, this one "
+            f"{len(words.split()):,} and {len(words):,}"
+        )
+    longest = max(map(len, asked.values()), default=0)
+    if len(filters) > MOST_CHOSEN or longest > LONGEST_VALUE:
+        raise TooMuch(
+            f"a filter has up to {MOST_CHOSEN} parts of up to {LONGEST_VALUE:,} characters, this "
+            f"one {len(filters):,} of up to {longest:,}"
+        )
+    return filters
+
+
+def sort_of(asked: Mapping[str, str]) -> str:
+    """Return the order in an address; an unknown one is that of the names."""
+    sort = asked.get("sort", "trial")
+    return sort if sort.removeprefix("-") in SORTS else "trial"
 
 
 def unmarked(driver: str) -> str:

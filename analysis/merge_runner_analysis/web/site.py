@@ -10,15 +10,18 @@ from collections.abc import Mapping
 from contextvars import copy_context
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from starlette.responses import Response
 
-from merge_runner.errors import MergeRunnerError
+from merge_runner.errors import MergeRunnerError, StoreError
 from merge_runner.paths import DEFAULT_DB
 from merge_runner_analysis.cache import stamp_of
 from merge_runner_analysis.metrics import METRICS
+from merge_runner_analysis.tables.model import Table, from_text
+from merge_runner_analysis.web.answers import Request
 from merge_runner_analysis.web.catalogue import Catalogue
-from merge_runner_analysis.web.computing import Computing
+from merge_runner_analysis.web.computing import Computing, Job
 from merge_runner_analysis.web.note_file import LONGEST_TEXT, Notes
 from merge_runner_analysis.web.phrases import clock, condition_text
 from merge_runner_analysis.web.queries import Queries
@@ -44,6 +47,8 @@ PAGES = {
 SCOPE = ("sweep", "model", "variant", "condition")
 # Pages with one list of all their entries.
 LISTS = {"Tables and figures": "tables", "Notes": "notes", "What words mean": "glossary"}
+# Cached answers come within the first time; a page asks again for others, a file waits.
+AT_ONCE_S, FILE_WAIT_S = 0.3, 300.0
 
 
 class NotThere(Exception):
@@ -148,6 +153,26 @@ class Site:
             raise NotThere(f"the database holds no trial {trial_id}")
         return row
 
+    def computed(self, request: Request, wait_s: float = AT_ONCE_S) -> Job:
+        """Ask for an answer, and wait for it for a moment; raises NotThere where there is none."""
+        # An export waits for every answer: its pages are written once.
+        job = self.computing.ask(request, stamp_of(self.db), None if self.is_still else wait_s)
+        if job.content is not None and "absent" in job.content:
+            raise NotThere(job.content["absent"])
+        return job
+
+    def table(self, name: str, sweep: str = "", condition: str = "") -> tuple[Job, Table | None]:
+        """Return the job of a table, of all trials or of a part, and the table once it is there."""
+        job = self.computed(("table", name, sweep, condition))
+        return job, from_text(job.content["table"]) if job.content else None
+
+    def awaited(self, request: Request) -> dict[str, Any]:
+        """Return the answer of a computation in FILE_WAIT_S; raises NotThere and StoreError."""
+        job = self.computed(request, FILE_WAIT_S)
+        if job.content is None:
+            raise StoreError(job.failure or "it is still being computed: ask again in a minute")
+        return job.content
+
     def in_words(self, condition: str) -> str:
         """Return a condition in words; empty where no human drove it and it has no trial."""
         if condition not in self._conditions:
@@ -167,7 +192,7 @@ class Site:
 
     def render(self, template: str, **values: object) -> str:
         """Return a page, or a part of one."""
-        values = {"is_locked": self.catalogue.is_locked, **values}
+        values = {"is_locked": self.catalogue.copies.is_locked, **values}
         return self._environment.get_template(template).render(values)
 
     def close(self) -> None:

@@ -10,8 +10,8 @@ from merge_runner.study.file import read_study
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables import make_tables
-from merge_runner_analysis.web import comparison
 from merge_runner_analysis.web.report import report_html
+from merge_runner_analysis.web.site import Site
 from merge_runner_analysis.wording import UNREADABLE, brackets, capital, money, number, p_value
 from tests.support.serving import client_of, listed
 from tests.support.studies import Said, write_study, yielding
@@ -92,7 +92,7 @@ def test_two_models_without_factors_are_what_the_first_page_and_the_report_answe
 def test_a_comparison_that_is_computed_while_its_page_is_made_is_still_awaited(db, monkeypatch):
     made = client_of(db)
     made.get(f"/drivers/{A}?with={B}")  # the table of verdicts is there from now on
-    whole = comparison.computed
+    whole = Site.computed
 
     class Ending:
         """A computation that ends once it was looked at."""
@@ -108,7 +108,11 @@ def test_a_comparison_that_is_computed_while_its_page_is_made_is_still_awaited(d
             self.looks += 1
             return self.job.content if self.looks > 1 else None
 
-    monkeypatch.setattr(comparison, "computed", lambda *asked: Ending(whole(*asked)))
+    def computed(site, request):
+        job = whole(site, request)
+        return Ending(job) if request[0] == "comparison" else job
+
+    monkeypatch.setattr(Site, "computed", computed)
     for address in (f"/drivers/{A}?with={B}", "/"):
         assert "Computing" in text_of(made.get(address).text), address
 

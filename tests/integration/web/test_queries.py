@@ -14,8 +14,8 @@ import pytest
 from merge_runner.errors import UsageError
 from merge_runner.results.database import open_database
 from merge_runner_analysis.web import queries as module
-from merge_runner_analysis.web.database_copy import Copies
 from merge_runner_analysis.web.queries import Queries
+from merge_runner_analysis.web.reading import Copies
 from tests.support.cases import cases, table
 from tests.support.gate import HANGS_S
 from tests.support.studies import write_study, yielding

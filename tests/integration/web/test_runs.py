@@ -21,10 +21,9 @@ from merge_runner.run.stored_replay import audit_database
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import Study
-from merge_runner_analysis.web.filters import filter_of
 from merge_runner_analysis.web.pages.sweep import sweep_page
 from merge_runner_analysis.web.runs import list_runs, numbers_of, standing_of
-from merge_runner_analysis.web.scope import scope_of
+from merge_runner_analysis.web.scope import filter_of, scope_of
 from merge_runner_analysis.web.site import Site
 from tests.support.serving import Page, client_of, held
 from tests.support.snapshots import progress, runner

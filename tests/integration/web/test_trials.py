@@ -12,9 +12,9 @@ import pytest
 from merge_runner.results.store import Store
 from merge_runner_analysis.web import catalogue as catalogue_module
 from merge_runner_analysis.web.catalogue import Catalogue
-from merge_runner_analysis.web.filters import filter_of
 from merge_runner_analysis.web.pictures import sparkline, speed_range
 from merge_runner_analysis.web.runs import list_runs
+from merge_runner_analysis.web.scope import filter_of
 from tests.support.cases import cases
 from tests.support.crashes import CLOSING_IN, EXAMPLES, drive
 from tests.support.harness import FAST

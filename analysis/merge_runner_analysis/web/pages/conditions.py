@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from math import ceil, floor
 from typing import Any
 
-from merge_runner_analysis.web.pictures import Scale
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.scope import carried, scope_of
 from merge_runner_analysis.web.site import NotThere, Site, news_of
@@ -17,6 +16,8 @@ MOST = 500
 # Sizes in the picture, in its units.
 WIDTH, LEFT, RIGHT, PANEL, BETWEEN, TOP, FOOT = 1000, 42, 8, 170, 34, 24, 42
 KEY = "trial_id", "spec_hash"
+Scale = Callable[[float], float]
+"""Place of a value in the picture."""
 CROSS = "m-5-5 10 10m0-10-10 10"
 # The drawn series of a trial, each a list; the headway is that of the vehicle that went first.
 PANELS = {
@@ -142,9 +143,13 @@ def _axis(
     """Return an axis of whole steps that holds all values, and its ticks: (place, value)."""
     low, high = min(values), max(values)
     steps = (size * 10**zeros for zeros in range(9) for size in (1, 2, 5))
-    step = next(step for step in steps if high - low <= (most - 1) * step)
+    step: int = next(step for step in steps if high - low <= (most - 1) * step)
     first, last = floor(low / step), max(ceil(high / step), floor(low / step) + 1)
-    scale = Scale(first * step, last * step, *places)
+    begin, end = places
+
+    def scale(value: float) -> float:
+        return begin + (end - begin) * (value / step - first) / (last - first)
+
     return scale, [(round(scale(i * step), 1), i * step) for i in range(first, last + 1)]
 
 

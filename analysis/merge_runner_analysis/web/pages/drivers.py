@@ -10,7 +10,6 @@ from merge_runner_analysis.published import HUMAN
 from merge_runner_analysis.tables.formats import printed
 from merge_runner_analysis.tables.model import Row as TableRow
 from merge_runner_analysis.web.comparison import compared
-from merge_runner_analysis.web.computed import computed_table
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.display_text import with_minus
 from merge_runner_analysis.web.effect_rows import MIDDLE
@@ -132,7 +131,7 @@ def _summary(driver: Driver) -> str:
 
 def _first(site: Site, driver: str, scope: Scope) -> tuple[Job | None, str]:
     """Return the job to wait for, and a driver's first actions in sentences."""
-    job, table = computed_table(site, "first-action", scope.sweep, scope.condition)
+    job, table = site.table("first-action", scope.sweep, scope.condition)
     sentences = []
     for row in table.rows if table else []:
         is_compared = row.groups[0] in {f"{driver}/{scope.prompt}", HUMAN}

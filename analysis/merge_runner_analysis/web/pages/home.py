@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from merge_runner_analysis.web.comparison import compared
-from merge_runner_analysis.web.computed import computed_table
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.effect_rows import MIDDLE
 from merge_runner_analysis.web.judged import Driver, by_condition, by_kind, humans_of, judged, noted
@@ -28,7 +27,7 @@ def _question(site: Site, bar: Bar) -> tuple[list[Job], list[Job], Answer | None
     if len(bar.prompts) < 2 and not site.catalogue.factors():
         return [], [], None
     part = bar.scope.sweep, bar.scope.condition
-    computed = [computed_table(site, name, *part) for name in TABLES]
+    computed = [site.table(name, *part) for name in TABLES]
     jobs, tables = zip(*computed, strict=True)
     return [*jobs], [job for job, table in computed if table is None], answer_of(*tables)
 
@@ -64,7 +63,7 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         job, is_awaited, apart = compared(site, shown[0], shown[1], scope)
         jobs, asking = [job], [job] * is_awaited
     older = [job.older for job in (values["computed"], *jobs)]
-    now = standing, site.catalogue.state, site.catalogue.is_locked, older
+    now = standing, site.catalogue.state, site.catalogue.copies.is_locked, older
     seen = news_of(now, asked.get("seen", ""))
     conditions = by_condition(site, scope, shown)
     return site.render(

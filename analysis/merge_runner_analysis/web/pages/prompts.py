@@ -10,15 +10,20 @@ from functools import partial
 from typing import Any
 
 from merge_runner.planted_effect import PARAMETERS as PLANTED
-from merge_runner.prompts.blocks import BASELINE, Variant, blocks_of
+from merge_runner.prompts.blocks import BASELINE, blocks_of
 from merge_runner.records import SIDES
 from merge_runner_analysis.metrics import COLLISIONS
 from merge_runner_analysis.tables.formats import printed
-from merge_runner_analysis.tables.model import Row, Table
-from merge_runner_analysis.web.computed import computed_table
-from merge_runner_analysis.web.effect_rows import MIDDLE, difference_mark
+from merge_runner_analysis.tables.model import Table
+from merge_runner_analysis.web.effect_rows import (
+    MIDDLE,
+    difference_mark,
+    interval_of,
+    metric_of,
+    value_of,
+)
 from merge_runner_analysis.web.judged import Driver, judged
-from merge_runner_analysis.web.phrases import UNKNOWN, block_meaning, changes_text
+from merge_runner_analysis.web.phrases import UNKNOWN, block_meaning
 from merge_runner_analysis.web.scope import scope_of, unmarked
 from merge_runner_analysis.web.site import NotThere, Site
 from merge_runner_analysis.web.trial.prompt_parts import Part, digests_of, level_of, parts_of
@@ -72,7 +77,7 @@ def prompts_page(site: Site, asked: Mapping[str, str]) -> str:
     """Return all prompts side by side, and the differences that they make."""
     bar = scope_of(site, asked)
     chosen = bar.scope.drivers or bar.drivers
-    job, contrasts = computed_table(site, "contrasts", bar.scope.sweep, bar.scope.condition)
+    job, contrasts = site.table("contrasts", bar.scope.sweep, bar.scope.condition)
     played, values = judged(site, bar, asked)
     driven: dict[str, list[Driver]] = {}
     for driver in played:
@@ -128,31 +133,25 @@ def differences(
     rows = [row for row in table.rows if row.values.get("difference") is not None]
     ends: dict[str, float] = {}
     for row in rows:
-        name = row.id.rpartition("/")[2]
-        ends[name] = max(ends.get(name, 0.0), *map(abs, _values(row)))
+        values = (value_of(row, "difference"), *(interval_of(row) or ()))
+        ends[metric_of(row)] = max(ends.get(metric_of(row), 0.0), *map(abs, values))
     drivers: dict[str, dict[str, dict[str, Any]]] = {}
     for row in rows:
-        name, (driver, _, prompt) = row.id.rpartition("/")[2], row.groups[0].rpartition("/")
+        driver, _, prompt = row.groups[0].rpartition("/")
         if unmarked(driver) not in chosen:
             continue
         p: Any = row.values["p_holm"]
         shape = "open" if p is None or p >= ALPHA else "like"
         compared = f"{prompt} against {row.values['reference']}"
         of_driver = drivers.setdefault(str(row.values["driver"]), {})
-        of_driver.setdefault(compared, {})[name] = {
+        of_driver.setdefault(compared, {})[metric_of(row)] = {
             **printed(table, row),
             "row": row.id,
             "driver": driver,
             "prompt": prompt,
-            "mark": replace(difference_mark(row, ends[name]), shape=shape),
+            "mark": replace(difference_mark(row, ends[metric_of(row)]), shape=shape),
         }
     return drivers, ends
-
-
-def _values(row: Row) -> list[float]:
-    """Return a difference, with the ends of its interval if it has one."""
-    values: Mapping[str, Any] = row.values
-    return [values["difference"], *(values.get("ci") or ())]
 
 
 def left_out(site: Site, variant: str) -> str:
@@ -166,10 +165,9 @@ def left_out(site: Site, variant: str) -> str:
     blocks = frozenset(level_of(name.partition("@")[0]) for name in names) - baseline
     blocks |= baseline & frozenset(names)
     # The levels of words are in the variant's name already.
-    changes = Variant(
-        removes=baseline - blocks, adds=blocks - baseline - frozenset(variant.split(" "))
-    )
-    return changes_text(changes, _named) or ("the whole prompt" if blocks == baseline else "")
+    changes = {"without": baseline - blocks, "with": blocks - baseline - {*variant.split(" ")}}
+    texts = [f"{word} {', '.join(map(_named, sorted(of)))}" for word, of in changes.items() if of]
+    return " and ".join(texts) or ("the whole prompt" if blocks == baseline else "")
 
 
 def _named(block: str) -> str:

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 
 from merge_runner.llm.ledger import APART
 from merge_runner_analysis.task import task_settings
-from merge_runner_analysis.web.computed import computed
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.listing import MISSING
 from merge_runner_analysis.web.reading import Row
@@ -78,7 +77,7 @@ def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
         raise NotThere(f"the database holds no run {sweep_id}")
     (run,) = matching
     state = run["state"]
-    if seen and state == "lost" and site.catalogue.is_locked:
+    if seen and state == "lost" and site.catalogue.copies.is_locked:
         raise NothingNew  # how it ended cannot be read yet
     return site.render(
         "sweep.html",
@@ -106,4 +105,4 @@ def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
 
 def audit_of(site: Site, runs: Sequence[Row]) -> Job | None:
     """Return the audit's notes on each run; None while a run goes on, which ends with an audit."""
-    return None if any(run["followed"] for run in runs) else computed(site, ("audit",))
+    return None if any(run["followed"] for run in runs) else site.computed(("audit",))

@@ -13,7 +13,6 @@ from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import TABLES
 from merge_runner_analysis.tables.formats import render, shown_columns, table_view
 from merge_runner_analysis.tables.model import from_text
-from merge_runner_analysis.web.computed import awaited, computed, computed_table
 from merge_runner_analysis.web.scope import descriptions_of, every
 from merge_runner_analysis.web.site import NotThere, Site, download
 
@@ -48,21 +47,21 @@ def tables_page(site: Site, _: Mapping[str, str]) -> str:
 def table_file(site: Site, name: str, suffix: str, _: Mapping[str, str]) -> Response:
     """Return a table as a file; raises NotThere and StoreError."""
     form = TABLE_FILES[_known(suffix, TABLE_FILES, "file")]
-    content = awaited(site, ("table", _known(name, TABLES, "table"), "", ""))
+    content = site.awaited(("table", _known(name, TABLES, "table"), "", ""))
     return download(render([from_text(content["table"])], form) + "\n", f"{name}.{suffix}")
 
 
 def figure_file(site: Site, name: str, suffix: str, _: Mapping[str, str]) -> Response:
     """Return a figure as a file; raises NotThere and StoreError."""
     kind = FIGURE_FILES[_known(suffix, FIGURE_FILES, "file")]
-    content = awaited(site, ("figure", _known(name, FIGURES, "figure"), suffix))
+    content = site.awaited(("figure", _known(name, FIGURES, "figure"), suffix))
     return Response(content["file"], headers={"content-security-policy": DRAWN}, media_type=kind)
 
 
 def figure_page(site: Site, name: str, _: Mapping[str, str]) -> str:
     """Return a figure with its caption, its files and its citation; raises NotThere."""
     about = FIGURES[_known(name, FIGURES, "figure")]
-    job = computed(site, ("figure", name, "svg"))
+    job = site.computed(("figure", name, "svg"))
     return site.render(
         "figure.html",
         view="tables",
@@ -80,7 +79,7 @@ def cite_page(site: Site, _: Mapping[str, str]) -> str:
     return site.render(
         "cite.html",
         view="cite",
-        computed=computed(site, ("digest",)),
+        computed=site.computed(("digest",)),
         cited_as="Results",
         descriptions=descriptions_of(site),
         version=metadata.version("merge-runner"),
@@ -89,7 +88,7 @@ def cite_page(site: Site, _: Mapping[str, str]) -> str:
 
 def table_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     """Return the page of a table; raises NotThere."""
-    job, table = computed_table(site, _known(name, TABLES, "table"))
+    job, table = site.table(_known(name, TABLES, "table"))
     without = every(asked, "without")
     columns = shown_columns(table) if table else []
     return site.render(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from itertools import chain
 from operator import itemgetter
 from typing import Any
 
@@ -11,7 +12,6 @@ from markupsafe import Markup
 
 from merge_runner.llm.formats import reasoning_of
 from merge_runner.records import DAMAGED, reply_object
-from merge_runner.served_model import Pair
 from merge_runner.text_safety import quoted
 from merge_runner_analysis.web.display_text import clamped, shortened, visible
 from merge_runner_analysis.web.phrases import block_meaning
@@ -115,18 +115,14 @@ def read(site: Site, rows: Sequence[Row]) -> list[Trial]:
 
 def panels(site: Site, row: Row, trial: Trial) -> list[Markup]:
     """Return the panels of all decisions of a trial, in the order of its ribbons."""
-    others = site.catalogue.others
-    decisions = (d for of_side in trial.by_side.values() for d in of_side)
-    return [decision_panel(site, row, trial, d, others) for d in decisions]
+    decisions = chain.from_iterable(trial.by_side.values())
+    return [_panel(site, row, trial, decision) for decision in decisions]
 
 
-def decision_panel(
-    site: Site, row: Row, trial: Trial, decision: Row, others: Sequence[Pair]
-) -> Markup:
-    """Return a decision's observation, reply, plan and action; ``others``: served models."""
+def _panel(site: Site, row: Row, trial: Trial, decision: Row) -> Markup:
+    """Return a decision's observation, reply, plan and action."""
     named = {"side": decision["side"], "decision": decision["decision"]}
     query = REPLY.format(decision["call_key"])
-    raw = site.at.to("sql.csv", q=query) if site.at.served else ""
     before = decision["before"]
     thoughts = ""
     with suppress(*DAMAGED):  # a reply of a server that failed is any text
@@ -144,10 +140,10 @@ def decision_panel(
             trial.blocks[decision["side"]],
         ),
         meaning=block_meaning,
-        others=others,
+        others=site.catalogue.listing.others,
         reply=shortened(decision["reply"]) if decision["reply"] else None,
         reasoning=shortened(thoughts) if thoughts else None,
-        raw=raw,
+        raw=site.at.to("sql.csv", q=query) if site.at.served else "",
         chart=plan_chart(decision, trial),
         points=step_points,
         accelerations=accelerations,

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from starlette.responses import Response
+
 from merge_runner.prompts.blocks import decomposed
 from merge_runner.study.arms import OPPONENT
 from merge_runner_analysis.tables import TABLES
 from merge_runner_analysis.web.catalogue import PAGE, SORTS, TrialFilter
-from merge_runner_analysis.web.computed import awaited, computed
-from merge_runner_analysis.web.filters import HEADINGS, filter_of, sort_of
 from merge_runner_analysis.web.listing import FACTOR
 from merge_runner_analysis.web.phrases import causes_text, plain
 from merge_runner_analysis.web.pictures import sparkline, speed_range
 from merge_runner_analysis.web.reading import Row
-from merge_runner_analysis.web.scope import carried, facets_shown
-from merge_runner_analysis.web.site import NotThere, Site, news_of
+from merge_runner_analysis.web.scope import HEADINGS, carried, facets_shown, filter_of, sort_of
+from merge_runner_analysis.web.site import NotThere, Site, download, news_of
 from merge_runner_analysis.web.urls import CELL, whole
 
 MOST = 4  # drivers whose sums stand above a list
@@ -32,7 +32,7 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
     chosen, sort, cell = filter_of(asked), sort_of(asked), cell_of(asked)
     filters, named = chosen, None
     if cell:
-        named = computed(site, cell_request(cell))
+        named = site.computed(cell_request(cell))
         if named.content is None:
             return site.render("behind.html", view="trials", cell=cell["cell"], computed=named)
         filters = {**chosen, "trials": named.content["trials"]}
@@ -96,13 +96,12 @@ def _unknown(site: Site, chosen: TrialFilter) -> list[tuple[str, str, list[str]]
     ]
 
 
-def export_filter(site: Site, asked: Mapping[str, str]) -> TrialFilter:
-    """Return the filter in an address, whose cell may have to be computed.
-
-    Raises NotThere, StoreError and TooMuch.
-    """
-    filters, cell = filter_of(asked), cell_of(asked)
-    return {**filters, "trials": awaited(site, cell_request(cell))["trials"]} if cell else filters
+def trials_csv(site: Site, asked: Mapping[str, str]) -> Response:
+    """Return the trials in an address as a file; raises NotThere, StoreError and TooMuch."""
+    filters: TrialFilter = filter_of(asked)
+    if cell := cell_of(asked):
+        filters = {**filters, "trials": site.awaited(cell_request(cell))["trials"]}
+    return download(site.catalogue.export(filters, sort_of(asked)), "trials.csv")
 
 
 def cell_of(asked: Mapping[str, str]) -> dict[str, str]:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 
-from merge_runner_analysis.web.filters import HEADINGS as OF_TRIALS
-from merge_runner_analysis.web.filters import filter_of
-from merge_runner_analysis.web.scope import carried, facets_shown
+from merge_runner_analysis.web.scope import HEADINGS as OF_TRIALS
+from merge_runner_analysis.web.scope import carried, facets_shown, filter_of
 from merge_runner_analysis.web.search import (
     FACETS,
     LIMITS,

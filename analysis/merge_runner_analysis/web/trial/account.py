@@ -7,6 +7,7 @@ sample.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil
@@ -81,11 +82,8 @@ class Course:
         low = max(after + 1, next(under_control, self.last))
         if low >= self.last or not self.avoided(side, action, low):
             return None
-        high = self.last  # where they have collided
-        while high - low > 1:
-            middle = (low + high) // 2
-            low, high = (middle, high) if self.avoided(side, action, middle) else (low, middle)
-        return low
+        later = range(low + 1, self.last)  # in the end they have collided
+        return low + bisect_left(later, True, key=lambda i: not self.avoided(side, action, i))
 
     def least_mps2(self, side: Side, action: float, since: int) -> float:
         """Return the least strength that avoids the collision from a sample on."""
