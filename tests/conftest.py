@@ -51,17 +51,20 @@ def emulator_url():
 
 @pytest.fixture
 def merge_runner(tmp_path, emulator_url):
-    """Runs ``merge-runner`` in an empty folder, beside an emulator.
+    """Runs ``merge-runner`` in an empty folder, beside an emulator; it must end with ``code``.
 
     With ``EMULATOR_BASE_URL=""`` a sweep has an emulator of its own. ``start`` returns once a
     process of its own has begun, to be signalled.
     """
     one_at_a_time = asyncio.Lock()
 
-    async def run(*arguments: object, cwd: Path = tmp_path, **changes: str) -> Run:
+    async def run(
+        *arguments: object, code: int | None = None, cwd: Path = tmp_path, **changes: str
+    ) -> Run:
         async with one_at_a_time:
             env = beside(emulator_url, changes)
-            return await asyncio.to_thread(program.run, arguments, cwd=cwd, env=env)
+            done = await asyncio.to_thread(program.run, arguments, cwd=cwd, env=env)
+        return done.ending_with(code)
 
     async def start(
         *arguments: object, cwd: Path = tmp_path, module: str = "", **changes: str
@@ -77,8 +80,9 @@ def merge_runner(tmp_path, emulator_url):
 def prepare(emulator_url):
     """Runs ``merge-runner`` in a folder, for what is made once for several tests."""
 
-    def run(folder: Path, *arguments: object, **changes: str) -> Run:
-        return program.run(arguments, cwd=folder, env=beside(emulator_url, changes))
+    def run(folder: Path, *arguments: object, code: int | None = None, **changes: str) -> Run:
+        done = program.run(arguments, cwd=folder, env=beside(emulator_url, changes))
+        return done.ending_with(code)
 
     return run
 

@@ -49,14 +49,12 @@ def pointed(prepare, emulator_url, tmp_path_factory):
     """A folder in which the emulator played a trial under each model's name, and its summary."""
     folder = tmp_path_factory.mktemp("pointed")
     sweep = ("sweep", "baseline", *MODELS, *SMALL, *FAST)
-    without = prepare(folder, *sweep)
-    assert without.code == 2
+    without = prepare(folder, *sweep, code=2)
     assert "_API_KEY" in without.err
     assert "`--model emulator` rehearses the study" in without.err
     unasked = prepare(folder, *sweep, **pointed_at(emulator_url))
     assert (unasked.code, "--yes" in unasked.err) == (2, True)
-    run = prepare(folder, *sweep, "--yes", **pointed_at(emulator_url))
-    assert run.code == 0, run.err
+    run = prepare(folder, *sweep, "--yes", code=0, **pointed_at(emulator_url))
     assert run.summary["calls"]["cached"] == 0, "money was spent without a question"
     return folder, run.summary
 
@@ -77,8 +75,7 @@ def test_the_emulator_behind_a_models_name_is_stored_as_what_it_is(pointed, prep
     export_recording(untold, stripped, [entry.request.key for entry in with_flags], {})
     info = prepare(tmp_path, "recording", "info", untold, "--json").summary
     assert info["scripted"] == info["calls"] == len(with_flags) == summary["calls"]["live"]
-    replay = prepare(tmp_path, "replay", "baseline", *MODELS, *SMALL, "--recording", untold)
-    assert replay.code == 0, replay.err
+    replay = prepare(tmp_path, "replay", "baseline", *MODELS, *SMALL, "--recording", untold, code=0)
     assert replay.summary["scripted"] is True
     assert marks(tmp_path / "results/merge.duckdb") == [(True, True, 200)]
     digests = [results_digest(each / "results/merge.duckdb") for each in (folder, tmp_path)]
@@ -125,8 +122,7 @@ def estimated(merge_runner):
 
     async def estimate(**changes):
         run = await merge_runner("sweep", "baseline", "--model", "o3", "--dry-run", "--json",
-                                 **{"OPENAI_API_KEY": "x", **changes})  # fmt: skip
-        assert run.code == 0, run.err
+                                 code=0, **{"OPENAI_API_KEY": "x", **changes})  # fmt: skip
         return tuple(run.summary[name] for name in ("cost_usd", "measured", "minutes"))
 
     return estimate
@@ -140,8 +136,7 @@ async def test_a_stand_in_is_said_to_answer_and_does_not_change_what_a_model_is_
     sweep = ("sweep", "baseline", "--model", "o3+constant", *SMALL[:-1], *FAST)
     dry = await merge_runner(*sweep, "--dry-run", **pointed)
     assert f"driver  o3 at {host}+constant\n" in dry.out
-    run = await merge_runner(*sweep, "--yes", **pointed)
-    assert run.code == 0, run.err
+    run = await merge_runner(*sweep, "--yes", code=0, **pointed)
     assert f"o3 at {host}: a scripted stand-in answered, not o3\n" in run.out
     assert f"driver  o3 at {host}+constant\n" in run.err
     assert "WARNING: a scripted stand-in answers, not o3" in run.err
@@ -189,13 +184,8 @@ NAMING.execute(re.search(r"CREATE MACRO[^;]*driver_name[^;]*;", schema_sql())[0]
 
 
 URLS = (
-    *(
-        "https://a.b-c.d/v1",
-        "http://localhost:8080/v1",
-        "http://1.2.3.4:1/",
-        "https://[::1]:8000/v1",
-    ),
-    *("http://[2001:db8::1]/", "https://a/b//c: d@e", "http://a:65535/http://b/v1"),
+    *("https://a.b-c.d/v1", "http://localhost:8080/v1", "http://1.2.3.4:1/", "https://a/b//c: d@e"),
+    *("https://[::1]:8000/v1", "http://[2001:db8::1]/", "http://a:65535/http://b/v1"),
 )
 
 

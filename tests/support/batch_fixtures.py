@@ -3,16 +3,13 @@
 import pytest
 from aiohttp import web
 
-from merge_runner.config import ScenarioConfig
 from merge_runner.llm.batch.providers import SERVICES
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import HttpTransport
-from merge_runner.prompts.blocks import prompt_of, render_prompt
 from merge_runner.providers import Endpoint, ModelEntry
 from merge_runner.records import Slot, make_request
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.scenarios.merge.geometry import TRACK
-from merge_runner.scenarios.merge.world import World
+from tests.support.emulator_fixtures import first_prompt
 from tests.support.harness import listening
 
 KEY = "sk-dummy-0123456789"
@@ -29,13 +26,11 @@ def entry_of(form, provider=None, **options):
 
 def lines(form, count=11, *, provider=None, first=0):
     """So many different requests with real prompts, each of another slot."""
-    entry, made, scenario = entry_of(form, provider), [], ScenarioConfig()
+    entry, made = entry_of(form, provider), []
     for number in range(first, first + count):
         condition = list(CONDITIONS)[number % len(CONDITIONS)]
         slot = Slot(condition, 1 + number // len(CONDITIONS), "left", 0, 0)
-        seen = World(scenario, CONDITIONS[condition], TRACK).observe("left")
-        prompt = render_prompt(seen, None, prompt=prompt_of("baseline"), scenario=scenario)
-        sent = FORMATS[form].request(entry, f"{prompt}\n{slot.repetition}")
+        sent = FORMATS[form].request(entry, f"{first_prompt(condition)}\n{slot.repetition}")
         named = {"provider": entry.provider, "endpoint": entry.provider, "model": entry.id}
         sent = {"path": sent.path, "headers": sent.headers, "body": sent.body}
         made.append(make_request(slot=slot, **named, **sent))

@@ -1,3 +1,5 @@
+from functools import cache
+
 import pytest
 
 from merge_runner.config import ScenarioConfig
@@ -23,9 +25,15 @@ async def emulator():
         await runner.cleanup()
 
 
-@pytest.fixture(scope="session")
+@cache
+def first_prompt(condition="N_0_0", side="left", variant="baseline"):
+    """What a driver is asked first in a condition."""
+    scenario = ScenarioConfig()
+    seen = World(scenario, CONDITIONS[condition], TRACK).observe(side)
+    return render_prompt(seen, None, prompt=prompt_of(variant), scenario=scenario)
+
+
+@pytest.fixture
 def driving_prompt():
     """What the left driver is asked first in a symmetric trial."""
-    scenario = ScenarioConfig()
-    seen = World(scenario, CONDITIONS["N_0_0"], TRACK).observe("left")
-    return render_prompt(seen, None, prompt=prompt_of("baseline"), scenario=scenario)
+    return first_prompt()

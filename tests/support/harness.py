@@ -44,6 +44,11 @@ class Run:
     def summary(self) -> dict:
         return json.loads(self.out)
 
+    def ending_with(self, code: int | None) -> "Run":
+        """Itself, if it has this exit code, or none is asked for."""
+        assert code is None or self.code == code, f"exit code {self.code}: {self.out}{self.err}"
+        return self
+
 
 def how_to(part: str) -> str:
     """The code of a section of docs/extend.md."""
@@ -121,12 +126,17 @@ class Watched:
         """With which the program asks it for the emulator."""
         return {"EMULATOR_BASE_URL": f"{self.url}/v1"}
 
+    @property
+    def account(self) -> dict[str, str]:
+        """With which the program asks it for any provider's model, too."""
+        keys = {f"{name}_API_KEY": "a-dummy-key" for name in ("OPENAI", "ANTHROPIC", "GEMINI")}
+        urls = dict.fromkeys(("ANTHROPIC_BASE_URL", "GOOGLE_GEMINI_BASE_URL"), self.url)
+        return keys | urls | self.env | {"OPENAI_BASE_URL": f"{self.url}/v1"}
+
 
 @asynccontextmanager
-async def listening(handle: Callable[[web.Request], Awaitable[web.StreamResponse]]):
-    """Serve one handler for all methods and paths on loopback; yields the URL."""
-    app = web.Application(client_max_size=2**26)
-    app.router.add_route("*", "/{path:.*}", handle)
+async def on_loopback(app: web.Application):
+    """Serve an application on a free port of loopback; yields the URL."""
     runner = web.AppRunner(app, access_log=None, shutdown_timeout=0.1)
     await runner.setup()
     await web.TCPSite(runner, HOST, 0).start()
@@ -134,6 +144,13 @@ async def listening(handle: Callable[[web.Request], Awaitable[web.StreamResponse
         yield f"http://{HOST}:{runner.addresses[0][1]}"
     finally:
         await runner.cleanup()
+
+
+def listening(handle: Callable[[web.Request], Awaitable[web.StreamResponse]]):
+    """Serve one handler for all methods and paths."""
+    app = web.Application(client_max_size=2**26)
+    app.router.add_route("*", "/{path:.*}", handle)
+    return on_loopback(app)
 
 
 async def as_a_model(request: web.Request, handler) -> web.StreamResponse:
@@ -165,11 +182,5 @@ async def watched(middle: Middle | None = None, faults=None, *, honest: bool = T
     app.middlewares.append(watch)
     if not honest:
         app.on_response_prepare.clear()
-    runner = web.AppRunner(app, access_log=None, shutdown_timeout=0.1)
-    await runner.setup()
-    await web.TCPSite(runner, HOST, 0).start()
-    seen.url = f"http://{HOST}:{runner.addresses[0][1]}"
-    try:
+    async with on_loopback(app) as seen.url:
         yield seen
-    finally:
-        await runner.cleanup()

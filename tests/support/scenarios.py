@@ -3,7 +3,6 @@
 import asyncio
 import json
 import tomllib
-from contextlib import asynccontextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
@@ -11,10 +10,9 @@ from datetime import UTC, datetime, timedelta
 from aiohttp import web
 
 from merge_runner.chance import draw
-from merge_runner.emulator.server import HOST
 from merge_runner.llm.formats import FORMATS
 from merge_runner.records import SCRIPTED_FIELD
-from tests.support.harness import PROJECT
+from tests.support.harness import PROJECT, on_loopback
 from tests.support.mock_server import FaultPlan, application
 
 ENDINGS = {
@@ -113,15 +111,8 @@ async def _play(request, handler):
     return scenario.reply(json.loads(usual.body), wire)
 
 
-@asynccontextmanager
-async def playing(plan, *middlewares):
-    """Serve an emulator on loopback that plays a plan; yields its URL."""
+def playing(plan, *middlewares):
+    """Serve an emulator that plays a plan; yields its URL."""
     app = application(plan)
     app.middlewares.extend((*middlewares, _play))
-    runner = web.AppRunner(app, access_log=None, shutdown_timeout=0.01)
-    await runner.setup()
-    await web.TCPSite(runner, HOST, 0).start()
-    try:
-        yield f"http://{HOST}:{runner.addresses[0][1]}"
-    finally:
-        await runner.cleanup()
+    return on_loopback(app)

@@ -175,13 +175,6 @@ def test_a_trial_ends_within_a_second_when_the_cars_collide():
     assert len(trial.decisions) == 2 * 4
 
 
-def test_a_trial_in_which_both_stand_still_times_out():
-    trial = play(Holding(-1.0), Holding(-1.0))
-    assert (trial.status, trial.end_time_s, trial.merged_first) == ("timeout", 30.0, None)
-    assert len(trial.decisions) == 2 * 30
-    assert trial.error is None
-
-
 @pytest.mark.parametrize("failing", SIDES)
 def test_a_failed_call_ends_the_trial_and_keeps_what_was_played(failing):
     drivers = {side: Asking(-0.1) for side in SIDES}

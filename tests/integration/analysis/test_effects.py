@@ -166,8 +166,7 @@ FROM trials WHERE status = 'finished' GROUP BY ALL
 
 def test_the_one_in_a_hurry_is_compared_with_the_one_on_the_same_side(prepare, tmp_path):
     (tmp_path / "hurry.toml").write_text(HURRY)
-    done = prepare(tmp_path, "sweep", "hurry.toml", "--db", "t.duckdb", *FAST)
-    assert done.code == 0
+    done = prepare(tmp_path, "sweep", "hurry.toml", "--db", "t.duckdb", *FAST, code=0)
     # What is planted makes several clients of one model, which share what they asked.
     assert "from the cache" not in done.out
     study = Study(tmp_path / "t.duckdb")
@@ -189,31 +188,6 @@ def test_the_one_in_a_hurry_is_compared_with_the_one_on_the_same_side(prepare, t
     assert (found.at_level.n, found.at_reference.n) == tuple(
         counts.groupby(counts.index.get_level_values(0) == "")["n"].sum()
     )
-
-
-PERSONA = """
-[texts.persona.taxi]
-add = [{ after = "C3.human", text = "You are a taxi driver." }]
-given_to = "ego"
-"""
-
-
-def test_words_that_nobody_reads_change_no_effect_of_others(prepare, tmp_path):
-    """Their trials are copies, in which the one with the words sits on either side."""
-    study = HURRY.replace("[factors]", '[factors]\npersona = ["none", "taxi"]') + PERSONA
-    (tmp_path / "both.toml").write_text(study.replace("repetitions = 30", "repetitions = 8"))
-    assert prepare(tmp_path, "sweep", "both.toml", "--db", "t.duckdb", *FAST).code == 0
-    every, alone = (
-        {name: row for name, row in values_of(study, "effects").items() if "hurry=yes/" in name}
-        for study in (
-            Study(tmp_path / "t.duckdb"),
-            Study(tmp_path / "t.duckdb", Selection(where={"persona": ["none"]})),
-        )
-    )
-    same = ("estimate", "estimate_reference", "difference", "ci", "p", "n", "n_reference")
-    for name, row in alone.items():
-        assert {of: every[name][of] for of in same} == {of: row[of] for of in same}
-    assert alone["hurry=yes/left_first_percent"]["estimate_reference"] == pytest.approx(50)
 
 
 def test_a_study_without_factors_says_so(tmp_path):

@@ -226,16 +226,6 @@ def test_means_are_compared_within_the_cells_that_both_levels_have_and_the_notes
     assert abs(row["value"] - rows["model=cheap/gap_m"]["value"]) > 0.1
 
 
-def test_the_trials_of_a_stand_in_that_reads_no_level_are_not_tested_and_count_once(played):
-    table = made(Study(played.db), "factors")
-    for name in ("model=dear/gap_m", "temperature=0.2/gap_m"):
-        row = by_id(table)[name]
-        assert {row.values.get(of) for of in ("difference", "p", "p_holm")} == {None}
-        assert row.note.startswith("not tested: the same trials at both levels")
-    assert by_id(table)["opponent=self/gap_m"].values["trials"] == 6
-    assert by_id(table)["opponent=sleepy/gap_m"].values["p"] is not None
-
-
 def test_stand_ins_are_never_pooled_with_models(copy):
     study = changed(
         copy,

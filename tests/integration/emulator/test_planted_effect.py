@@ -1,33 +1,22 @@
 """An effect that a study plants in the emulator is what its analysis finds in the long run."""
 
-from functools import cache
 from itertools import product
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from merge_runner.config import ScenarioConfig
 from merge_runner.emulator.driver import answer
 from merge_runner.planted_effect import PARAMETERS, PlantedEffect, planted_fields
-from merge_runner.prompts.blocks import prompt_of, render_prompt
 from merge_runner.prompts.parse import parse_reply
 from merge_runner.providers import PROVIDERS
 from merge_runner.records import SIDES, Slot
 from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
-from merge_runner.scenarios.merge.geometry import TRACK
-from merge_runner.scenarios.merge.world import World
 from merge_runner_analysis.stats.regressions import WHO_FIRST_TERMS, who_first_logit
+from tests.support.emulator_fixtures import first_prompt
 
 HURRIED = "You are in a hurry."
 REPETITIONS = range(1, 201)
-
-
-@cache
-def first_prompt(condition, side):
-    scenario = ScenarioConfig()
-    seen = World(scenario, CONDITIONS[condition], TRACK).observe(side)
-    return render_prompt(seen, None, prompt=prompt_of("baseline"), scenario=scenario)
 
 
 def told(condition, repetition, side, effect, added=""):

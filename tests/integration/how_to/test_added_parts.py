@@ -54,17 +54,14 @@ def write(folder, **changed):
 def folder(tmp_path_factory, prepare):
     """Where the study has been played."""
     folder = write(tmp_path_factory.mktemp("added"))
-    done = prepare(folder, "sweep", "study.toml", "--trust", *FAST)
-    assert done.code == 0, done.err
+    prepare(folder, "sweep", "study.toml", "--trust", *FAST, code=0)
     return folder
 
 
 @pytest.fixture
 def run(folder, prepare):
     def run(*arguments):
-        done = prepare(folder, *arguments)
-        assert done.code == 0, f"{arguments}: {done.err}"
-        return done
+        return prepare(folder, *arguments, code=0)
 
     return run
 

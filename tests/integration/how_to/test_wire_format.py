@@ -7,9 +7,8 @@ import pytest
 from aiohttp import web
 
 from merge_runner.emulator.driver import answer
-from merge_runner.emulator.server import HOST
 from merge_runner.results.store import query
-from tests.support.harness import how_to
+from tests.support.harness import how_to, listening
 
 MODELS = """
 [talker-1]
@@ -40,7 +39,7 @@ class Talker:
     always: tuple[int, dict] | None = None
 
     async def say(self, request: web.Request) -> web.Response:
-        if request.headers.get("x-talker-key") != KEY:
+        if (request.path, request.headers.get("x-talker-key")) != ("/say", KEY):
             return web.json_response({"error": {"message": "who are you?"}}, status=401)
         body = await request.json()
         self.bodies.append(body)
@@ -52,16 +51,10 @@ class Talker:
 
 
 @asynccontextmanager
-async def listening(talker):
+async def asked(talker):
     """The service on loopback; yields what to set in the environment."""
-    app = web.Application()
-    app.add_routes([web.post("/say", talker.say)])
-    runner = web.AppRunner(app, access_log=None, shutdown_timeout=0.1)
-    await runner.setup()
-    await web.TCPSite(runner, HOST, 0).start()
-    url = f"http://{HOST}:{runner.addresses[0][1]}"
-    yield {"TALKER_BASE_URL": url, "TALKER_API_KEY": KEY}
-    await runner.cleanup()
+    async with listening(talker.say) as url:
+        yield {"TALKER_BASE_URL": url, "TALKER_API_KEY": KEY}
 
 
 @pytest.fixture
@@ -75,7 +68,7 @@ def folder(tmp_path):
 async def test_a_format_from_outside_is_sent_waited_for_read_and_paid(merge_runner, folder):
     busy = {"error": {"code": "busy", "message": "Busy.", "details": {"wait_ms": 900}}}
     talker = Talker(first=(503, busy))
-    async with listening(talker) as there:
+    async with asked(talker) as there:
         played = await merge_runner(*SWEEP, "--max-cost", 1, **there)
     assert played.code == 0, played.err
     assert played.summary["audit"]["findings"] == []
@@ -109,7 +102,7 @@ async def test_a_format_from_outside_is_sent_waited_for_read_and_paid(merge_runn
 async def test_what_its_errors_mean_stands_in_its_own_file(
     merge_runner, folder, status, body, code, says
 ):
-    async with listening(Talker(always=(status, body))) as there:
+    async with asked(Talker(always=(status, body))) as there:
         stopped = await merge_runner(*SWEEP, **there)
     assert stopped.code == code
     assert says in stopped.err
@@ -118,15 +111,13 @@ async def test_what_its_errors_mean_stands_in_its_own_file(
 
 async def test_a_key_goes_into_the_providers_own_header_and_nowhere_else(merge_runner, folder):
     talker = Talker()
-    async with listening(talker) as there:
+    async with asked(talker) as there:
         refused = await merge_runner(*SWEEP, **{**there, "TALKER_API_KEY": "another"})
     assert (refused.code, talker.bodies) == (2, [])
     assert "set TALKER_API_KEY to a valid one" in refused.err
-    missing = await merge_runner(*SWEEP)
-    assert missing.code == 2
+    missing = await merge_runner(*SWEEP, code=2)
     assert "set TALKER_API_KEY" in missing.err
     (folder / "models.toml").write_text(MODELS.replace('"say"', '"tell"'))
-    unknown = await merge_runner(*SWEEP)
-    assert unknown.code == 2
+    unknown = await merge_runner(*SWEEP, code=2)
     assert "unknown wire format 'tell'; valid: openai-chat" in unknown.err
     assert "anthropic, say" in unknown.err

@@ -250,8 +250,9 @@ async def test_a_call_of_a_running_trial_has_its_place_whatever_it_waits_for(
             if call == number:
                 trials.append(trial)
                 budget.queue.reorder()
-    done, _ = await asyncio.wait(tasks, timeout=0.1)
-    assert {tasks.index(task) for task in done} == go_on
+    await asyncio.wait_for(asyncio.gather(*(tasks[number] for number in go_on)), 5)
+    await asyncio.sleep(0.01)
+    assert {number for number, task in enumerate(tasks) if task.done()} == go_on
     for task in tasks:
         task.cancel()
 

@@ -11,7 +11,7 @@ from aiohttp import web
 from merge_runner.results.store import results_digest
 from merge_runner.run.options import Options
 from merge_runner.run.plan import make_plan
-from tests.integration.reliability.test_batches import PRICE, account, answered
+from tests.integration.reliability.test_batches import PRICE, answered
 from tests.support.harness import a_model, run_sweep, watched
 from tests.support.mock_server import BatchPlan, FaultPlan
 
@@ -176,7 +176,7 @@ def play(tmp_path, monkeypatch):
         (tmp_path / "models.toml").write_text(a_model("model", **fields))
         (tmp_path / "study.toml").write_text(STUDY)
         async with watched(chain(middles), plan) as server:
-            for name, value in account(server).items():
+            for name, value in server.account.items():
                 monkeypatch.setenv(name, value)
             plan = make_plan(str(tmp_path / "study.toml"), "model", trust=True)
             db = tmp_path / f"{len([*tmp_path.iterdir()])}.duckdb"

@@ -28,10 +28,6 @@ def experiments(tmp_path):
     return folder
 
 
-def account(server):
-    return {"OPENAI_API_KEY": "a-dummy-key", "OPENAI_BASE_URL": f"{server.url}/v1"}
-
-
 class Bill:
     """What the server charges: the price of every answer that it counts."""
 
@@ -52,10 +48,9 @@ async def sql(merge_runner, query):
 async def test_the_cap_holds_over_all_runs_and_a_higher_one_goes_on(merge_runner):
     bill = Bill()
     async with watched(bill.middle) as server:
-        env = account(server)
+        env = server.account
         sweep = (*SWEEP, "--reps", 4, "--yes", *FAST)
-        run = await merge_runner(*sweep, "--max-cost", ROOM_FOR_SOME, **env)
-        assert run.code == 3, run.err
+        run = await merge_runner(*sweep, "--max-cost", ROOM_FOR_SOME, code=3, **env)
         assert 0 < bill.usd <= ROOM_FOR_SOME
         assert run.summary["cost_usd"] == pytest.approx(bill.usd)
         assert run.summary["trials"]["suspended"] > 0
@@ -71,8 +66,7 @@ async def test_the_cap_holds_over_all_runs_and_a_higher_one_goes_on(merge_runner
         again = await merge_runner(*sweep, "--max-cost", ROOM_FOR_SOME, **env)
         assert (again.code, bill.usd) == (3, spent)
         assert again.summary["sweep_cost_usd"] == pytest.approx(spent)
-        done = await merge_runner(*sweep, "--max-cost", 50, **env)
-        assert done.code == 0, done.err
+        done = await merge_runner(*sweep, "--max-cost", 50, code=0, **env)
         (calls,) = await sql(merge_runner, "select count(*) as n from calls")
         assert calls["n"] == server.requests, "nothing was paid for twice"
         query = "select (config->>'max_cost_usd')::double as cap from sweeps order by started_at"
@@ -93,7 +87,7 @@ async def test_one_cap_holds_over_several_sweeps(merge_runner, experiments):
     bill = Bill()
     async with watched(bill.middle) as server:
         sweep = ("sweep", "baseline", "other", *SWEEP[2:], "--yes", *FAST)
-        run = await merge_runner(*sweep, "--max-cost", ROOM_FOR_SOME, **account(server))
+        run = await merge_runner(*sweep, "--max-cost", ROOM_FOR_SOME, **server.account)
     first, other = (json.loads(line) for line in run.out.splitlines())
     assert (run.code, first["trials"]["suspended"]) == (3, 0), run.err
     assert other["trials"]["suspended"] > 0
@@ -116,9 +110,8 @@ async def test_a_begun_trial_that_cannot_be_paid_is_suspended_with_its_replies(m
         return web.json_response(body)
 
     async with watched(middle) as server:
-        env = account(server)
-        run = await merge_runner(*ONE, "--max-cost", 2.5, **env)
-        assert run.code == 3, run.err
+        env = server.account
+        run = await merge_runner(*ONE, "--max-cost", 2.5, code=3, **env)
         assert run.summary["trials"]["suspended"] == 1
         assert run.summary["sweep_cost_usd"] + run.summary["set_aside_usd"] <= 2.5
         assert run.summary["set_aside_usd"] > 0.1
@@ -142,7 +135,7 @@ async def test_what_a_run_has_in_flight_is_not_released_and_stays_set_aside_when
     arrived = asyncio.Event()
     sweep = (*SWEEP, "--reps", 2, "--conditions", "L_4_0", "--yes", *FAST)
     async with watched(middle) as server:
-        env = account(server)
+        env = server.account
         process = await merge_runner.start(*sweep, **env)
         await arrived.wait()
         told = await merge_runner("ledger")
@@ -164,7 +157,7 @@ async def test_what_a_run_has_in_flight_is_not_released_and_stays_set_aside_when
 
 async def test_hits_cost_nothing_and_the_estimate_counts_what_is_missing(merge_runner, tmp_path):
     async with watched(as_a_model, honest=False) as server:
-        env = account(server)
+        env = server.account
         sweep = (*SWEEP, "--conditions", "L_4_0", *FAST, "--reps")
         before = sorted(tmp_path.rglob("*"))
         assert not (await merge_runner(*sweep, 1, "--dry-run", **env)).summary["measured"]
@@ -198,14 +191,12 @@ async def test_an_unknown_price_is_said_and_needs_yes(merge_runner, experiments)
     entry = a_model("mine", **O3, id="nobody-knows", price="genai-prices")
     (experiments / "models.toml").write_text(entry)
     async with watched() as server:
-        env = account(server)
+        env = server.account
         sweep = ("sweep", "baseline", "--model", "mine", "--conditions", "L_4_0", "--json", *FAST)
-        asked = await merge_runner(*sweep, **env)
-        assert asked.code == 2
+        asked = await merge_runner(*sweep, code=2, **env)
         assert "an unknown price" in asked.err
         assert "--yes" in asked.err
-        capped = await merge_runner(*sweep, "--yes", "--max-cost", 1, **env)
-        assert capped.code == 2
+        capped = await merge_runner(*sweep, "--yes", "--max-cost", 1, code=2, **env)
         assert "--max-cost cannot hold" in capped.err
         assert "give it a `price` in [mine] in experiments/models.toml" in capped.err
         assert server.requests == 0
@@ -223,7 +214,7 @@ async def test_runs_of_two_models_under_one_cap_never_pass_it_and_both_end(
         registry.write("\n" + a_model("twin", **O3, id="o3-twin", price=price))
     bill = Bill()
     async with watched(bill.middle) as server:
-        env = account(server)
+        env = server.account
         sweep = ("sweep", "baseline", "--conditions", "L_4_0,N_0_0,R_-4_8", "--reps", 1, "--yes")
         twins = ("o3", "twin")
         runs = [await merge_runner.start(*sweep, *FAST, "--model", name, **env) for name in twins]
@@ -241,7 +232,7 @@ async def test_what_is_set_aside_is_shown_with_its_reasons_and_released_by_name(
         return await handler(request)
 
     async with watched(middle) as server:
-        assert (await merge_runner(*ONE, **account(server))).code == 0
+        assert (await merge_runner(*ONE, **server.account)).code == 0
     told = await merge_runner("ledger")
     driver = f"o3 at {server.url.removeprefix('http://')}"
     assert re.match(
@@ -253,8 +244,7 @@ async def test_what_is_set_aside_is_shown_with_its_reasons_and_released_by_name(
     assert "  L_4_0 rep 1 " in told.out
     (account_before,) = json.loads((await merge_runner("ledger", "--json")).out)
     assert account_before["open_attempts"] == account_before["reasons"][0]["attempts"] == 2
-    asked = await merge_runner("ledger", "--release", "baseline/o3/set0")
-    assert asked.code == 2
+    asked = await merge_runner("ledger", "--release", "baseline/o3/set0", code=2)
     assert "--max-cost may be passed by as much" in asked.err
     assert "add --yes" in asked.err
     unknown = await merge_runner("ledger", "--release", "other/o3/set0", "--yes")

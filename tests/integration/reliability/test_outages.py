@@ -8,7 +8,7 @@ from aiohttp import web
 
 from merge_runner.records import SLOT_HEADER
 from merge_runner.results.store import query
-from tests.support.harness import FAST, PROJECT, Watched, a_model, watched
+from tests.support.harness import FAST, PROJECT, a_model, watched
 
 
 def configured(folder, deadline_s, *options):
@@ -47,16 +47,14 @@ async def test_one_trial_fails_with_a_reason_and_the_rest_go_on(merge_runner, tm
     mended = False
     sweep = configured(tmp_path, 1.2, "--reps", 1, "--conditions", "L_4_8,N_0_0,L_4_0")
     async with watched(middle) as server:
-        run = await merge_runner(*sweep, **server.env)
-        assert run.code == 1
+        run = await merge_runner(*sweep, code=1, **server.env)
         assert run.summary["trials"]["finished"] == 2
         ((trial, error),) = run.summary["failed"].items()
         assert trial == "patient/baseline/L_4_8/rep01"
         assert "no answer within 1 s (HTTP 503: The engine is down.), 2 attempts" in error
         before = server.requests
         mended = True
-        again = await merge_runner(*sweep, **server.env)
-        assert again.code == 0, again.err
+        again = await merge_runner(*sweep, code=0, **server.env)
     # The attempts in vain are not forgotten, and what had been answered was not asked again.
     told = "select fate from attempts where outcome = 'overloaded'"
     assert query(tmp_path / "results/merge.duckdb", told)[1] == [("retried",)] * 2
@@ -73,8 +71,7 @@ async def test_when_everything_fails_the_list_is_not_burnt_and_recorded_trials_d
         part = ("--conditions", "L_4_0,L_4_8,N_0_0")
         assert (await merge_runner(*sweep, *part, **server.env)).code == 0
         service.working, before = False, server.requests
-        run = await merge_runner(*sweep, "--db", "new", **server.env)
-        assert run.code == 1, run.err
+        run = await merge_runner(*sweep, "--db", "new", code=1, **server.env)
         said = "the last 10 trials with patient failed and no call was answered in between"
         assert said in run.err
         assert "run the same command to go on" in run.err
@@ -95,7 +92,6 @@ async def test_when_everything_fails_the_list_is_not_burnt_and_recorded_trials_d
 
 
 STREAM = ('data: {"choices": [{"delta": {"content": "M"}}]}\n\ndata: [DONE]\n', "text/event-stream")
-USED_UP = "You have reached your specified API usage limits. You will regain access on 2027-01-01."
 FIRST_CALLS = tomllib.loads((PROJECT / "tests/cases/first_calls.toml").read_text())
 
 
@@ -117,7 +113,7 @@ async def test_what_no_call_would_fare_better_with_ends_the_run_at_its_first_cal
 
     sweep = ("sweep", "baseline", "--reps", 2, "--model", "o3", "--yes", "--json", *FAST)
     async with watched(middle) as server:
-        env = {"OPENAI_API_KEY": "a-dummy-key", "OPENAI_BASE_URL": f"{server.url}/v1"}
+        env = server.account
         run = await merge_runner(*sweep, "--max-cost", 20, **env)
     assert (run.code, server.requests) == (told["exit"], told["requests"]), run.err
     last = run.err.splitlines()[-1]
@@ -125,18 +121,6 @@ async def test_what_no_call_would_fare_better_with_ends_the_run_at_its_first_cal
     assert run.summary["trials"]["failed"] == 0
     if told["status"] != 200:
         assert run.summary["set_aside_usd"] == 0
-
-
-async def test_a_quota_that_is_used_up_in_the_midst_fails_no_trial(merge_runner, tmp_path):
-    async def middle(request, handler):
-        if server.requests > 5:
-            return as_reply({"error": {"message": USED_UP, "type": "invalid_request_error"}}, 400)
-        return await handler(request)
-
-    async with watched(middle) as server:
-        run = await merge_runner(*configured(tmp_path, 600), **server.env)
-    assert (run.code, run.summary["trials"]["failed"]) == (3, 0), run.err
-    assert USED_UP in run.err
 
 
 async def test_errors_within_a_200_and_odd_bodies_in_the_midst_of_a_run_cost_no_trial(
@@ -158,14 +142,6 @@ async def test_errors_within_a_200_and_odd_bodies_in_the_midst_of_a_run_cost_no_
         run = await merge_runner(*sweep, **server.env)
     assert run.code == 0, run.err
     assert not odd
-
-
-async def test_nobody_listens(merge_runner, tmp_path):
-    run = await merge_runner(*configured(tmp_path, 0.6), **Watched("http://127.0.0.1:9").env)
-    assert run.code == 1
-    assert "the first call of this run: no answer within 1 s" in run.err
-    assert run.summary["attempts"].keys() == {"no_connection"}
-    assert run.summary["trials"]["failed"] == 0
 
 
 async def test_waits_are_told(merge_runner, tmp_path, monkeypatch):
@@ -196,15 +172,12 @@ async def test_another_model_behind_a_name_stops_a_strict_sweep(merge_runner):
 
     sweep = ("sweep", "baseline", "--reps", 2, "--model", "o3", "--yes", "--json", *FAST)
     async with watched(middle) as server:
-        env = {"OPENAI_API_KEY": "a-dummy-key", "OPENAI_BASE_URL": f"{server.url}/v1"}
-        run = await merge_runner(*sweep, "--in-flight", 2, "--strict-model", **env)
-        assert run.code == 1
+        env = server.account
+        run = await merge_runner(*sweep, "--in-flight", 2, "--strict-model", code=1, **env)
         assert "o3-mini answered where o3-2025-04-16 was asked for" in run.err
         stopped_at = server.requests
         assert stopped_at < 20
         # Its replies are kept: the same command stops at once, and without the option it goes on.
-        again = await merge_runner(*sweep, "--strict-model", "--in-flight", 2, **env)
-        assert again.code == 1
-        loose = await merge_runner(*sweep, "--conditions", "L_4_0", **env)
-        assert loose.code == 0
+        await merge_runner(*sweep, "--strict-model", "--in-flight", 2, code=1, **env)
+        loose = await merge_runner(*sweep, "--conditions", "L_4_0", code=0, **env)
     assert loose.summary["model_mismatches"]

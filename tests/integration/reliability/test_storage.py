@@ -62,8 +62,7 @@ async def test_a_disk_that_fills_up_ends_the_run_and_the_next_one_goes_on(
         env = server.env
         with small_disk(1 if what == "cache" else 2) as folder:
             place = folder / what
-            run = await merge_runner(*ALL, f"--{what}", place, **env)
-            assert run.code == 1, run.err
+            run = await merge_runner(*ALL, f"--{what}", place, code=1, **env)
             assert "run the same command again" in line(run)
             assert "Traceback" not in run.err
             # With room again nothing that was kept is lost.
@@ -91,8 +90,7 @@ async def test_a_read_only_folder_is_told_before_anything_is_asked(merge_runner,
             ):
                 place = stored / there
                 options = [f"--{k}={path}" for k, path in {**writable, what: place}.items()]
-                run = await merge_runner(*SWEEP, "--reps", 2, *options, **server.env)
-                assert run.code == 2, run.err
+                run = await merge_runner(*SWEEP, "--reps", 2, *options, code=2, **server.env)
                 assert str(place.parent) in line(run)
                 assert f"--{what}" in line(run)
     assert server.requests == 0
@@ -170,8 +168,7 @@ async def test_a_truncated_database_is_left_alone_and_rebuilt_from_the_cache(mer
     for before in (whole[: len(whole) // 2], whole[:999], b"no database"):
         db.write_bytes(before)
         for command in (SWEEP, ("digest",)):
-            run = await merge_runner(*command, cwd=stored)
-            assert run.code == 2, (command, run.err)
+            run = await merge_runner(*command, cwd=stored, code=2)
             assert "rebuilt from the cache without a call" in line(run)
             assert db.read_bytes() == before
     db.unlink()
@@ -198,8 +195,7 @@ async def test_a_database_of_another_version_is_refused_in_one_line_and_left_as_
         connection.execute("UPDATE meta SET schema_version = ?", [version])
     before = db.read_bytes()
     for command in commands:
-        run = await merge_runner(*command.split(), "--db", db)
-        assert run.code == 2, command
+        run = await merge_runner(*command.split(), "--db", db, code=2)
         (told,) = run.err.splitlines()
         assert f"other.duckdb has schema version {version}, and" in told
         assert f"merge-runner reads version {SCHEMA_VERSION}: " in told
@@ -247,11 +243,9 @@ async def test_a_damaged_record_of_spending_stops_no_replay(merge_runner, stored
     with closing(sqlite3.connect(stored / "cache/responses/cache.db")) as cache, cache:
         cache.execute("INSERT INTO spent VALUES ('baseline/emulator/set0', 'm', -9.0, 0, 0)")
     for command in ((*SWEEP, "--dry-run"), ("replay", *SWEEP[1:])):
-        run = await merge_runner(*command, "--db", "new", cwd=stored)
-        assert run.code == 0, run.err
+        await merge_runner(*command, "--db", "new", cwd=stored, code=0)
     for command in (SWEEP, ("ledger",)):
-        refused = await merge_runner(*command, cwd=stored)
-        assert refused.code == 2
+        refused = await merge_runner(*command, cwd=stored, code=2)
         assert "no cap could hold" in refused.err
 
 

@@ -17,15 +17,9 @@ O3 = "o3 at openai"
 MODELS = ("emulator", "o3")
 
 
-def account(server):
-    """Where both the emulator and o3 are asked."""
-    key = {"OPENAI_API_KEY": "a-dummy-key"}
-    return server.env | key | {"OPENAI_BASE_URL": f"{server.url}/v1"}
-
-
 async def test_runs_of_two_models_share_a_cache_and_lose_no_row(merge_runner, tmp_path):
     async with watched(faults=FaultPlan(latency_s=0.05)) as server:
-        env = account(server)
+        env = server.account
         runs = [await merge_runner.start(*SWEEP, "--model", model, **env) for model in MODELS]
         summaries = [json.loads((await run.communicate())[0]) for run in runs]
     assert [run.returncode for run in runs] == [0, 0]
@@ -48,7 +42,7 @@ async def test_a_second_live_run_of_a_model_names_the_first_and_asks_nothing(mer
         return await handler(request)
 
     async with watched(middle) as server:
-        env = account(server)
+        env = server.account
         first = await merge_runner.start(*SWEEP, **env)
         await arrived.wait()
         second = await merge_runner(*SWEEP, "--reps", 2, "--db", "second.duckdb", **env)

@@ -4,7 +4,6 @@ import os
 import pickle
 import stat
 import zipfile
-from contextlib import suppress
 
 import pytest
 
@@ -110,18 +109,3 @@ def test_names_cannot_speak_to_the_terminal(imported, tmp_path):
     assert error.startswith(f"error: two?lines?[2J?/{TRIAL}.csv: it lacks ")
     assert error.isprintable()
     assert {note[:6] for note in notes} == {"note: "}
-
-
-def read_all(files):
-    for file in files:
-        assert file.name.isprintable()
-        with suppress(Unreadable):
-            assert file.size > 2**20 or file.read()
-
-
-def test_nothing_is_written_whatever_the_members_are_called(tmp_path):
-    names = ("a/b/c.csv", "d.csv/", f"{TRIAL}.csv", "x" * 300, "con.csv", "~/e.csv", "$HOME/f.csv")
-    path = write_zip(tmp_path / "d.zip", dict.fromkeys(names, b"x"))
-    with open_files(path) as files:
-        read_all(files)
-    assert list(tmp_path.rglob("*")) == [path]

@@ -213,8 +213,7 @@ async def test_a_bad_certificate_ends_a_sweep_at_once_and_nothing_is_sent(
 async def test_an_environment_that_cannot_be_used_is_told_before_anything_is_asked(
     merge_runner, variables, says
 ):
-    run = await merge_runner(*O3, OPENAI_API_KEY=KEY, **variables)
-    assert run.code == 2, run.err
+    run = await merge_runner(*O3, OPENAI_API_KEY=KEY, code=2, **variables)
     line = run.err.splitlines()[-1]
     assert says in line
     assert KEY not in run.err

@@ -14,16 +14,12 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 from merge_runner.trial import Trial, play_trial
+from tests.support.emulator_fixtures import first_prompt
 from tests.support.specs import spec_of
 
 SCENARIO = ScenarioConfig()
 REPETITIONS = range(1, 11)
 SLOT = Slot("L_4_0", 1, "right", 5, 0)
-
-
-def first_prompt(condition, side, variant="baseline"):
-    seen = World(SCENARIO, CONDITIONS[condition], TRACK).observe(side)
-    return render_prompt(seen, None, prompt=prompt_of(variant), scenario=SCENARIO)
 
 
 def straight_prompt(variant="baseline", previous=None, **changes):
@@ -32,12 +28,9 @@ def straight_prompt(variant="baseline", previous=None, **changes):
     return render_prompt(seen, previous, prompt=prompt_of(variant), scenario=SCENARIO)
 
 
-FIRST_PROMPTS = {(name, side): first_prompt(name, side) for name in CONDITIONS for side in SIDES}
-
-
 def first_token(condition, repetition, side, sample_set=0):
     slot = Slot(condition, repetition, side, 0, sample_set)
-    return answer(FIRST_PROMPTS[condition, side], slot).split("\n")[0]
+    return answer(first_prompt(condition, side), slot).split("\n")[0]
 
 
 def first_tokens(condition, repetition, sample_set=0):
@@ -90,7 +83,7 @@ def test_draws_fill_their_range_and_stay_in_it():
 def test_each_part_of_a_slot_changes_some_plan():
     def actions(**changes):
         slots = [replace(Slot(condition, 1, "left", 0, 0), **changes) for condition in CONDITIONS]
-        return [first_action(FIRST_PROMPTS[s.condition, "left"], s) for s in slots]
+        return [first_action(first_prompt(s.condition, "left"), s) for s in slots]
 
     assert actions() == actions()
     for change in ({"repetition": 2}, {"sample_set": 1}, {"decision": 1}, {"side": "right"}):
@@ -163,7 +156,7 @@ def test_ten_repetitions_of_a_condition_differ_and_another_sample_set_does(trial
         # Plans have two decimals, so two of ten may happen to drive the same.
         assert len({trial.states for trial in ten}) >= 8
         slots = [Slot(condition, 1, "left", 0, sample_set) for sample_set in range(6)]
-        assert len({answer(FIRST_PROMPTS[condition, "left"], slot) for slot in slots}) >= 5
+        assert len({answer(first_prompt(condition, "left"), slot) for slot in slots}) >= 5
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -186,7 +179,7 @@ def test_a_prompt_of_any_variant_gets_a_valid_plan_and_the_token_that_it_asks_fo
 
 
 def test_the_plan_has_as_many_actions_as_the_prompt_asks_for():
-    prompt = FIRST_PROMPTS["N_0_0", "left"]
+    prompt = first_prompt("N_0_0", "left")
     shorter = prompt.replace("exactly 20 numbers", "exactly 8 numbers")
     assert shorter != prompt
     assert len(parse_reply(answer(shorter, None), 8).plan) == 8
@@ -197,7 +190,7 @@ def test_who_goes_first_does_not_brake_and_who_yields_does_not_accelerate():
         for repetition in REPETITIONS:
             for side in SIDES:
                 slot = Slot(condition, repetition, side, 0, 0)
-                action = first_action(FIRST_PROMPTS[condition, side], slot)
+                action = first_action(first_prompt(condition, side), slot)
                 # Within the wobble of the hand, 0.05 of 2.5 m/s^2.
                 if first_token(condition, repetition, side) == "M":
                     assert action >= -0.02
@@ -232,7 +225,7 @@ def test_a_follower_brakes_for_a_slower_car_close_ahead_and_for_none_behind():
 
 
 def test_without_a_slot_an_answer_depends_on_the_prompt_alone():
-    left, right = FIRST_PROMPTS["L_4_0", "left"], FIRST_PROMPTS["L_4_0", "right"]
+    left, right = first_prompt("L_4_0", "left"), first_prompt("L_4_0", "right")
     assert answer(left, None) == answer(left, None)
     # The projected leader goes first.
     assert answer(left, None).startswith("M\n")

@@ -5,25 +5,16 @@ from dataclasses import replace
 
 import pytest
 
-from merge_runner.config import ScenarioConfig
 from merge_runner.emulator.driver import answer
 from merge_runner.planted_effect import PlantedEffect
-from merge_runner.prompts.blocks import prompt_of, render_prompt
 from merge_runner.records import SIDES, Slot, other_side
-from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.scenarios.merge.geometry import TRACK
-from merge_runner.scenarios.merge.world import World
+from tests.support.emulator_fixtures import first_prompt
 
 TRIALS = 1500
-SEEN = {side: World(ScenarioConfig(), CONDITIONS["N_0_0"], TRACK).observe(side) for side in SIDES}
-PROMPTS = {
-    side: render_prompt(seen, None, prompt=prompt_of("baseline"), scenario=ScenarioConfig())
-    for side, seen in SEEN.items()
-}
 
 
 def says_first(slot, effect):
-    return answer(PROMPTS[slot.side], slot, effect).startswith("M")
+    return answer(first_prompt(side=slot.side), slot, effect).startswith("M")
 
 
 @pytest.mark.parametrize("condition", ["N_0_0", "of-a-study"])

@@ -6,17 +6,15 @@ import pytest
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.emulator.driver import random_answer as answer
-from merge_runner.prompts.blocks import VARIANTS, prompt_of, render_prompt
+from merge_runner.prompts.blocks import VARIANTS
 from merge_runner.prompts.parse import parse_reply
 from merge_runner.records import SIDES, Slot
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.scenarios.merge.geometry import TRACK
-from merge_runner.scenarios.merge.world import World
+from tests.support.emulator_fixtures import first_prompt
 
 SCENARIO = ScenarioConfig()
 SLOT = Slot("N_0_0", 1, "left", 0, 0)
-SEEN = World(SCENARIO, CONDITIONS["L_4_8"], TRACK).observe("left")
-PROMPTS = [render_prompt(SEEN, None, prompt=prompt_of(v), scenario=SCENARIO) for v in VARIANTS]
+PROMPTS = [first_prompt("L_4_8", variant=variant) for variant in VARIANTS]
 
 
 @pytest.mark.parametrize(

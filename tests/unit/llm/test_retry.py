@@ -59,10 +59,3 @@ async def test_the_wait_for_a_turn_does_not_count(make):
     assert (await client.ask("prompt", slot())).outcome == "ok"
     assert now_s() > 100
     assert client.direct.transport.timeouts == pytest.approx([50, 40, 30], abs=0.01)
-
-
-async def test_a_wait_that_the_deadline_does_not_allow_is_told(make):
-    client = make(error(503, retry_after="3600"), deadline_s=60.0)
-    with pytest.raises(CallFailed, match="asks to wait 3600 s, longer than a call"):
-        await client.ask("prompt", slot())
-    assert (len(client.direct.transport.sent), now_s()) == (1, 0)

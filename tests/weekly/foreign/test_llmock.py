@@ -11,17 +11,15 @@ from merge_runner.llm.http import HttpTransport
 from merge_runner.providers import Endpoint, ModelEntry
 from merge_runner.records import CallFailed, Slot
 from tests.support.clients import client_of as a_client
-from tests.weekly.foreign.conftest import PROVIDERS
+from tests.support.harness import FAST, a_model
 
 PASSING = (408, 409, 429, 500, 502, 503, 504, 529)
-LASTING = {
-    400: CallFailed,
-    401: EndpointRefused,
-    403: EndpointRefused,
-    404: EndpointRefused,
-    413: CallFailed,
-    422: CallFailed,
-}
+LASTING = dict.fromkeys((400, 413, 422), CallFailed)
+LASTING |= dict.fromkeys((401, 403, 404), EndpointRefused)
+PROVIDERS = {"openai-chat": "openai", "openai-responses": "openai"}
+PROVIDERS |= {name: name for name in ("gemini", "anthropic")}
+KEYS = dict.fromkeys(("OPENAI_API_KEY", "GOOGLE_API_KEY", "ANTHROPIC_API_KEY"), "a-dummy-key")
+PLAN = f"M\nI keep my speed.\n```python\n{[0.0] * 20}\n```"
 BACKOFF_S = 0.05  # a tenth of ours, so that tests end soon
 
 
@@ -58,7 +56,7 @@ def asks(llmock, model):
     return sum(request.model == model for request in llmock.requests)
 
 
-async def test_answers_are_read_as_a_foreign_server_writes_them(llmock, client_of, plan):
+async def test_answers_are_read_as_a_foreign_server_writes_them(llmock, client_of):
     endings = {"ok": None, "truncated": "length", "refusal": "content_filter"}
     known = {
         (wire, outcome)
@@ -68,10 +66,10 @@ async def test_answers_are_read_as_a_foreign_server_writes_them(llmock, client_o
     }
     for wire, outcome in known:
         model = f"{wire}-{outcome}"
-        llmock.add(Reply(plan, finish_reason=endings[outcome], match=Match(model=model)))
+        llmock.add(Reply(PLAN, finish_reason=endings[outcome], match=Match(model=model)))
     for wire, outcome in known:
         reply = await ask(client_of(wire, f"{wire}-{outcome}"))
-        assert (wire, reply.outcome, reply.text) == (wire, outcome, plan)
+        assert (wire, reply.outcome, reply.text) == (wire, outcome, PLAN)
         assert reply.attempts[0].usage.input_tokens > 0 < reply.attempts[0].usage.output_tokens
 
 
@@ -129,14 +127,21 @@ async def test_a_real_quota_costs_few_refusals(llmock, llmock_server, client_of)
     llmock.assert_resilient(strict=True)
 
 
-async def test_a_sweep_in_each_format_passes_what_a_foreign_server_breaks(llmock, sweeps, plan):
-    for wire in PROVIDERS:
+async def test_a_sweep_in_each_format_passes_what_a_foreign_server_breaks(
+    llmock, merge_runner, tmp_path
+):
+    for wire, name in PROVIDERS.items():
         for status in (429, 503):
             llmock.add(Fail(status, retry_after=0.1, match=Match(model=wire)))
-    llmock.reply(plan, times=None)
-    for wire, run in (
-        await sweeps({w: llmock.base_url(name) for w, name in PROVIDERS.items()})
-    ).items():
+        own = {"provider": name, "format": wire, "id": wire, "base_url": llmock.base_url(name)}
+        with (tmp_path / "models.toml").open("a") as registry:
+            registry.write(a_model(wire, **own))
+    llmock.reply(PLAN, times=None)
+    one = ("--reps", 1, "--conditions", "R_-4_8", "--json", "--yes", "--trust", *FAST)
+    for wire in PROVIDERS:
+        places = ("--model", wire, "--db", f"{wire}.duckdb", "--cache", wire)
+        run = await merge_runner("sweep", "baseline", *one, *places, code=0, **KEYS)
+        assert (run.summary["audit"]["findings"], run.summary["trials"]["failed"]) == ([], 0)
         attempts = run.summary["attempts"]
         assert attempts.keys() == {"ok", "rate_limited", "overloaded"}
         assert (attempts["rate_limited"], attempts["overloaded"]) == (1, 1)

@@ -9,10 +9,7 @@ import pytest
 
 from merge_runner.results.store import results_digest
 from tests.integration.reliability.test_batches import (
-    Looks,
-    account,
     answered,
-    interrupted,
     priced,  # noqa: F401 # a fixture
     rows,
 )
@@ -41,7 +38,7 @@ async def test_a_sweep_that_is_killed_at_20_instants_pays_nothing_twice(merge_ru
     chance, killed = random.Random(5), 0
     plan = BatchPlan(delay_s=0.5, failed=0.1, expired=0.05)
     async with watched(middle, FaultPlan(seed=3, batch=plan)) as server:
-        env = account(server)
+        env = server.account
         for number in range(KILLS):
             at = ("before", "after", "anywhere", "anywhere")[number % 4]
             process = await merge_runner.start(*sweep, **env)
@@ -64,7 +61,7 @@ async def test_a_sweep_that_is_killed_at_20_instants_pays_nothing_twice(merge_ru
     assert last.summary["trials"]["failed"] == 0
     quiet = ("sweep", "long.toml", "--reps", 2, "--model", "priced", "--yes")
     async with watched() as server:
-        plain = await merge_runner(*quiet, "--db", "quiet", "--cache", "new", **account(server))
+        plain = await merge_runner(*quiet, "--db", "quiet", "--cache", "new", **server.account)
     assert plain.code == 0, plain.err
     digest = results_digest(tmp_path / "results/merge.duckdb")
     assert digest == results_digest(tmp_path / "quiet")
@@ -72,26 +69,3 @@ async def test_a_sweep_that_is_killed_at_20_instants_pays_nothing_twice(merge_ru
     query = "select count(*) as n from calls where outcome = 'ok' and batch_id is not null"
     (used,) = await rows(merge_runner, query)
     assert used["n"] == batched.total()
-
-
-async def test_a_sweep_may_change_its_mode_at_any_time(merge_runner, tmp_path):
-    sweep = ("sweep", "short.toml", "--model", "priced", "--yes")
-    plan, looks = FaultPlan(latency_s=0.02, batch=BatchPlan(delay_s=0.5)), Looks()
-    async with watched(looks.middle, plan) as server:
-        env = account(server)
-        process = await merge_runner.start(*sweep, "--in-flight", 2, **env)
-        while server.requests < 20:  # another process asks
-            await asyncio.sleep(0.02)
-        process.send_signal(signal.SIGINT)
-        assert await process.wait() == 130
-        await interrupted(merge_runner, looks, *sweep, "--batch", **env)
-        last = await merge_runner(*sweep, **env)
-        batched, alone = await answered(server)
-        plain = await merge_runner(*sweep, "--db", "plain", "--cache", "new", **env)
-    assert (last.code, plain.code) == (0, 0), last.err
-    assert "are not asked again" in last.err
-    assert batched
-    assert max(batched.values()) == 1
-    assert not batched.keys() & alone.keys()
-    digest = results_digest(tmp_path / "results/merge.duckdb")
-    assert digest == results_digest(tmp_path / "plain")

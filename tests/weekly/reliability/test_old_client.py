@@ -60,8 +60,7 @@ def read_by(client: Path, db: Path) -> dict[str, int]:
 
 
 async def test_an_old_duckdb_reads_every_table_and_view(merge_runner, tmp_path, old_client):
-    played = await merge_runner("sweep", "baseline", "--reps", 1, "--conditions", "N_0_0")
-    assert played.code == 0, played.err
+    await merge_runner("sweep", "baseline", "--reps", 1, "--conditions", "N_0_0", code=0)
     rows = read_by(old_client, tmp_path / "results/merge.duckdb")
     assert rows["trial_metrics"] == rows["trials"] == 1
     assert min(rows[name] for name in ("states", "attempts", "geometry")) > 0

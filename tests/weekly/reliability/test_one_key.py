@@ -22,7 +22,7 @@ async def test_two_sweeps_on_one_key_go_on_after_the_servers_429(merge_runner):
 
     sweep = ("sweep", "baseline", "--reps", 1, "--model", "o3", "--yes", "--json", "--rpm", 600)
     async with watched(middle) as server:
-        env = {"OPENAI_API_KEY": "a-dummy-key", "OPENAI_BASE_URL": f"{server.url}/v1"}
+        env = server.account
         runs = [
             await merge_runner.start(*sweep, "--tpm", 10**9, "--conditions", name, "--cache", name,
                                      "--db", f"{name}.duckdb", **env)

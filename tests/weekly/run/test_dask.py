@@ -44,8 +44,7 @@ async def test_a_scheduler_that_dies_ends_the_run_in_one_line(merge_runner, sche
     await scheduler("--no-nanny")
     async with watched(middle, FaultPlan(latency_s=0.2)) as server:
         url = f"{server.url}/v1"
-        run = await merge_runner(*SMALL, "--dask", scheduler.file, EMULATOR_BASE_URL=url)
-        assert run.code == 1
+        run = await merge_runner(*SMALL, "--dask", scheduler.file, EMULATOR_BASE_URL=url, code=1)
         assert "error: the Dask scheduler is gone" in run.err
         assert "Traceback" not in run.err
         again = await merge_runner(*SMALL, EMULATOR_BASE_URL=url)
@@ -92,8 +91,7 @@ async def test_three_workers_keep_the_requests_a_minute_and_come_to_the_results_
         assert run.summary["calls"] == {"live": server.requests, "cached": 0}
         again = await merge_runner(*SIX, "--db", "again", **server.env)
         assert again.summary["calls"]["live"] == 0, "all is recorded"
-    one = await merge_runner(*SIX, "--db", "one", "--cache", "new")
-    assert one.code == 0, one.err
+    await merge_runner(*SIX, "--db", "one", "--cache", "new", code=0)
     digest = (await merge_runner("digest")).out
     assert (digest, "6 trials" in digest) == (
         (await merge_runner("digest", "--db", "one")).out,
@@ -116,16 +114,14 @@ async def test_the_cost_cap_holds_over_all_workers_and_a_higher_one_goes_on(merg
         return reply
 
     async with watched(middle) as server:
-        env = {"OPENAI_API_KEY": "a-dummy-key", "OPENAI_BASE_URL": f"{server.url}/v1"}
+        env = server.account
         sweep = (*SIX, "--reps", 18, "--model", "o3", "--yes", *FAST)
-        run = await merge_runner(*sweep, "--dask", "local:3", "--max-cost", cap, **env)
-        assert run.code == 3, run.err
+        run = await merge_runner(*sweep, "--dask", "local:3", "--max-cost", cap, code=3, **env)
         assert 0 < usd <= cap
         assert run.summary["cost_usd"] == pytest.approx(usd)
         assert run.summary["sweep_cost_usd"] == pytest.approx(usd)
         assert run.summary["trials"]["suspended"] > 0
-        done = await merge_runner(*sweep, "--max-cost", 50, **env)
-        assert done.code == 0, done.err
+        done = await merge_runner(*sweep, "--max-cost", 50, code=0, **env)
         calls = await merge_runner("sql", "select count(*) from calls", "--format", "csv")
         assert int(calls.out.split()[1]) == server.requests, "nothing was paid for twice"
     assert done.summary["sweep_cost_usd"] == pytest.approx(usd)
@@ -140,7 +136,7 @@ async def test_what_stops_a_sweep_stops_it_at_all_workers_in_one_line(merge_runn
         return await handler(request)
 
     async with watched(middle) as server:
-        env = {"OPENAI_API_KEY": "a-dummy-key", "OPENAI_BASE_URL": f"{server.url}/v1"}
+        env = server.account
         run = await merge_runner(
             *SMALL, "--conditions", "L_4_0,N_0_0", "--model", "o3", "--yes", "--dask", "local:2",
             **env,

@@ -14,7 +14,7 @@ from merge_runner_analysis.humans.record import SPEC, SPEC_HASH, parse_csv, tria
 from tests.support.pages import packed, velocity_page
 from tests.support.recordings import Recording, drive, file
 
-LEFT, RIGHT = drive("L_4_0"), drive("R_-4_0", yields="left")
+LEFT = drive("L_4_0")
 # On the pages: two pairs and their iterations.
 DRIVEN = {"1-1": drive("L_4_0"), "3-12": drive("L_4_0", yields="left")}
 
@@ -83,16 +83,6 @@ def test_a_trial_that_is_stored_with_other_values_is_named_and_kept(path):
     assert (report.added, report.stored) == (1, 0)
     assert sorted(report.differing) == [f"human/pair1/L_4_0/iter00{number}" for number in range(4)]
     assert (rows(path, "from trials where rep < 9 order by rep"), rows(path, kept)) == before
-
-
-def test_what_cannot_be_read_says_why_and_the_rest_is_imported(path):
-    far = changed(LEFT, "travelled_distance.left", 0, 2.0)
-    files = {"a/experiment_4_iter_1.csv": b"", "b/experiment_4_iter_1.csv": b"",
-             "experiment_4_iter_2.csv": RIGHT.csv(), "experiment_4_iter_3.csv": far}  # fmt: skip
-    report = imported(path, files)
-    assert report.added == 1
-    assert [name for name, _ in report.unreadable] == [n for n in files if "iter_2" not in n]
-    assert "left at 2.00 m with 10.00 m/s, right at 0.00 m" in report.unreadable[2][1]
 
 
 def test_only_a_csv_of_a_trial_is_ever_read(path):

@@ -11,11 +11,11 @@ from merge_runner.trial_records import StateRow, TrialRecord, TrialSpec
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.frames import load
 from merge_runner_analysis.humans.imported import by_condition, by_pair, findings, human_trials
-from merge_runner_analysis.metrics import BOXES, COLLISIONS, LEFT_FIRST
+from merge_runner_analysis.metrics import BOXES, COLLISIONS
 from merge_runner_analysis.published import PAIRS, human_outcomes
 from merge_runner_analysis.stats.measures import counts, known
 from merge_runner_analysis.study import Study
-from tests.support.tables import by_id, made, notes_with
+from tests.support.tables import made, notes_with
 
 LEFT, RIGHT, CRASH = ("finished", "left"), ("finished", "right"), ("collided", None)
 PUBLISHED = human_outcomes().assign(
@@ -60,11 +60,6 @@ def test_what_is_found_of_human_trials_is_said(trials, said):
     assert all(one.startswith(start) for one, start in zip(found, said, strict=True))
 
 
-def test_trials_of_other_pairs_are_counted_for_nothing():
-    assert by_condition(moved(1))["trials"].sum() == 989
-    assert by_pair(moved(1))["trials"]["experiment_7"] == 1
-
-
 @pytest.fixture
 def stored(tmp_path):
     """Writes human trials, and a trial of a model, into a database."""
@@ -102,21 +97,6 @@ def test_a_complete_import_leads_to_the_trials_behind_the_published_outcomes(sto
     assert not known(study.human, COLLISIONS)
 
 
-def test_a_partial_import_has_both_numbers_of_trials_in_its_row(stored):
-    study = Study(stored(PUBLISHED[::8]))
-    human = study.human
-    assert counts(human, BOXES) == (28, 990)
-    assert counts(human, LEFT_FIRST)[1] == 962
-    assert not known(human, COLLISIONS)
-    row = by_id(made(study, "ablation-quantitative"))["human"]
-    assert row.values["driver"] == "humans (124 of 990 imported)"
-    assert row.values["n"] == 990
-    assert row.values.get("collided_percent") is None
-    finished = len(human.finished)
-    assert f"the 990 published outcomes; the rest: 124 imported trials, {finished}" in row.note
-    assert "published human collisions are boxes that overlap" in row.note
-
-
 def test_another_data_set_is_named_under_every_table_with_humans(stored):
     study = Study(stored(changed("N_0_0", LEFT, CRASH, 8)))
     for name in ("who-first", "ablation-quantitative"):
@@ -125,7 +105,8 @@ def test_another_data_set_is_named_under_every_table_with_humans(stored):
 
 def test_trials_of_other_pairs_are_in_no_row_and_in_no_query(stored):
     study = Study(stored(moved(5)))
-    assert len(study.human.trials) == 985
+    assert len(study.human.trials) == by_condition(moved(5))["trials"].sum() == 985
+    assert by_pair(moved(5))["trials"]["experiment_7"] == 5
     (source,) = explain(study, made(study, "who-first"), "human/intercept").sources
     trials = load(source.query, study.db)["trial_id"]
     assert trials.tolist() == list(source.trials)

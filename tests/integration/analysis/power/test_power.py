@@ -231,8 +231,7 @@ def test_power_sends_and_makes_nothing_and_says_where_a_price_is_unknown(prepare
         "max_output_tokens = 4000\n"
     )
     few = ("--model", "dear", "--reps", 1, "--conditions", "N_0_0,L_4_0", "--sims", 20)
-    run = prepare(tmp_path, "power", "baseline", *few)
-    assert run.code == 0, run.err
+    run = prepare(tmp_path, "power", "baseline", *few, code=0)
     assert "2 trials, an unknown price; 20 simulated studies" in run.out
     told = json.loads(prepare(tmp_path, "power", "baseline", *few, "--json").out)
     assert (told["study"], told["trials"], told["cost_usd"]) == ("baseline", 2, None)

@@ -2,21 +2,16 @@
 
 import json
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pandas as pd
 import pytest
 from scipy import stats
 
-from merge_runner.config import ScenarioConfig
 from merge_runner.emulator.driver import answer
 from merge_runner.planted_effect import PlantedEffect
-from merge_runner.prompts.blocks import prompt_of, render_prompt
 from merge_runner.records import SIDES, Slot
 from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
-from merge_runner.scenarios.merge.geometry import TRACK
-from merge_runner.scenarios.merge.world import World
 from merge_runner.study.file import Effect
 from merge_runner_analysis.power import (
     Case,
@@ -29,19 +24,13 @@ from merge_runner_analysis.power import (
 )
 from merge_runner_analysis.stats.regressions import gap_ols, who_first_firth
 from merge_runner_analysis.study import Study
+from tests.support.emulator_fixtures import first_prompt
 
 REPS, STUDIES = 10, 20
 
 
 def chance(case, question, simulations=150):
     return power(case, 1, simulations)[question]
-
-
-@cache
-def first_prompt(condition: str, side: str) -> str:
-    scenario = ScenarioConfig()
-    seen = World(scenario, CONDITIONS[condition], TRACK).observe(side)
-    return render_prompt(seen, None, prompt=prompt_of("baseline"), scenario=scenario)
 
 
 def emulated(effect: PlantedEffect, repetitions: int, sample_set: int) -> pd.DataFrame:

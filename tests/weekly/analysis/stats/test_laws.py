@@ -8,9 +8,7 @@ from analysis.research.ceiling import shares
 from merge_runner_analysis.published import published
 from merge_runner_analysis.stats.first_action import exchange_rate, mean, slope
 from merge_runner_analysis.stats.intervals import melded
-from merge_runner_analysis.stats.regressions import who_first_firth
 from tests.unit.analysis.stats.test_first_action import HEADWAY, SLOPE, VELOCITY, drawn
-from tests.unit.analysis.stats.test_regressions import OVERLAPPING, firthmodels, who_first_arrays
 
 
 @pytest.mark.parametrize("rates", [(0.02, 0.03), (0.3, 0.03), (0.5, 0.5), (0.0, 0.03)])
@@ -45,12 +43,3 @@ def test_the_script_of_the_ceiling_computes_what_ships(n):
     for key, share in found.items():
         low, high = stats.binom.interval(0.999, 60, curve[n, *key])
         assert low <= round(60 * share) <= high
-
-
-def test_profile_intervals_are_those_of_firthmodels_and_agree_with_the_tests():
-    expected = np.roll(firthmodels(*who_first_arrays(OVERLAPPING)).conf_int(method="pl"), 1, axis=0)
-    fit = who_first_firth(OVERLAPPING)
-    for (name, term), bounds in zip(fit.terms.items(), expected, strict=True):
-        low, high = fit.interval(name, 0.95)
-        assert (low, high) == pytest.approx(tuple(bounds), rel=1e-3, abs=1e-3)
-        assert (low <= 0 <= high) == (term.p >= 0.05)
