@@ -25,7 +25,7 @@ from merge_runner_analysis.web.judged import (
 from merge_runner_analysis.web.marks import rate
 from merge_runner_analysis.web.scope import Scope, scope_of, unmarked
 from merge_runner_analysis.web.site import NotThere, Site
-from merge_runner_analysis.wording import DIFFERS, OPEN, SHOWN, UNLIKE, shown_state
+from merge_runner_analysis.wording import DIFFERS, MEASURES, OPEN, SHOWN, UNLIKE, shown_state
 
 # Outcomes and served models of the attempts of a driver's trials with a prompt.
 ATTEMPTS = """
@@ -96,7 +96,7 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         conditions=conditions,
         counted=_counted([cell for _, cells in conditions["rows"] for cell in cells if cell]),
         rates=zip(*shares, strict=True),
-        notes=noted(both),
+        notes=noted(both, {name: measure.trait for name, measure in MEASURES.items()}),
     )
 
 
