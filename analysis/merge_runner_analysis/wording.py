@@ -299,7 +299,7 @@ MEASURES = {
         ),
         Measure(
             "collisions",
-            "Collisions by the humans' rule",
+            "Crashes by people's rule",
             "crashes",
             "% of trials",
             BOXES.column,

@@ -125,7 +125,7 @@ def _summary(driver: Driver) -> str:
     traits = [states[name] for name in states if name not in {"collisions", "gap"}]
     shown = sum(state in {SHOWN, *DIFFERS} - {UNLIKE} for state in traits)
     return (
-        f"{shown} of {len(traits)} human traits shown; "
+        f"{shown} of {len(traits)} patterns of people are found; "
         f"{[*states.values()].count(OPEN)} of {len(states)} measures cannot be told yet."
     )
 
