@@ -32,7 +32,7 @@ HUMANS, LANGUAGE_MODEL, PROGRAM, MOCK = "humans", "language model", "program", "
 SHOWN, WEAKER, STRONGER, UNLIKE, OPEN = "shown", "weaker", "stronger", "unlike", "inconclusive"
 DIFFERS = frozenset({WEAKER, STRONGER, UNLIKE})
 ENOUGH = 20  # trials with an outcome; with fewer of them a headline says nothing of likeness
-TOO_FEW = f"Too few trials finished to say ({ENOUGH}, and half of all, are needed)"
+TOO_FEW = f"Too few trials finished for a verdict (at least {ENOUGH}, and half of all, are needed)"
 ALPHA = 0.05  # that of all tests: to import it would take pandas, which no page needs
 # So far from people, in points and in m, a driver still is like them.
 MARGINS = {"collisions": 5.0, "gap": 1.0}
@@ -49,13 +49,21 @@ DIRECTIONS = {
     "gap": {WEAKER: "smaller than people's", STRONGER: "larger than people's"},
 }
 VERDICT_RULE = (
-    "like people: a pattern of theirs passes its own test, or the difference from them is surely "
-    "less than 5 points (crashes), 1 m (gap, and how far relative velocity moves it) or half a "
-    "standard deviation (accelerations held). Less, more, unlike: a difference is shown, with a "
-    "p below .05 that is corrected for the number of the driver's measures (Holm). Cannot tell "
-    "yet: neither of the two; that is not “alike”. Of a driver with fewer than "
-    f"{ENOUGH} trials nothing is said"
+    "like people: their pattern is found, with p below .05 in a regression over all its trials "
+    "(logistic for who goes first, linear for the gap by headway), or the whole interval of the "
+    "difference from people lies within 5 points (crashes), 1 m (gap, and how far relative "
+    "velocity moves it) or half a standard deviation (accelerations held). Less, more, unlike: a "
+    "difference from people is shown, with a p below .05 that is corrected for the number of the "
+    "driver's measures (Holm). Cannot tell yet: neither of the two; that is not “alike”. With "
+    f"fewer than {ENOUGH} trials there is no verdict"
 )
+# Measures that the first page shows, with its headings.
+HEADINGS = {
+    "collisions": "Crashes",
+    "headway": "The one ahead goes first",
+    "velocity": "Side by side, the slower goes first",
+    "gap": "Gap at the merge point",
+}
 # Names of metrics in sentences and pages; others keep the label of the table.
 METRIC_NAMES = {
     LEFT_FIRST.name: "goes first",
@@ -77,30 +85,64 @@ CHANGED = {
     VALID.name: "how many replies are valid",
     COST.name: "the cost of a trial",
 }
+# Where two equal drivers met, who goes first is counted for the left vehicle.
+LEFT_GOES_FIRST = "left vehicle goes first"
 # Sentence parts: a driver has more than another, has less, or no difference is shown in it.
 COMPARED = {
-    LEFT_FIRST.name: ("goes first more often", "goes first less often", "who goes first"),
+    LEFT_FIRST.name: (
+        "goes before its opponent more often",
+        "goes before its opponent less often",
+        "how often it goes before its opponent",
+    ),
+    LEFT_GOES_FIRST: (
+        "lets the left vehicle go first more often",
+        "lets the left vehicle go first less often",
+        "how often the left vehicle goes first",
+    ),
     GAP.name: ("leaves a larger gap", "leaves a smaller gap", "the gap"),
-    RMSE.name: ("departs more from its speed", "keeps closer to its speed", "speed"),
+    RMSE.name: (
+        "departs more from its initial speed",
+        "keeps closer to its initial speed",
+        "how far it departs from its initial speed",
+    ),
     JOINT.name: (
         "has both drivers change their speed more often",
         "has both drivers change their speed less often",
         "how often both change their speed",
     ),
-    VALID.name: ("replies more reliably", "replies less reliably", "valid replies"),
-    COST.name: ("costs more", "costs less", "cost"),
+    VALID.name: ("has more valid replies", "has fewer valid replies", "how many replies are valid"),
+    COST.name: ("costs more", "costs less", "its cost"),
 }
-# The collision rules that trials may be played by, as sentences name them.
+# The collision rules that trials may be played by, as sentences name them, and their meaning.
 PLAYED_RULES = {
     "euclid2d": "the paper's rule",
-    "rectangle": "people's rule, looked for at each step",
-    "shared_lane": "the rule of its scenario",
+    "rectangle": "people's rule, checked at each time step",
+    "shared_lane": "the rule of the shared lane",
 }
+RULES_MEAN = {
+    "euclid2d": "the vehicles' centres are closer than a vehicle length",
+    "rectangle": "the vehicles' outlines overlap",
+    "shared_lane": "the vehicles are less than a length apart once one is in the shared lane",
+}
+PEOPLES_RULE = "the vehicles' outlines overlap, checked 20 times a second"
 # Where an interval leaves out 0 and the corrected p shows no difference.
 UNCORRECTED = (
-    "An interval may leave out 0 where no difference is shown: it is that of one test, and the "
-    "corrected p allows for all of them."
+    "An interval may leave out 0 where no difference is shown: it is of one test alone, and the "
+    "corrected p allows for the number of tests."
 )
+# Of a rehearsal, with the planted effects.
+PLANTED = "planted in the scripted stand-in for this rehearsal"
+# The vehicle that going first is counted for: (subject of a sentence, its meaning).
+LEFT = (
+    "the left driver",
+    "goes first: counted for the left driver, as both drivers are equal and get the same",
+)
+EGO = (
+    "the driver under study",
+    "goes first: counted for the driver under study (ego), the one that alone gets a level's words "
+    "or settings, else the one that is named first",
+)
+HALVES = "where two equal drivers get the same, a trial counts half for each"
 UNREADABLE = "the stored study cannot be read by this version"
 # Note on levels that no driver reads.
 SAME_TRIALS = "not tested: the same trials at both levels, as the drivers do not read what differs"
@@ -131,7 +173,7 @@ class Why(Enum):
     NO_PROFILE = "no profile of Firth's likelihood converges"
     INFINITE_GAP = "a gap is not finite"
     STEADY_GAP = "the gaps vary by less than 1 cm: there is nothing to test"
-    ONE_DECIDES = "a single trial decides a coefficient: no HC3 errors"
+    ONE_DECIDES = "a single trial decides a coefficient: no standard errors"
     FEW_PAIRS = "{} pairs are too few for errors by pair"
     WITHOUT_PAIR = "without {}: {}"
     BY_PAIRS = "errors by jackknife over {} pairs"
@@ -257,7 +299,7 @@ MEASURES = {
         ),
         Measure(
             "collisions",
-            "Collisions by the humans' rule",
+            "Crashes by people's rule",
             "crashes",
             "% of trials",
             BOXES.column,
@@ -272,12 +314,12 @@ MEASURES = {
             "m",
             GAP.column,
             "difference within 1 m by its interval; else corrected p below .05",
-            "{it} left {driver} m at the merge point, people {people} m",
+            "{it} left a gap of {driver} m, people of {people} m",
             (0.0, 8.0),
             {
-                SHOWN: "leaves {of} m at the merge point, like people ({humans} m)",
-                WEAKER: "leaves {of} m at the merge point, less than people ({humans} m)",
-                STRONGER: "leaves {of} m at the merge point, more than people ({humans} m)",
+                SHOWN: "leaves a gap of {of} m, like people ({humans} m)",
+                WEAKER: "leaves a gap of {of} m, smaller than people ({humans} m)",
+                STRONGER: "leaves a gap of {of} m, larger than people ({humans} m)",
             },
         ),
         Measure(
@@ -344,15 +386,24 @@ def by_group(rows: Iterable[Any]) -> dict[str, dict[str, Values]]:
 def sentences(rows: Iterable[Any]) -> list[str]:
     """Return the headline of a table's rows, then a sentence on each driver and prompt."""
     groups = by_group(rows)
-    kinds = {name: next(iter(of.values()))["kind"] for name, of in groups.items()}
-    judged = {n: of for n, of in groups.items() if kinds[n] == LANGUAGE_MODEL and "" not in of}
     suffix = f"/{BASELINE}"
+    drivers = {name: of for name, of in groups.items() if _kind(of) != HUMANS}
+    answering = _models(drivers) or drivers
     # A study may call its first prompt otherwise.
-    models = {n.removesuffix(suffix): of for n, of in judged.items() if n.endswith(suffix)}
+    shown = {n.removesuffix(suffix): of for n, of in answering.items() if n.endswith(suffix)}
     return [
-        " ".join(filter(None, headline(models or judged, kinds.values()))),
-        *(f"{name}: {sentence(of)}" for name, of in groups.items() if kinds[name] != HUMANS),
+        " ".join(filter(None, headline(shown or answering))),
+        *(f"{name}: {sentence(of)}" for name, of in drivers.items()),
     ]
+
+
+def _kind(verdicts: Mapping[str, Values]) -> str:
+    return str(next(iter(verdicts.values()))["kind"])
+
+
+def _models(drivers: Mapping[str, Mapping[str, Values]]) -> dict[str, Mapping[str, Values]]:
+    """Return the language models that are judged."""
+    return {n: of for n, of in drivers.items() if _kind(of) == LANGUAGE_MODEL and "" not in of}
 
 
 def sentence(verdicts: Mapping[str, Values]) -> str:
@@ -402,7 +453,7 @@ def crashes(values: Values) -> str:
     text = f"crashed in {seen} trials"
     if undecided:
         rule = values.get("counted_by") or PLAYED_RULES["shared_lane"]
-        text += f" by {rule}; by people's rule {k} are certain, {undecided} cannot be told"
+        text += f" by {rule}; by people's rule {k} surely did, {undecided} cannot be told"
     people = values.get("human_counted")
     if shown_state(values) in DIFFERS:
         than = f" ({people})" if people else ""
@@ -410,52 +461,67 @@ def crashes(values: Values) -> str:
     return f"{text}; people in {people}" if people else text
 
 
+def crash_text(rules: Sequence[str]) -> str:
+    """Return the meaning of a crash by the collision rules that were played."""
+    return " or, by the scenario of the trial, ".join(
+        f"{RULES_MEAN[rule]} ({PLAYED_RULES[rule]})" for rule in rules
+    )
+
+
 def _percent(collisions: Values, count: int) -> float:
     ended = _ended(collisions)
     return 100 * count / ended if ended else 0.0
 
 
-def apart(driver: str, other: str, rows: Mapping[str, Values]) -> tuple[str, str]:
+def apart(driver: str, other: str, rows: Mapping[str, Values], *, of_left: bool) -> tuple[str, str]:
     """Return the headline of a driver less another, and other differences, of rows by their metric.
 
-    ``A crashed in 12 of 110 trials, B in 33 of 110: 19.09 points fewer [8.41, 29.78]; corrected
-    p = 0.004``.
+    ``A crashed in 12 of 110 trials, B in 33 of 110. In the same situations A crashed less often, by
+    19.09 points [8.41, 29.78]; corrected p = 0.004.`` Who goes first is said ``of_left`` vehicles.
     """
     crashed = rows.get(COLLISIONS.name, {})
+    others = _others(driver, other, rows, of_left=of_left)
     counts = [crashed.get(f"{name}{of}") for of in ("", "_reference") for name in ("k", "n")]
     if any(count is None for count in counts):
-        return f"{driver} against {other}.", _others(driver, rows)
+        return f"{driver} against {other}.", others
     k, n, k_other, n_other = counts
     claim = f"{driver} crashed in {k} of {n} trials, {other} in {k_other} of {n_other}"
     difference, p, ci = (crashed.get(name) for name in ("difference", "p_corrected", "ci"))
     if min(n or 0, n_other or 0) < ENOUGH:
         return f"{claim}: too few to say more.", ""
     if difference is None or p is None:
-        return f"{claim}.", _others(driver, rows)
+        return f"{claim}.", others
+    corrected = f"corrected p {equal_p(p)}"
     if p >= ALPHA:
-        result = f"no difference is shown, {number(difference)} points {brackets(ci)}"
+        result = f"No difference is shown: {number(difference)} points {brackets(ci)}"
         also = UNCORRECTED if ci and ci[0] * ci[1] > 0 else ""
-        claim = f"{claim}: {result}; corrected p {equal_p(p)}."
-        return claim, " ".join(filter(None, (also, _others(driver, rows))))
+        return f"{claim}. {result}; {corrected}.", " ".join(filter(None, (also, others)))
     # Where trials are fewer, the ends change their signs and their places.
     ends = ci and sorted(end if difference > 0 else -end for end in ci)
-    more = "more" if difference > 0 else "fewer"
-    result = f"{number(abs(difference))} points {more} {brackets(ends)}".rstrip()
-    return f"{claim}: {result}; corrected p {equal_p(p)}.", _others(driver, rows)
+    result = f"{number(abs(difference))} points {brackets(ends)}".rstrip()
+    often = "more" if difference > 0 else "less"
+    same = f"In the same situations {driver} crashed {often} often, by {result}"
+    return f"{claim}. {same}; {corrected}.", others
 
 
-def _others(driver: str, rows: Mapping[str, Values]) -> str:
+def _others(driver: str, other: str, rows: Mapping[str, Values], *, of_left: bool) -> str:
     """Return the measures besides crashes in which a driver is shown to differ, and the others."""
     shown, unshown = [], []
     for name, (more, less, what) in COMPARED.items():
-        values = rows.get(name, {})
-        if (p := values.get("p_corrected")) is None:
+        is_unasked = name == (LEFT_FIRST.name if of_left else LEFT_GOES_FIRST)
+        values = rows.get(LEFT_FIRST.name if name == LEFT_GOES_FIRST else name, {})
+        if is_unasked or (p := values.get("p_corrected")) is None:
             continue
-        if p < ALPHA:
-            shown.append(more if values["difference"] > 0 else less)
-        else:
+        if p >= ALPHA:
             unshown.append(what)
-    parts = [f"{driver} {joined(shown)}."] if shown else []
+            continue
+        unit = str(values["measure"]).rpartition("(")[2].rstrip(")")
+        form = money if unit == "USD" else number
+        sides = (form(values[f"value{of}"]) for of in ("", "_reference"))
+        shown.append(
+            f"{more if values['difference'] > 0 else less} ({' against '.join(sides)} {unit})"
+        )
+    parts = [f"Compared with {other}, {driver} {joined(shown)}."] if shown else []
     parts += [f"No difference is shown in {joined(unshown)}."] if unshown else []
     return " ".join(parts)
 
@@ -493,39 +559,53 @@ def differs(values: Values) -> bool:
     return values.get("state") in DIFFERS and not _is_within(values)
 
 
-def headline(
-    drivers: Mapping[str, Mapping[str, Values]], kinds: Iterable[Any] = ()
-) -> tuple[str, str]:
-    """Return the answer of language models in two parts: the claim, and what else is seen at once.
+def headline(drivers: Mapping[str, Mapping[str, Values]]) -> tuple[str, str]:
+    """Return how drivers compare with people: the claim, and what else is seen at once.
 
-    ``drivers`` are those that are judged, by name: no mock model and no program; ``kinds`` are
-    those of all drivers. Drivers with too few outcomes have their counts alone.
+    It is of the language models that are judged or, without one, of all ``drivers``, by name. Those
+    with too few outcomes have their counts alone.
     """
-    if not drivers:
-        return _without_models({*kinds}), ""
-    compared = {
-        name: of for name, of in drivers.items() if any(v.get("state") for v in of.values())
-    }
+    models = _models(drivers)
+    if not models:
+        return _without_models(drivers)
+    compared = {name: of for name, of in models.items() if any(v.get("state") for v in of.values())}
     if not compared:
         return "No language model can be compared with people yet.", ""
     enough = {name: of for name, of in compared.items() if _enough(of)}
     few = {name: of for name, of in compared.items() if name not in enough}
-    too_few = [_too_few(few, alone=len(drivers) == 1)] if few else []
+    too_few = [_too_few(few, alone=len(models) == 1)] if few else []
     untold = [f"{name} {crashes(of['collisions'])}." for name, of in few.items()]
     if not enough:
         return " ".join(too_few), " ".join(untold)
-    claim, because = _likeness(enough, every=len(enough) == len(drivers))
+    claim, because = _likeness(enough, every=len(enough) == len(models))
     return claim, " ".join(filter(None, [because, *too_few, *untold]))
 
 
-def _without_models(kinds: set[str]) -> str:
-    """Return who drove, in trials without a language model."""
-    if LANGUAGE_MODEL in kinds:
-        return "No language model is judged here."
+def _without_models(drivers: Mapping[str, Mapping[str, Values]]) -> tuple[str, str]:
+    """Return in how many drivers each measure is like people's, and who drove."""
+    kinds = {_kind(of) for of in drivers.values()}
     names = {PROGRAM: "programs", MOCK: "scripted stand-ins"}
-    if drove := [name for kind, name in names.items() if kind in kinds]:
-        return f"Only {joined(drove)} drove here; they tell nothing about a language model."
-    return "No language model drove here."
+    who = "No language model drove here."
+    if LANGUAGE_MODEL in kinds:
+        who = "No language model is judged here."
+    elif drove := [name for kind, name in names.items() if kind in kinds]:
+        who = f"Only {joined(drove)} drove here; they tell nothing about a language model."
+    compared = [of for of in drivers.values() if "" not in of]
+    return (_tally(compared), who) if len(compared) > 1 else (who, "")
+
+
+def _tally(drivers: Sequence[Mapping[str, Values]]) -> str:
+    like, unclear = [], []
+    for name, heading in HEADINGS.items():
+        states = [shown_state(of[name]) for of in drivers if name in of]
+        if {*states} <= {"", OPEN}:
+            unclear.append(f"“{heading}”")
+        else:
+            like.append(f"{states.count(SHOWN) or 'none'} in “{heading}”")
+    if not like:
+        return f"Whether {len(drivers)} drivers are like people cannot be told yet."
+    rest = f"; cannot be told yet: {', '.join(unclear)}" if unclear else ""
+    return f"Like people, of {len(drivers)} drivers: {', '.join(like)}{rest}."
 
 
 def _likeness(drivers: Mapping[str, Mapping[str, Values]], *, every: bool) -> tuple[str, str]:
@@ -604,8 +684,8 @@ def _count(drivers: Mapping[str, Mapping[str, Values]]) -> str:
     every = [values for of in drivers.values() for values in of.values()]
     tested = sum(values.get("p_holm") is not None for values in every)
     return (
-        f"{sum(map(differs, every))} of {tested} comparisons with people show a difference, with p "
-        "below 0.05 after correction for the number of comparisons of each model (Holm)."
+        f"By all measures together, {sum(map(differs, every))} of {tested} comparisons with people "
+        "show a difference (corrected p below 0.05)."
     )
 
 
@@ -664,7 +744,8 @@ def equal_p(p: float) -> str:
 
 def verdict_word(values: Values) -> str:
     """Return a state in words, as it stands in a list of verdicts."""
-    if values.get("state") and (values.get("n") or 0) < ENOUGH:
+    is_few = values.get("state") and (values.get("n") or 0) < ENOUGH
+    if is_few and not values.get("undecided"):
         return f"fewer than {ENOUGH} trials"
     words = VERDICTS | DIRECTIONS.get(str(values.get("measure")), {})
     return words.get(shown_state(values), "not compared")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from merge_runner.errors import UsageError
 from merge_runner.registry import in_use, require
 from merge_runner.study.arms import MODEL
-from merge_runner.study.file import StudyFile, StudySource
+from merge_runner.study.file import StudyFile, StudySource, StudyText
 from merge_runner.text_safety import first_line
 from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.grouping import Group, levels_of
@@ -147,6 +147,12 @@ def _named(study: Study) -> str:
         return ""
     require(_measures(), "measure", file.primary, "as the study's primary one")
     return file.primary
+
+
+def texts_of(study: Study) -> dict[str, dict[str, StudyText]]:
+    """Return the texts of a study's factors by level; empty where its file is not known."""
+    file, _ = _file(study)
+    return {} if file is None else dict(file.texts)
 
 
 def unreadable(study: Study) -> str:

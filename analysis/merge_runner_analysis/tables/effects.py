@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import chain
-from math import isinf
+from math import exp, isinf
 
 from merge_runner.study.arms import PROMPT
 from merge_runner_analysis.metrics import (
@@ -22,6 +22,7 @@ from merge_runner_analysis.stats.effects import (
     driver_effects,
     effects,
     primary,
+    texts_of,
     unreadable,
 )
 from merge_runner_analysis.stats.estimate import Estimate
@@ -30,7 +31,7 @@ from merge_runner_analysis.stats.measures import undecided_note
 from merge_runner_analysis.stats.sides import cells_seen, level_estimate
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Value, interval
-from merge_runner_analysis.wording import SAME_TRIALS, TIMES, note_of
+from merge_runner_analysis.wording import PLANTED, SAME_TRIALS, TIMES, note_of
 
 TEST = "of the test of Mantel and Haenszel, or of Welch's"
 UNTESTED = (
@@ -203,6 +204,8 @@ def _notes(study: Study, by: str) -> Iterator[str]:
     every = levels_by_factor(study)
     if failure := unreadable(study):
         yield failure
+    if planted := _planted(study):
+        yield f"{PLANTED}: {'; '.join(planted)}"
     if not tested and not every:
         yield "the trials of judged drivers differ in no factor"
         return
@@ -232,6 +235,22 @@ def _notes(study: Study, by: str) -> Iterator[str]:
         )
     yield from (f"{levels[0].factor}{levels[0].mark}: {balance(study, levels)}" for levels in every)
     yield RULES_NOTE
+
+
+def _planted(study: Study) -> list[str]:
+    """Return the effects of words that a study plants in the mock models that drove."""
+    planted = []
+    for factor, levels in texts_of(study).items() if any(g.scripted for g in study.models) else ():
+        for level, text in levels.items():
+            if more := text.emulator.own_first:
+                even = 100 / (1 + exp(-more))
+                planted.append(
+                    f"{factor}={level} adds {more:g} to the log-odds that the driver with these "
+                    f"words goes first (an even chance becomes {even:.0f} %)"
+                )
+            if gap_m := text.emulator.gap_m:
+                planted.append(f"{factor}={level} adds {gap_m:g} m to the gap that drivers aim at")
+    return planted
 
 
 def factors(study: Study) -> Table:

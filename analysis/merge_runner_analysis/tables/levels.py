@@ -6,15 +6,15 @@ from collections.abc import Iterator
 from itertools import product
 
 from merge_runner.study.arms import MODEL, OPPONENT
-from merge_runner_analysis.metrics import COLLISIONS, GAP, LEFT_FIRST, RMSE, Metric
+from merge_runner_analysis.metrics import COLLISIONS, GAP, RMSE, Metric
 from merge_runner_analysis.stats.effects import primary
 from merge_runner_analysis.stats.levels import Level, crossing, levels_by_factor
 from merge_runner_analysis.stats.measures import counts, estimate
 from merge_runner_analysis.stats.sides import level_estimate, one_sided
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.model import ENDED, Column, Optional, Row, Table, Value, interval
+from merge_runner_analysis.wording import EGO, HALVES, LEFT, TIMES, note_of
 
-HALVES = "where both drivers are told the same, a trial counts half for each, and k is not given"
 # More crossings than these are no chart.
 MOST_CROSSINGS = 8
 
@@ -33,6 +33,7 @@ def levels(study: Study) -> Table:
             Column("n", "n", "count", f"trials that count: {metric.meaning}"),
             Optional("value", metric.heading, "number", metric.meaning),
             interval("ci", f"of {metric.heading}"),
+            Optional("repeated", "repeated", "count", "trials that repeat another one, left out"),
             Column("crashed", "crashed", "count", COLLISIONS.meaning, COLLISIONS.column,
                    rests_on=COLLISIONS.column),
             Column("ended", "of", "count", "trials that ended", rests_on=ENDED),
@@ -43,9 +44,18 @@ def levels(study: Study) -> Table:
         (
             "all trials of a level, whether or not another level has the same cells: differences "
             "are in the table effects. A crossing leaves out the driver and the opponent",
-            *([HALVES] if metric is LEFT_FIRST and one_sided(study) else []),
+            _counted_driver(study),
         ),
     )  # fmt: skip
+
+
+def _counted_driver(study: Study) -> str:
+    """Return which driver's going first is counted."""
+    trials = [group.trials for group in study.models]
+    is_equal = all((of["model_left"] == of["model_right"]).all() for of in trials)
+    if is_equal and all(of["focal"].isna().all() for of in trials):
+        return LEFT[1]
+    return note_of(EGO[1], HALVES * one_sided(study))
 
 
 def varied(study: Study) -> tuple[str, ...]:
@@ -100,6 +110,7 @@ def _row(study: Study, level: Level, driver: str, metric: Metric) -> Row:
         "n": shown.n,
         "value": shown.value,
         "ci": shown.bounds(),
+        "repeated": _repeated(study, level, driver, len(group.ended)),
         "crashed": crashed,
         "ended": ended,
         "gap_m": estimate(group, GAP).value,
@@ -107,3 +118,17 @@ def _row(study: Study, level: Level, driver: str, metric: Metric) -> Row:
     }
     name = f"{driver}/" * bool(driver) + f"{level.factor}={level.name}{level.mark}"
     return Row(name, level.groups, values, "", metric.column, copies=level.copies)
+
+
+def _repeated(study: Study, level: Level, driver: str, ended: int) -> int | None:
+    """Return the number of a level's ended trials that are left out as copies."""
+    if TIMES in level.factor:
+        return None
+    of_level = [
+        group
+        for group in study.models
+        if group.scripted == level.pooled.scripted
+        and group.levels.get(level.factor) == level.name
+        and group.levels.get(MODEL) in (driver or group.levels.get(MODEL), None)
+    ]
+    return sum(len(group.stored.ended) for group in of_level) - ended

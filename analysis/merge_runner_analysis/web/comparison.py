@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from merge_runner.records import SIDES
 from merge_runner_analysis.metrics import COLLISIONS, LEFT_FIRST
 from merge_runner_analysis.tables.model import Row, Table, from_text
 from merge_runner_analysis.web.computing import Job
@@ -24,7 +25,14 @@ from merge_runner_analysis.web.marks import Mark
 from merge_runner_analysis.web.names import short_names
 from merge_runner_analysis.web.scope import Scope
 from merge_runner_analysis.web.site import Site
-from merge_runner_analysis.wording import UNCORRECTED, apart, capital, number, p_value
+from merge_runner_analysis.wording import (
+    LEFT_GOES_FIRST,
+    UNCORRECTED,
+    apart,
+    capital,
+    number,
+    p_value,
+)
 
 # The trials behind a count, as a filter of their list; None where no filter keeps just these.
 Filter = dict[str, Any] | None
@@ -83,21 +91,25 @@ def compared(
     if (content := job.content) is None:
         return job, True, None
     trials = trials_of(first, scope), trials_of(second, scope)
-    table = from_text(content["table"])
-    return job, False, comparison_of(table, (named[first.name], named[second.name]), trials)
+    table, names = from_text(content["table"]), (named[first.name], named[second.name])
+    egos = [of.facts[f"ego_merged_{side}"] for of in (first, second) if of.facts for side in SIDES]
+    return job, False, comparison_of(table, names, trials, of_left=not any(egos))
 
 
 def comparison_of(
-    table: Table, names: tuple[str, str], trials: tuple[TrialsOf, TrialsOf]
+    table: Table, names: tuple[str, str], trials: tuple[TrialsOf, TrialsOf], *, of_left: bool
 ) -> Comparison | None:
-    """Return the comparison of two drivers; None where one of them is not judged."""
+    """Return the comparison of two drivers; None where one of them is not judged.
+
+    Who goes first is that ``of_left`` vehicles where all drivers met copies of their own.
+    """
     if not table.rows:
         return None
     # The most visible measure is the first.
     rows = sorted(table.rows, key=lambda row: metric_of(row) != COLLISIONS.name)
-    claim, rest = apart(*names, {metric_of(row): row.values for row in rows})
+    claim, rest = apart(*names, {metric_of(row): row.values for row in rows}, of_left=of_left)
     seen = [
-        f"{name_of(row)}, {_with_unit(row, 'detectable')}"
+        f"{_name(row, of_left)} {_with_unit(row, 'detectable')}"
         for row in rows
         if row.values["detectable"] is not None
     ]
@@ -105,7 +117,7 @@ def comparison_of(
         names,
         unbroken(claim),
         unbroken(rest),
-        [_difference(row, trials) for row in rows],
+        [_difference(row, trials, _name(row, of_left)) for row in rows],
         _corrected(rows),
         unbroken("; ".join(seen)),
     )
@@ -115,10 +127,15 @@ def _corrected(rows: Sequence[Row]) -> str:
     """Describe the correction of these rows' p."""
     tested = [row for row in rows if row.values["p_corrected"] is not None]
     primary = [name_of(row) for row in tested if row.values["primary"]]
-    count = len(tested) - len(primary)
-    others = f"for the number of {'other ' * bool(primary)}comparisons, {count} (Holm)"
+    many = f"Corrected for {len(tested) - len(primary)} tests (Holm)"
     alone = f"; {primary[0]}, the primary measure, is tested by itself" if primary else ""
-    return f"{others}{alone}. {UNCORRECTED * any(map(is_uncorrected, tested))}".rstrip()
+    return f"{many}{alone}. {UNCORRECTED * any(map(is_uncorrected, tested))}".rstrip()
+
+
+def _name(row: Row, of_left: bool) -> str:
+    if metric_of(row) != LEFT_FIRST.name:
+        return name_of(row)
+    return LEFT_GOES_FIRST if of_left else "goes first, before its opponent"
 
 
 def trials_of(driver: Driver, scope: Scope) -> TrialsOf:
@@ -147,7 +164,7 @@ def no_trials(_what: str, _count: int) -> Filter:
     return None
 
 
-def _difference(row: Row, trials: tuple[TrialsOf, TrialsOf]) -> Difference:
+def _difference(row: Row, trials: tuple[TrialsOf, TrialsOf], name: str) -> Difference:
     values: Any = row.values
     ci, is_tested = values["ci"], values["difference"] is not None
     end = max(map(abs, (values["difference"], *(ci or ())))) if is_tested else 0.0
@@ -155,7 +172,7 @@ def _difference(row: Row, trials: tuple[TrialsOf, TrialsOf]) -> Difference:
         _side(row, of, filter_of) for of, filter_of in zip(("", "_reference"), trials, strict=True)
     )
     return Difference(
-        capital(name_of(row)),
+        capital(name),
         (first, second),
         unbroken(_with_unit(row, "difference", sign="+")) if is_tested else "–",
         unbroken(interval_text(row)),

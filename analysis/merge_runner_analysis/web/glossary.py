@@ -11,6 +11,23 @@ from markupsafe import Markup, escape
 from merge_runner.paths import shipped
 
 FILE = shipped(Path(__file__).with_name("glossary.md"), "docs/glossary.md")
+# Terms that a page explains where it has their words: (words as the page has them, term, pattern).
+USED = (
+    ("factor, level", "factor", "factor|level"),
+    ("difference, interaction (×)", "effect", "×"),
+    ("could have been seen", "detectable", "could have been seen"),
+    ("interval [ ]", "interval", r"\["),
+    ("p, corrected", "corrected p", "corrected"),
+    ("ego", "ego", r"\bego\b"),
+    ("prompt, Baseline", "prompt variant", "prompt"),
+    ("headway", "projected headway", "headway"),
+    ("crash", "collision", "crash"),
+    ("valid reply, plan", "plan", "valid|plan"),
+    ("gap at the merge point", "gap", r"\bgap\b"),
+    ("deviation from the initial speed", "RMSE", "initial speed"),
+    ("both change their speed", "joint contribution", "change their speed"),
+    ("scripted stand-in", "mock model", "stand-in"),
+)
 _ROW = re.compile(r"\| (.+?) \| (.+) \|")
 _MARKED = (
     (re.compile(r"\*\*(.+?)\*\*"), r"<strong>\1</strong>"),
@@ -38,6 +55,8 @@ def sections() -> dict[str, list[tuple[str, Markup]]]:
     return by_heading
 
 
-def meaning(term: str) -> Markup:
-    """Return the meaning of a term; raises KeyError for one that the glossary lacks."""
-    return {word: text for words in sections().values() for word, text in words}[term]
+def used_terms(html: str) -> list[tuple[str, Markup]]:
+    """Return the words of a page that need a meaning, each with that of its term."""
+    text = re.sub("<[^>]*>", " ", html).lower()
+    meanings = {word: meaning for words in sections().values() for word, meaning in words}
+    return [(words, meanings[term]) for words, term, used in USED if re.search(used, text)]

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from merge_runner.config import ScenarioConfig
 from merge_runner_analysis.published import HUMAN, human_counts
 from merge_runner_analysis.tables.model import Table
 from merge_runner_analysis.web.marks import Cell, band, cells, measures_of
@@ -22,6 +23,7 @@ from merge_runner_analysis.wording import (
     TABLE,
     by_group,
     capital,
+    crash_text,
     sentence,
 )
 
@@ -35,6 +37,12 @@ ASKED = """
 SELECT model, variant, coalesce(any_value(spec->>'$.left.endpoint'), '') AS endpoint,
     any_value(coalesce(spec->'$.left.body', spec->'$.right.body'))::VARCHAR AS body
 FROM listed JOIN specs USING (spec_hash) GROUP BY ALL
+"""
+# The collision rules by which drivers with prompts were played; $2 is the default one.
+RULES = """
+SELECT DISTINCT coalesce(spec->>'$.scenario.collision_rule', $2) AS rule
+FROM listed LEFT JOIN specs USING (spec_hash)
+WHERE list_contains($1::VARCHAR[], model || '/' || variant) ORDER BY rule
 """
 
 
@@ -134,19 +142,20 @@ def by_kind(drivers: Sequence[Driver]) -> dict[str, list[Driver]]:
     return {kind: [driver for driver in drivers if driver.kind == kind] for kind in KINDS}
 
 
-def noted(drivers: Sequence[Driver]) -> list[tuple[str, str, str]]:
-    """Return the notes on numbers: driver, measure and note, each marked † at its cell."""
+def noted(drivers: Sequence[Driver], headings: Mapping[str, str]) -> list[tuple[str, str, str]]:
+    """Return the notes on numbers of the measures with a heading: driver, heading and note."""
     return [
-        (driver.name, cell.measure.trait, capital(str(cell.values["note"])))
+        (driver.name, heading, capital(str(driver.cells[name].values["note"])))
         for driver in drivers
-        for cell in driver.cells.values()
-        if cell.values["note"]
+        for name, heading in headings.items()
+        if name in driver.cells and driver.cells[name].values["note"]
     ]
 
 
 def by_condition(site: Site, scope: Scope, drivers: Sequence[Driver]) -> dict[str, Any]:
     """Return counts by condition, of the drivers' trials and of the humans' as published.
 
+    ``crash`` says by which rule drivers crash.
     None stands for a condition that somebody did not drive; without a driver they are the humans'.
     """
     rows = site.catalogue.counts(scope.trials(), "model", "variant", "condition")
@@ -155,8 +164,11 @@ def by_condition(site: Site, scope: Scope, drivers: Sequence[Driver]) -> dict[st
     known = {name: _merged(counts._asdict()) for name, counts in human_counts().items()}
     played = {name for *key, name in counted if tuple(key) in [driver for _, driver in of]}
     names = ordered(played or known)
+    played_by = ["/".join(key) for _, key in of]
+    rules = site.catalogue.ask(RULES, played_by, ScenarioConfig().collision_rule)
     return {
         "names": names,
+        "crash": crash_text([row["rule"] for row in rules]),
         "humans": [known.get(name) for name in names],
         "rows": [(driver, [counted.get((*key, name)) for name in names]) for driver, key in of],
     }

@@ -43,6 +43,16 @@ def short_names(names: Sequence[str]) -> dict[str, str]:
     }
 
 
+def opponents_text(names: Iterable[str]) -> str:
+    """Return whom the drivers of these names meet."""
+    is_pair = {"+" in name for name in names}
+    if is_pair == {False}:
+        return "Each driver here meets a copy of itself."
+    of_pair = "A name with + has both drivers of a pair."
+    alone = "A driver named alone meets a copy of itself."
+    return " ".join([of_pair] * (True in is_pair) + [alone] * (False in is_pair))
+
+
 def names_mean(programs: Iterable[Mapping[str, Any]], drivers: Iterable[str]) -> dict[str, str]:
     """Return the meanings of programs, and of the parts of drivers' names."""
     meanings = {of["program"]: program_text(of["program"], of.get("based_on")) for of in programs}

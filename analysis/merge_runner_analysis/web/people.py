@@ -12,6 +12,7 @@ from merge_runner_analysis.web.effect_rows import unbroken
 from merge_runner_analysis.web.judged import Driver
 from merge_runner_analysis.web.marks import Cell
 from merge_runner_analysis.wording import (
+    HEADINGS,
     OPEN,
     SHOWN,
     STRONGER,
@@ -23,12 +24,6 @@ from merge_runner_analysis.wording import (
     verdict_word,
 )
 
-HEADINGS = {
-    "collisions": "Crashes",
-    "headway": "The one ahead goes first",
-    "velocity": "Side by side, the slower goes first",
-    "gap": "Gap at the merge point",
-}
 MARKS = {SHOWN: "●", STRONGER: "▲", WEAKER: "▼", UNLIKE: "✕", OPEN: "○"}
 
 
@@ -52,23 +47,17 @@ def likeness_of(driver: Driver) -> dict[str, Likeness]:
     return {name: _likeness(driver.cells[name]) for name in HEADINGS if name in driver.cells}
 
 
-def tally(drivers: Sequence[Driver]) -> str:
-    """Return in how many drivers each measure is like people's; empty where none is compared."""
-    compared = [driver.cells for driver in drivers if driver.cells]
-    like, open_measures = [], []
-    for name, heading in HEADINGS.items():
-        label = heading[:1].lower() + heading[1:]
-        states = [shown_state(cells[name].values) for cells in compared if name in cells]
-        if {*states} <= {"", OPEN}:
-            open_measures.append(label)
-        else:
-            like.append(f"{states.count(SHOWN) or 'none'} ({label})")
-    if not compared:
-        return ""
-    if not like:
-        return f"Whether {len(compared)} drivers are like people cannot be told yet."
-    rest = f"; cannot be told yet: {', '.join(open_measures)}" if open_measures else ""
-    return f"Of {len(compared)} drivers, like people: {', '.join(like)}{rest}."
+def could_see(drivers: Sequence[Driver]) -> str:
+    """Return the differences from people that four of five studies find; empty without any."""
+    parts = []
+    for name, unit in {"collisions": "points in crashes", "gap": "m in the gap"}.items():
+        values = [driver.cells[name].values for driver in drivers if name in driver.cells]
+        sizes = [of["detectable"] for of in values if of.get("detectable") is not None]
+        if sizes:
+            ends = dict.fromkeys(number(size) for size in (min(sizes), max(sizes)))
+            parts.append(f"{' to '.join(ends)} {unit}")
+    of_driver = ", depending on the driver" if any(" to " in part for part in parts) else ""
+    return unbroken(" or ".join(parts)) + of_driver
 
 
 def _likeness(cell: Cell) -> Likeness:

@@ -41,8 +41,11 @@ from merge_runner_analysis.web.marks import Mark
 from merge_runner_analysis.web.names import short_names
 from merge_runner_analysis.wording import (
     CHANGED,
+    EGO,
     ENOUGH,
+    LEFT,
     METRIC_NAMES,
+    PLANTED,
     SAME_TRIALS,
     TIMES,
     UNCORRECTED,
@@ -54,7 +57,6 @@ from merge_runner_analysis.wording import (
 
 # Reason for equal trials at both levels with a mock model.
 UNREAD = "not tested: the scripted stand-in does not read it, and no effect is planted for it"
-PLANTED = "Words act on the stand-in only by effects that the study plants in it."
 # More levels that show nothing are counted, not listed.
 FEW = 3
 
@@ -94,8 +96,8 @@ class Answer:
 
     ``asked`` is the question in words, for a study that has none of its own; ``crossed`` a factor
     at whose levels another one may be shown, ``has_self`` whether drivers meet a copy of their own.
-    ``uncorrected`` says why an interval may leave out 0
-    where no difference is shown, and ``problem`` what is wrong with the stored study.
+    ``who`` says of which driver who goes first is counted, ``uncorrected`` why an interval may
+    leave out 0 where no difference is shown, and ``problem`` what is wrong with the stored study.
     """
 
     asked: str
@@ -104,7 +106,7 @@ class Answer:
     measure: str
     drivers: list[tuple[str, str]]
     counted: str
-    halves: bool
+    who: str
     charts: list[Chart]
     crossed: str
     crossings: str
@@ -123,7 +125,10 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
     # A driver that is not judged has a row without values.
     known = [row for row in levels.rows if row.values.get("factor")]
     sides = {row.id: row for row in known}
-    claim, rest = answered(effects.rows)
+    who = next((note for note in levels.notes if note.startswith((LEFT[1], EGO[1]))), "")
+    planted = next((note for note in effects.notes if note.startswith(PLANTED)), "")
+    driver, _ = LEFT if who == LEFT[1] else EGO
+    claim, rest = answered(effects.rows, driver, planted)
     if not claim:
         return None
     asked = [row for row in effects.rows if row.values.get("primary")]
@@ -159,7 +164,7 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
         capital(name_of(primary)),
         [(short[driver], shape) for driver, shape in shapes.items()],
         _counted(_of_one_factor(shown, drawn), metric),
-        any(row.values["k"] is None for row in known) and metric == LEFT_FIRST.name,
+        capital(who),
         [chart for chart in charts if chart],
         OPPONENT if OPPONENT in names[1:] else names[-1] if len(names) > 1 else "",
         unbroken(_interactions(tested, {str(row.values["factor"]) for row in known})),
@@ -172,9 +177,10 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
     )
 
 
-def answered(rows: Sequence[Row]) -> tuple[str, str]:
+def answered(rows: Sequence[Row], driver: str = EGO[0], planted: str = "") -> tuple[str, str]:
     """Return the answer in a sentence, and the rest; empty where no primary test was made.
 
+    The ``driver`` is the one whose going first is counted, and ``planted`` names planted effects.
     The claim is the surest of the primary tests whose corrected p is below 5 %; where there is
     none it says so, and the rest what could have been seen. It is of mock models only where there
     is no other driver, and then says so.
@@ -190,7 +196,7 @@ def answered(rows: Sequence[Row]) -> tuple[str, str]:
     )
     why = UNREAD if rehearsed else SAME_TRIALS
     copied = [f"{level_text(row)} is {why}" for row in rows if is_copied(row)]
-    planted = [PLANTED] if rehearsed else []
+    notes = [f"{capital(planted)}."] if rehearsed and planted else []
     if not primary:
         return capital(rehearsed + f"{'; '.join(copied)}.") if copied else "", ""
     what = _changed(primary[0])
@@ -205,7 +211,7 @@ def answered(rows: Sequence[Row]) -> tuple[str, str]:
     rest = []
     if sure:
         first = sure[0]
-        claim = f"{rehearsed}{first.values['factor']} changes {what}: {_both(first)}."
+        claim = f"{rehearsed}{first.values['factor']} changes {what}: {_both(first, driver)}."
         rest.append(f"The difference is {test_text(first)}.")
     else:
         claim = f"{rehearsed}no change of {what} is shown by {joined(_factors(primary))}."
@@ -226,8 +232,10 @@ def answered(rows: Sequence[Row]) -> tuple[str, str]:
     also = [row for row in also if row.values["factor"] != MODEL and metric_of(row) in METRIC_NAMES]
     if not sure and also:
         row = min(also, key=lambda row: (_seen_first(row), value_of(row, "p")))
-        rest.append(f"{capital(str(row.values['factor']))} changes {_changed(row)}: {_both(row)}.")
-    return capital(claim), " ".join(filter(None, [*rest, *planted]))
+        rest.append(
+            f"{capital(str(row.values['factor']))} changes {_changed(row)}: {_both(row, driver)}."
+        )
+    return capital(claim), " ".join(filter(None, [*rest, *notes]))
 
 
 def _seen_first(row: Row) -> int:
@@ -282,20 +290,20 @@ def _seen(rows: Sequence[Row], what: str = "A change") -> str:
     size = sizes[max(least, key=lambda name: least[name])]
     if 1 < len(least) <= FEW:
         size = ", ".join(f"{of} by {name}" for name, of in sizes.items())
-    return f"{what} of {size} or more would have been seen in four of five studies."
+    return f"{what} of {size} or more would be shown by four of five such studies."
 
 
 def _factors(rows: Iterable[Row]) -> list[str]:
     return list(dict.fromkeys(str(row.values["factor"]) for row in rows))
 
 
-def _both(row: Row) -> str:
-    """Return ``in the same situations, the driver goes first in 63.00 % with hurry=yes ...``."""
+def _both(row: Row, driver: str) -> str:
+    """Return ``in the same situations, the left driver goes first in 63.00 % with hurry=yes``."""
     factor, level, base = (row.values[name] for name in ("factor", "level", "reference"))
     of, reference = (estimate_text(row, name) for name in ("estimate", "estimate_reference"))
     if metric_of(row) == LEFT_FIRST.name:
         return (
-            f"in the same situations, the driver goes first in {of} with {factor}={level} and in "
+            f"in the same situations, {driver} goes first in {of} with {factor}={level} and in "
             f"{reference} with {factor}={_called(factor, base)}"
         )
     return f"{of} with {factor}={level}, {reference} with {factor}={_called(factor, base)}"
@@ -395,14 +403,16 @@ def _crossing_of(levels: Sequence[Row]) -> str:
 def _counted(levels: Sequence[Row], metric: str) -> str:
     """Return how many trials the measure counts, as in ``58 trials without a crash, 12 with one``.
 
-    Trials of equal drivers, words and course are one.
+    Trials of equal drivers, words and course are one: ``80 that repeat another one are left out``.
     """
     trials = f"{sum(count_of(row, 'n') for row in levels):,} trials"
+    repeated = sum(count_of(row, "repeated") for row in levels)
+    left_out = f"; {repeated:,} that repeat another one are left out" if repeated else ""
     crashed = sum(count_of(row, "crashed") for row in levels)
     what = " that ended" if metric == COLLISIONS.name else " that count"
     if metric == LEFT_FIRST.name:
         what = f" without a crash, {crashed:,} with one" if crashed else " without a crash"
-    return f"{trials}{what}; those that repeat another one are left out"
+    return f"{trials}{what}{left_out}"
 
 
 def _of_one_factor(levels: Sequence[Row], drivers: Sequence[str]) -> list[Row]:

@@ -14,12 +14,13 @@ from jinja2.bccache import Bucket
 from markupsafe import Markup
 
 from merge_runner_analysis.web.display_text import visible, with_minus
-from merge_runner_analysis.web.glossary import meaning
+from merge_runner_analysis.web.glossary import used_terms
 from merge_runner_analysis.web.marks import SHAPES
 from merge_runner_analysis.web.phrases import plain
 from merge_runner_analysis.web.urls import Links
 from merge_runner_analysis.wording import (
     MINUS,
+    PEOPLES_RULE,
     VERDICT_RULE,
     VERDICTS,
     capital,
@@ -87,11 +88,12 @@ def environment(
         whole="{:,}".format,
         minus=lambda text: with_minus(str(text)),
         plain=plain,
-        meaning=meaning,
+        used_terms=used_terms,
     )
     verdicts = {SHAPES[state]: words for state, words in VERDICTS.items()}
     made.globals.update(at=at, policy=policy, inlined=inlined or {}, style=STYLE, **shared)
     made.globals.update(verdict_shapes=verdicts, verdict_rule=capital(VERDICT_RULE))
+    made.globals["peoples_rule"] = PEOPLES_RULE
     for name in MACROS:
         macros = vars(made.get_template(f"_{name}.html").module)
         made.globals |= {k: v for k, v in macros.items() if k[0] != "_"}

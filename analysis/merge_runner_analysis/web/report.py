@@ -199,7 +199,12 @@ def _apart(study: Study) -> Comparison | None:
     first, second = groups
     named = short_names([first.driver, second.driver])
     names = (named[first.driver], named[second.driver])
-    return comparison_of(comparison(study, first.id, second.id), names, (no_trials, no_trials))
+    of_left = all(
+        (rows["focal"].isna() & (rows["model_left"] == rows["model_right"])).all()
+        for rows in (first.trials, second.trials)
+    )
+    table = comparison(study, first.id, second.id)
+    return comparison_of(table, names, (no_trials, no_trials), of_left=of_left)
 
 
 def _once(tables: Iterable[Mapping[str, Any]]) -> dict[str, list[str]]:

@@ -8,11 +8,16 @@ from hypothesis import strategies as st
 
 from merge_runner_analysis.wording import (
     DIFFERS,
+    LANGUAGE_MODEL,
     MEASURES,
     OPEN,
     PLAYED_RULES,
+    PROGRAM,
+    RULES_MEAN,
     SHOWN,
     TOO_FEW,
+    apart,
+    crash_text,
     crashes,
     difference_sentence,
     differs,
@@ -31,7 +36,8 @@ DIRECTION = re.compile(
 
 def row(measure, state="shown", *, n=110, p_holm=0.5, estimate=1.0, ci=(0.5, 1.5), **others):
     return {"measure": measure, "state": state, "n": n, "p_holm": p_holm, "estimate": estimate,
-            "ci": ci, "human": 2.0, "human_ci": None, "difference": -1.0, **others}  # fmt: skip
+            "ci": ci, "human": 2.0, "human_ci": None, "difference": -1.0,
+            "kind": LANGUAGE_MODEL, **others}  # fmt: skip
 
 
 def driver(finished=110, *, collided=0, undecided=None, **states):
@@ -78,17 +84,16 @@ WILD = driver(86, collisions="unlike", gap="unlike", collided=24)
         ),
         (
             {"o3": driver(gap="unlike", undecided=33)},
-            "o3 does not drive like people: it left 1.00 [0.50, 1.50] m at the merge point, people "
-            "2.00 m.",
-            "o3 crashed in 33 of 143 trials by the paper's rule; by people's rule 0 are certain, "
+            "o3 does not drive like people: it left a gap of 1.00 [0.50, 1.50] m, people of 2.00 "
+            "m.",
+            "o3 crashed in 33 of 143 trials by the paper's rule; by people's rule 0 surely did, "
             "33 cannot be told; people in 28 of 990.",
         ),
         (
             {"o3": driver(), "wild": WILD},
             "wild does not drive like people: it crashed in 24 of 110 trials, people in 28 of 990.",
-            "No difference from people is shown for o3. 2 of 8 comparisons with people show a "
-            "difference, with p below 0.05 after correction for the number of comparisons of each "
-            "model (Holm).",
+            "No difference from people is shown for o3. By all measures together, 2 of 8 "
+            "comparisons with people show a difference (corrected p below 0.05).",
         ),
     ],
 )
@@ -96,16 +101,75 @@ def test_a_headline_says_what_a_person_sees_at_once_in_counts_and_metres(drivers
     assert headline(drivers) == (claim, because)
 
 
+def of_kind(kind, **states):
+    """The rows of a driver that is no judged model."""
+    return {name: row(name, state, kind=kind, n=40) for name, state in states.items()}
+
+
+UNJUDGED = {"": {"kind": LANGUAGE_MODEL, "note": "not judged: why"}}
+OPEN_GAP, SHOWN_HEADWAY = of_kind("mock", gap=OPEN), of_kind(PROGRAM, headway=SHOWN)
+ONLY = "drove here; they tell nothing about a language model."
+
+
 @pytest.mark.parametrize(
-    ("kinds", "says"),
+    ("drivers", "says"),
     [
-        (["language model", "mock"], "No language model is judged here."),
-        (["humans", "mock"], "Only scripted stand-ins drove here; they tell nothing about"),
-        (["program", "mock"], "Only programs and scripted stand-ins drove here; they tell"),
+        ([UNJUDGED, OPEN_GAP], ["No language model is judged here.", ""]),
+        ([OPEN_GAP], [f"Only scripted stand-ins {ONLY}", ""]),
+        (
+            [OPEN_GAP, SHOWN_HEADWAY],
+            [
+                "Like people, of 2 drivers: 1 in “The one ahead goes first”; cannot be told yet: "
+                "“Crashes”, “Side by side, the slower goes first”, “Gap at the merge point”.",
+                f"Only programs and scripted stand-ins {ONLY}",
+            ],
+        ),
+        (
+            [of_kind(PROGRAM, headway="unlike"), of_kind(PROGRAM, collisions="unlike")],
+            [
+                "Like people, of 2 drivers: none in “Crashes”, none in “The one ahead goes "
+                "first”; cannot be told yet: “Side by side, the slower goes first”, “Gap at the "
+                "merge point”.",
+                f"Only programs {ONLY}",
+            ],
+        ),
+        (
+            [OPEN_GAP, {"headway": row("headway", n=19, kind="mock")}],
+            ["Whether 2 drivers are like people cannot be told yet.",
+             f"Only scripted stand-ins {ONLY}"],
+        ),
     ],
-)
-def test_where_no_language_model_drove_the_headline_says_who_did(kinds, says):
-    assert headline({}, kinds)[0].startswith(says)
+)  # fmt: skip
+def test_where_no_language_model_drove_the_headline_counts_drivers_and_says_who_did(drivers, says):
+    assert [*headline({f"d{place}": of for place, of in enumerate(drivers)})] == says
+
+
+def test_two_drivers_are_told_apart_with_names_and_numbers():
+    crashed = {"k": 42, "n": 110, "k_reference": 84, "n_reference": 110, "p_corrected": 0.001,
+               "difference": -38.64, "ci": (-50.0, -27.0)}  # fmt: skip
+    gap = {"measure": "gap (m)", "value": 3.1, "value_reference": 4.2, "p_corrected": 0.01,
+           "difference": -1.1}  # fmt: skip
+    first = {"measure": "goes first (%)", "p_corrected": 0.5, "difference": 1.0}
+    rows = {"collided_percent": crashed, "gap_m": gap, "left_first_percent": first}
+    claim, rest = apart("a", "b", rows, of_left=True)
+    assert claim == (
+        "a crashed in 42 of 110 trials, b in 84 of 110. In the same situations a crashed less "
+        "often, by 38.64 points [27.00, 50.00]; corrected p = 0.001."
+    )
+    smaller = "Compared with b, a leaves a smaller gap (3.10 against 4.20 m)."
+    assert rest == f"{smaller} No difference is shown in how often the left vehicle goes first."
+    assert "how often it goes before its opponent." in apart("a", "b", rows, of_left=False)[1]
+    claim, _ = apart("a", "b", rows | {"collided_percent": crashed | {"p_corrected": 0.4}},
+                     of_left=True)  # fmt: skip
+    assert "of 110. No difference is shown: −38.64 points [−50.00, −27.00]; corrected" in claim
+
+
+def test_a_crash_is_explained_by_the_rules_that_were_played():
+    assert crash_text(["rectangle"]) == (
+        "the vehicles' outlines overlap (people's rule, checked at each time step)"
+    )
+    assert " or, by the scenario of the trial, " in crash_text([*RULES_MEAN])
+    assert PLAYED_RULES.keys() == RULES_MEAN.keys()
 
 
 @pytest.mark.parametrize(
@@ -140,7 +204,7 @@ def test_crashes_that_another_rule_decides_are_said_by_both():
     assert crashes(of) == "crashed in 2 of 10 trials; people in 5 of 90"
     cut_off = of | {"undecided": 4, "counted": "6 of 14", "counted_by": PLAYED_RULES["euclid2d"]}
     assert crashes(cut_off) == (
-        "crashed in 6 of 14 trials by the paper's rule; by people's rule 2 are certain, 4 cannot "
+        "crashed in 6 of 14 trials by the paper's rule; by people's rule 2 surely did, 4 cannot "
         "be told; people in 5 of 90"
     )
 
@@ -166,7 +230,7 @@ def test_several_drivers_are_told_together():
         (driver(95, collided=15), "crashed in 15 of 110 trials; people in 28 of 990"),
         (
             driver(7, collided=3, undecided=12),
-            "crashed in 15 of 22 trials by the paper's rule; by people's rule 3 are certain, 12 "
+            "crashed in 15 of 22 trials by the paper's rule; by people's rule 3 surely did, 12 "
             "cannot be told; people in 28 of 990",
         ),
         (
@@ -209,7 +273,7 @@ def test_an_interval_beside_a_margin_names_its_level_where_that_is_not_95_percen
             "Who goes first depends less on who is ahead than with people (the one ahead in 75 of",
         ),
         (driver(velocity="unlike"), "The faster one does not yield, as it does with people ("),
-        (driver(gap="unlike"), "Leaves 1.00 m at the merge point, less than people (2.00 m)"),
+        (driver(gap="unlike"), "Leaves a gap of 1.00 m, smaller than people (2.00 m)"),
         (driver(50, collided=50, collisions="unlike"), "Crashed in 50 of 100 trials, less often"),
         ({"": {"note": "not judged: why"}}, "Not judged: why."),
     ],

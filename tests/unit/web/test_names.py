@@ -4,7 +4,13 @@ import pytest
 
 from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.registry import Catalogue, collecting, using
-from merge_runner_analysis.web.names import names_mean, program_text, programs_of, short_names
+from merge_runner_analysis.web.names import (
+    names_mean,
+    opponents_text,
+    program_text,
+    programs_of,
+    short_names,
+)
 
 
 class Hesitant:
@@ -57,3 +63,20 @@ def test_the_parts_of_names_are_explained_once():
 )
 def test_a_server_is_named_only_where_it_tells_two_drivers_apart(names, shown):
     assert [*short_names(names).values()] == shown
+
+
+@pytest.mark.parametrize(
+    ("names", "says"),
+    [
+        ([], ""),
+        (["o3", "idm"], "Each driver here meets a copy of itself."),
+        (["o3+idm"], "A name with + has both drivers of a pair."),
+        (
+            ["o3", "o3+idm"],
+            "A name with + has both drivers of a pair. A driver named alone meets a copy of "
+            "itself.",
+        ),
+    ],
+)
+def test_the_page_says_whom_a_driver_meets(names, says):
+    assert opponents_text(names) == says

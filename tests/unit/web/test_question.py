@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from merge_runner_analysis.tables.model import Column, Row, Table
 from merge_runner_analysis.web import effect_rows
-from merge_runner_analysis.web.question import PLANTED, UNREAD, answer_of, answered
-from merge_runner_analysis.wording import SAME_TRIALS, UNCORRECTED
+from merge_runner_analysis.web.question import UNREAD, answer_of, answered
+from merge_runner_analysis.wording import EGO, LEFT, PLANTED, SAME_TRIALS, UNCORRECTED
 
 GOES_FIRST, GAP, COST = "goes first (%)", "gap (m)", "cost (USD)"
 METRICS = {GOES_FIRST: "left_first_percent", "coll. (%)": "collided_percent", GAP: "gap_m",
@@ -42,11 +42,11 @@ def copied(factor):
 
 
 HURRY = (
-    "Hurry changes who goes first: in the same situations, the driver goes first in 63.00 % with "
-    "hurry=yes and in 50.00 % with hurry=no."
+    "Hurry changes who goes first: in the same situations, the driver under study goes first in "
+    "63.00 % with hurry=yes and in 50.00 % with hurry=no."
 )
 SAME = "The difference is +13.00 points [6.00, 20.00], corrected "
-SEEN = "A change of 10.00 points or more would have been seen in four of five studies."
+SEEN = "A change of 10.00 points or more would be shown by four of five such studies."
 
 
 @pytest.mark.parametrize(
@@ -76,7 +76,7 @@ SEEN = "A change of 10.00 points or more would have been seen in four of five st
         (
             [effect(drivers="scripted"), copied("persona")],
             f"In a rehearsal with a scripted stand-in, h{HURRY[1:]}",
-            f"{SAME}p = 0.001. Persona=yes is {UNREAD}. {PLANTED}",
+            f"{SAME}p = 0.001. Persona=yes is {UNREAD}.",
         ),
         (
             [effect(f"words{n}", 0.9 - n / 10, difference=1.0) for n in range(4)],
@@ -105,7 +105,7 @@ SEEN = "A change of 10.00 points or more would have been seen in four of five st
             "Hurry=yes is not shown to change it: +13.00 points [6.00, 20.00], corrected p = "
             "0.200. Persona=yes is not shown to change it: +1.00 points [−6.00, 8.00], corrected p "
             f"= 0.300. {UNCORRECTED} A change of 10.00 points by hurry, 10.00 points by persona or "
-            "more would have been seen in four of five studies.",
+            "more would be shown by four of five such studies.",
         ),
         (
             [effect(n=12)],
@@ -143,16 +143,34 @@ def levels_of(factor, drivers=("",)):
             (),
             {"factor": factor, "level": level, "driver": driver.rstrip("/") or None, "k": k,
              "n": 100, "value": k, "ci": (k - 8.0, k + 8.0), "crashed": 3, "ended": 103,
-             "gap_m": None, "rmse_mps": 1.0},
+             "repeated": 7, "gap_m": None, "rmse_mps": 1.0},
         )
         for driver in drivers
         for level, k in (("no", 50), ("yes", 63))
     ]  # fmt: skip
 
 
-def answer(effects, levels):
+def answer(effects, levels, *notes):
     columns = (Column("factor", "factor"),)
-    return answer_of(Table("effects", columns, effects), Table("levels", columns, levels))
+    tables = (Table("effects", columns, effects, notes), Table("levels", columns, levels, notes))
+    return answer_of(*tables)
+
+
+PLANT = f"{PLANTED}: hurry=yes adds 1.5"
+
+
+@pytest.mark.parametrize(("drivers", "is_said"), [("scripted", True), (None, False)])
+def test_a_planted_effect_is_said_of_a_rehearsal_with_its_size(drivers, is_said):
+    rest = answer([effect(drivers=drivers)], levels_of("hurry"), PLANT).rest
+    assert rest.endswith(f"{PLANT[0].upper()}{PLANT[1:]}.") is is_said
+    assert "lanted" not in answer([effect(drivers=drivers)], levels_of("hurry")).rest
+
+
+@pytest.mark.parametrize("who", [EGO, LEFT])
+def test_the_driver_that_goes_first_is_named_and_explained(who):
+    made = answer([effect()], levels_of("hurry"), who[1])
+    assert f"situations, {who[0]} goes first in" in made.claim
+    assert made.who == f"G{who[1][1:]}"
 
 
 def test_a_side_has_its_count_and_the_chart_the_axis_of_its_data():
@@ -168,7 +186,7 @@ def test_a_side_has_its_count_and_the_chart_the_axis_of_its_data():
     # Of both drivers, which are drawn.
     assert (
         made.counted
-        == "400 trials without a crash, 12 with one; those that repeat another one are left out"
+        == "400 trials without a crash, 12 with one; 28 that repeat another one are left out"
     )
     (chart,) = made.charts
     assert chart.title == "By factor"
@@ -189,7 +207,7 @@ def test_levels_that_are_not_tested_are_not_drawn():
     assert [line.head for line in chart.lines] == ["hurry", ""]
     assert (
         made.counted
-        == "200 trials without a crash, 6 with one; those that repeat another one are left out"
+        == "200 trials without a crash, 6 with one; 14 that repeat another one are left out"
     )
 
 

@@ -24,7 +24,7 @@ from merge_runner_analysis.web.judged import (
 from merge_runner_analysis.web.marks import rate
 from merge_runner_analysis.web.scope import Scope, scope_of, unmarked
 from merge_runner_analysis.web.site import NotThere, Site
-from merge_runner_analysis.wording import DIFFERS, OPEN, SHOWN, UNLIKE, shown_state
+from merge_runner_analysis.wording import DIFFERS, MEASURES, OPEN, SHOWN, UNLIKE, shown_state
 
 # Outcomes and served models of the attempts of a driver's trials with a prompt.
 ATTEMPTS = """
@@ -95,7 +95,7 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         conditions=conditions,
         counted=_counted([cell for _, cells in conditions["rows"] for cell in cells if cell]),
         rates=zip(*shares, strict=True),
-        notes=noted(both),
+        notes=noted(both, {name: measure.trait for name, measure in MEASURES.items()}),
     )
 
 
@@ -124,7 +124,7 @@ def _summary(driver: Driver) -> str:
     traits = [states[name] for name in states if name not in {"collisions", "gap"}]
     shown = sum(state in {SHOWN, *DIFFERS} - {UNLIKE} for state in traits)
     return (
-        f"{shown} of {len(traits)} human traits shown; "
+        f"{shown} of {len(traits)} patterns of people are found; "
         f"{[*states.values()].count(OPEN)} of {len(states)} measures cannot be told yet."
     )
 
