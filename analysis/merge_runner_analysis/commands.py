@@ -49,31 +49,20 @@ NAMES = (
 
 app.add_typer(human_app, name="human", rich_help_panel=KEEP)
 
-ModelsOption = Annotated[
-    str | None,
-    option("A,B", "Only these drivers, separated by commas; human is one.", "--models"),
-]
-WhereOption = Annotated[
-    list[str] | None,
-    option(
-        "FACTOR=LEVEL",
-        "Only trials at this level of a factor, of model or of prompt, and human trials; may be "
-        "repeated.",
-        "--where",
-    ),
-]
-RunOption = Annotated[
-    str | None,
-    option("NAME", "Only trials of runs with this --name or sweep_id, and human trials.", "--run"),
-]
-ByOption = Annotated[
-    str | None,
-    option(
-        "FACTOR",
-        "With the table effects: effects at each level of this factor, and interactions.",
-        "--by",
-    ),
-]
+MODELS = "Only these drivers, separated by commas; human is one."
+WHERE = "Only trials at this level of a factor, model or prompt, and humans; may be repeated."
+RUN = "Only trials of runs with this --name or sweep_id, and humans."
+BY = "With the table effects: effects at each level of this factor, and interactions."
+FORM = "text (the default), csv, json, md or latex."
+AGAINST = "Published values and differences, for drivers of that name."
+WITHOUT = "Without the trials in which a reply held no valid plan."
+WIDE = "All columns, also where the terminal is narrower."
+TRIALS = "Which trials to write: names separated by commas, * for anything."
+READER = "Your name in notes; default: your user name."
+ModelsOption = Annotated[str | None, option("A,B", MODELS, "--models")]
+WhereOption = Annotated[list[str] | None, option("FACTOR=LEVEL", WHERE, "--where")]
+RunOption = Annotated[str | None, option("NAME", RUN, "--run")]
+ByOption = Annotated[str | None, option("FACTOR", BY, "--by")]
 
 
 def _table_names() -> list[str]:
@@ -85,8 +74,7 @@ def _table_names() -> list[str]:
 @app.command(rich_help_panel=LOOK)
 def tables(
     names: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="NAME", autocompletion=_table_names, help=NAMES),
+        list[str] | None, typer.Argument(metavar="NAME", autocompletion=_table_names, help=NAMES)
     ] = None,
     db: DbOption = DEFAULT_DB,
     models: ModelsOption = None,
@@ -95,23 +83,12 @@ def tables(
     study_file: StudyOption = None,
     trust: TrustOption = False,
     output: Annotated[
-        TableFormat,
-        option(
-            "FORM", "text (the default), csv, json, md or latex.", "--format", show_default=False
-        ),
+        TableFormat, option("FORM", FORM, "--format", show_default=False)
     ] = TableFormat.TEXT,
-    against: Annotated[
-        str | None,
-        option("paper", "Published values and differences, for drivers of that name.", "--against"),
-    ] = None,
+    against: Annotated[str | None, option("paper", AGAINST, "--against")] = None,
     by: ByOption = None,
-    without_fallbacks: Annotated[
-        bool,
-        flag("--without-fallbacks", "Without the trials in which a reply held no valid plan."),
-    ] = False,
-    wide: Annotated[
-        bool, flag("--wide", "All columns, also where the terminal is narrower.")
-    ] = False,
+    without_fallbacks: Annotated[bool, flag("--without-fallbacks", WITHOUT)] = False,
+    wide: Annotated[bool, flag("--wide", WIDE)] = False,
     as_json: cli.JsonOption = False,
 ) -> None:
     """Print the paper's tables, and further ones.
@@ -382,18 +359,9 @@ def view(
     single: Annotated[
         Path | None, option("FILE", "Write one page with the --trials.", "--single")
     ] = None,
-    trials: Annotated[
-        str | None,
-        option(
-            "NAMES",
-            "Which trials to write: names separated by commas, * for anything.",
-            "--trials",
-        ),
-    ] = None,
+    trials: Annotated[str | None, option("NAMES", TRIALS, "--trials")] = None,
     no_open: Annotated[bool, flag("--no-open", "Do not open a browser.")] = False,
-    reader: Annotated[
-        str | None, option("NAME", "Your name in notes; default: your user name.", "--reader")
-    ] = None,
+    reader: Annotated[str | None, option("NAME", READER, "--reader")] = None,
     db: DbOption = DEFAULT_DB,
     study_file: StudyOption = None,
     trust: TrustOption = False,

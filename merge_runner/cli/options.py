@@ -54,57 +54,25 @@ DB = "The results database; that of a study's file is in its folder."
 CACHE = "The folder of recorded replies; that of a study's file is in its folder."
 DbOption = Annotated[Path, option("FILE", DB, "--db", callback=beside_study, **FILES)]
 CacheOption = Annotated[Path, option("DIR", CACHE, "--cache", callback=beside_study, **FILES)]
-ModelOption = Annotated[
-    list[str] | None,
-    option(
-        "NAME",
-        "A model or program of `merge-runner models`, or a pair LEFT+RIGHT; may be repeated. "
-        "Default: those of the study's file, or the emulator.",
-        "--model",
-        **PLAYED,
-    ),
-]
-OnlyOption = Annotated[
-    list[str] | None,
-    option(
-        "FACTOR=LEVEL",
-        "Only this level of a factor, of model or of prompt; may be repeated.",
-        "--only",
-        **PLAYED,
-    ),
-]
-RepsOption = Annotated[
-    int | None, option("N", "Repetitions per condition and prompt.", "--reps", **PLAYED)
-]
-ConditionsOption = Annotated[
-    str | None, option("A,B", "Conditions, separated by commas.", "--conditions", **PLAYED)
-]
-VariantsOption = Annotated[
-    str | None, option("A,B", "Prompts, separated by commas.", "--variants", **PLAYED)
-]
+MODEL = (
+    "A model or program of `merge-runner models`, or a pair LEFT+RIGHT; may be repeated. Default: "
+    "those of the study's file, or the emulator."
+)
+ONLY = "Only this level of a factor, of model or of prompt; may be repeated."
+CONDITIONS, PROMPTS = "Conditions, separated by commas.", "Prompts, separated by commas."
+REPS = "Repetitions per condition and prompt."
+ModelOption = Annotated[list[str] | None, option("NAME", MODEL, "--model", **PLAYED)]
+OnlyOption = Annotated[list[str] | None, option("FACTOR=LEVEL", ONLY, "--only", **PLAYED)]
+RepsOption = Annotated[int | None, option("N", REPS, "--reps", **PLAYED)]
+ConditionsOption = Annotated[str | None, option("A,B", CONDITIONS, "--conditions", **PLAYED)]
+VariantsOption = Annotated[str | None, option("A,B", PROMPTS, "--variants", **PLAYED)]
+YES = "Do not ask before something is spent or removed."
+TRUST = "Without asking, run the study's code, and send keys where its models.toml says."
+STUDY = "Only trials of this study. A command that needs the study's parts runs its plug-ins."
 JsonOption = Annotated[bool, flag("--json", "Print the result as JSON.", **ASKED)]
-YesOption = Annotated[
-    bool, flag("--yes", "Do not ask before something is spent or removed.", **ASKED)
-]
-TrustOption = Annotated[
-    bool,
-    flag(
-        "--trust",
-        "Without asking, run the study's code, and send keys where its models.toml says.",
-        **ASKED,
-    ),
-]
-StudyOption = Annotated[
-    str | None,
-    option(
-        "FILE",
-        "Only trials of this study. A command that needs the study's parts runs its plug-ins.",
-        "--study",
-        **FILES,
-    ),
-]
-
-
+YesOption = Annotated[bool, flag("--yes", YES, **ASKED)]
+TrustOption = Annotated[bool, flag("--trust", TRUST, **ASKED)]
+StudyOption = Annotated[str | None, option("FILE", STUDY, "--study", **FILES)]
 NOT_BOTH = "--sweep names a run, --study all runs of a study: leave one of them out"
 
 
