@@ -53,6 +53,14 @@ MODELS = "Only these drivers, separated by commas; human is one."
 WHERE = "Only trials at this level of a factor, model or prompt, and humans; may be repeated."
 RUN = "Only trials of runs with this --name or sweep_id, and humans."
 BY = "With the table effects: effects at each level of this factor, and interactions."
+NAME, ROW = "A table's name.", "ROW, or ROW:COLUMN; without it rows are listed."
+ALL = "All trials, also those that the value does not count."
+OUT, HTML_FILE = "The folder to write to.", "The HTML file to write."
+ALSO, EXPORT = (
+    "Also write all tables and figures here.",
+    "A new folder, or that of an earlier export.",
+)
+SINGLE, STUDY_FILE = "Write one page with the --trials.", "experiments/STUDY.toml, or a path."
 FORM = "text (the default), csv, json, md or latex."
 AGAINST = "Published values and differences, for drivers of that name."
 WITHOUT = "Without the trials in which a reply held no valid plan."
@@ -121,22 +129,15 @@ def tables(
 
 @app.command(rich_help_panel=LOOK)
 def explain(
-    table: Annotated[
-        str,
-        typer.Argument(metavar="TABLE", autocompletion=_table_names, help="A table's name."),
-    ],
-    cell: Annotated[
-        str, typer.Argument(metavar="ROW", help="ROW, or ROW:COLUMN; without it rows are listed.")
-    ] = "",
+    table: Annotated[str, typer.Argument(metavar="TABLE", autocompletion=_table_names, help=NAME)],
+    cell: Annotated[str, typer.Argument(metavar="ROW", help=ROW)] = "",
     db: DbOption = DEFAULT_DB,
     where: WhereOption = None,
     run: RunOption = None,
     study_file: StudyOption = None,
     trust: TrustOption = False,
     by: ByOption = None,
-    whole: Annotated[
-        bool, flag("--all", "All trials, also those that the value does not count.")
-    ] = False,
+    whole: Annotated[bool, flag("--all", ALL)] = False,
     as_json: cli.JsonOption = False,
 ) -> None:
     """Explain a row of a table: its query and its trials.
@@ -165,9 +166,7 @@ def explain(
 
 @app.command(rich_help_panel=PLAY)
 def power(
-    study: Annotated[
-        str, typer.Argument(metavar="STUDY", help="experiments/STUDY.toml, or a path.")
-    ],
+    study: Annotated[str, typer.Argument(metavar="STUDY", help=STUDY_FILE)],
     model: cli.ModelOption = None,
     only: cli.OnlyOption = None,
     reps: cli.RepsOption = None,
@@ -219,9 +218,9 @@ def power(
 
 @app.command(rich_help_panel=LOOK)
 def figures(
-    out: Annotated[
-        Path, option("DIR", "The folder to write to.", "--out", callback=beside_study)
-    ] = Path("results/figures"),
+    out: Annotated[Path, option("DIR", OUT, "--out", callback=beside_study)] = Path(
+        "results/figures"
+    ),
     db: DbOption = DEFAULT_DB,
     models: ModelsOption = None,
     where: WhereOption = None,
@@ -244,9 +243,7 @@ def figures(
 
 @app.command(rich_help_panel=KEEP)
 def export(
-    folder: Annotated[
-        Path, typer.Argument(metavar="DIR", help="A new folder, or that of an earlier export.")
-    ],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help=EXPORT)],
     db: DbOption = DEFAULT_DB,
     study_file: StudyOption = None,
 ) -> None:
@@ -262,12 +259,10 @@ def export(
 
 @app.command(rich_help_panel=LOOK)
 def report(
-    out: Annotated[
-        Path, option("FILE", "The HTML file to write.", "--out", callback=beside_study)
-    ] = Path("results/report.html"),
-    files: Annotated[
-        Path | None, option("DIR", "Also write all tables and figures here.", "--files")
-    ] = None,
+    out: Annotated[Path, option("FILE", HTML_FILE, "--out", callback=beside_study)] = Path(
+        "results/report.html"
+    ),
+    files: Annotated[Path | None, option("DIR", ALSO, "--files")] = None,
     db: DbOption = DEFAULT_DB,
     models: ModelsOption = None,
     where: WhereOption = None,
@@ -356,9 +351,7 @@ def view(
     export: Annotated[
         Path | None, option("DIR", "Write a folder of pages instead of serving.", "--export")
     ] = None,
-    single: Annotated[
-        Path | None, option("FILE", "Write one page with the --trials.", "--single")
-    ] = None,
+    single: Annotated[Path | None, option("FILE", SINGLE, "--single")] = None,
     trials: Annotated[str | None, option("NAMES", TRIALS, "--trials")] = None,
     no_open: Annotated[bool, flag("--no-open", "Do not open a browser.")] = False,
     reader: Annotated[str | None, option("NAME", READER, "--reader")] = None,

@@ -14,7 +14,9 @@ from merge_runner.study.file import StudyFile
 from tests.support.harness import PROJECT
 
 PAGE = (PROJECT / "docs/run-a-study.md").read_text()
+PERCEPTION = (PROJECT / "docs/perception.md").read_text()
 EXAMPLES = dict(re.findall(r"^## ([^\n]*)\n+```toml\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE))
+(EXAMPLES["Perception"],) = re.findall(r"```toml\n(.*?)```", PERCEPTION, re.DOTALL)
 
 
 def keys(model: type):
@@ -42,6 +44,7 @@ def plan_of(folder, example, **asked):
         ("What varies", 8 + 8 + 4 + 4),  # those against projected-order both ways round
         ("Prompts", 4),
         ("Text factors", 1 + 3 * 2 + 4 * 2),
+        ("Perception", 2 * 3),
     ],
 )
 def test_every_example_can_be_played(example, arms, tmp_path):
@@ -66,7 +69,8 @@ async def test_the_study_of_the_readme_fits_its_cap_with_models_that_answer_in_2
 
 
 def test_every_key_is_explained_and_shown_in_an_example():
-    assert len(EXAMPLES) == PAGE.count("```toml\n") == 4
+    assert len(EXAMPLES) == PAGE.count("```toml\n") + 1 == 5
+    assert re.findall(r"^\| `(\w+)` \|", PERCEPTION, re.MULTILINE) == [*Perception.model_fields]
     explained = re.sub(r"```.*?```", "", PAGE, flags=re.DOTALL)
     shown = "\n".join(EXAMPLES.values())
     for key in keys(StudyFile):
