@@ -28,6 +28,11 @@ if TYPE_CHECKING:
     from merge_runner.run.options import Options
     from merge_runner.run.plan import Plan
 
+STUDIES = (
+    "A study: experiments/NAME.toml, or a path; default: baseline. To replay, also a recording, "
+    "FILE.parquet. Several are played one after the other."
+)
+MIRROR = "Play pairs of different drivers in both positions."
 GRID = (
     "With --first, in place of the study's conditions: projected headways in m and relative "
     "velocities in m/s, h=FROM:TO:STEP,dv=FROM:TO:STEP; usual: h=-6:6:2,dv=-1.6:1.6:0.4."
@@ -63,20 +68,10 @@ def init(
 
 
 def sweep(
-    studies: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="NAME",
-            help="A study: experiments/NAME.toml, or a path; default: baseline. To replay, also a "
-            "recording, FILE.parquet. Several are played one after the other.",
-        ),
-    ] = None,
+    studies: Annotated[list[str] | None, typer.Argument(metavar="NAME", help=STUDIES)] = None,
     models: cli.ModelOption = None,
     only: cli.OnlyOption = None,
-    mirror: Annotated[
-        bool,
-        cli.flag("--mirror", "Play pairs of different drivers in both positions.", **cli.PLAYED),
-    ] = False,
+    mirror: Annotated[bool, cli.flag("--mirror", MIRROR, **cli.PLAYED)] = False,
     repetitions: cli.RepsOption = None,
     conditions: cli.ConditionsOption = None,
     variants: cli.VariantsOption = None,
