@@ -13,6 +13,7 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 from merge_runner_analysis import wording
+from merge_runner_analysis.published import published
 from merge_runner_analysis.stats.regressions import GAP_MARGIN_M
 from merge_runner_analysis.web import export, report, search
 from merge_runner_analysis.web.pages import conditions
@@ -23,6 +24,7 @@ UNSET = ScenarioConfig()
 ENTRY = ModelEntry(provider="local", format="openai-chat", max_output_tokens=1)
 SEEN = [World(UNSET, CONDITIONS[n], TRACK).observe(s) for n in HUMAN_CONDITIONS for s in SIDES]
 AWAY_M = [seen.distance_to_merge_m for seen in SEEN]
+PASSES = 100 * published("human_ceiling").set_index(["n", "indicator", "rule"])["share"]
 CLAIMS = f"""
 batches: at most {rounds.MAX_CALLS:,} requests. At most {players.MOST_IN_ROUNDS:,} trials
 batches: no batch can be created for {lifecycle.OUTAGE_S / 60:g} minutes
@@ -39,6 +41,10 @@ models: is refused for {endpoint_state.NOBODY_S:g} to {2 * endpoint_state.NOBODY
 models: warn from {models.SOON_DAYS} days before
 numbers: more than {MOST_INVALID_SHARE * 100:g} % of a model's decisions
 numbers: more than {report.MANY_FALLBACKS * 100:g} % fallbacks
+numbers: together in {PASSES[10, "I1-I4", "paper"]:.0f} % of studies by the paper's rules
+numbers: By the robust rules it is {PASSES[10, "I1-I4", "robust"]:g} %
+numbers: I4 in {PASSES[10, "I4", "robust"]:.0f} % of data sets with 110 trials
+numbers: and in {PASSES[50, "I4", "robust"]:.0f} % with 550
 numbers: margins of {GAP_MARGIN_M:g} m and 0.5 SD
 numbers: {wording.MARGINS["collisions"]:g} points (collisions) or {wording.MARGINS["gap"]:g} m (gap)
 numbers: With fewer than {wording.ENOUGH} trials
