@@ -102,3 +102,5 @@ def test_links_of_the_docs_lead_somewhere():
             to = page.parent / path if path else page
             assert to.exists(), f"{page}: {target}"
             assert not heading or heading in anchors(to), f"{page}: {target}"
+        for path in re.findall(r"`((?:merge_runner|analysis|tests)/[\w./]+)`", page.read_text()):
+            assert (PROJECT / path).exists(), f"{page}: {path}"
