@@ -23,6 +23,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import duckdb
+from pydantic import TypeAdapter
 
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import ResponseCache
@@ -67,6 +68,7 @@ COLUMNS = {
 SLOT = ("condition", "repetition", "side", "decision", "sample_set")
 # Far beyond any sweep; a file that claims more is hostile.
 MOST_CALLS = 10_000_000
+_CALL = TypeAdapter(CachedCall)
 BLOCK, MOST_BLOCK_BYTES = 2048, 2**28
 """Number of rows that DuckDB returns at once, and the maximum bytes of their texts."""
 MOST_GROUP_BYTES = 2 * MOST_BLOCK_BYTES
@@ -256,8 +258,9 @@ def _entry(row: dict[str, Any]) -> CachedCall:
     request = {name: row[name] for name in ("provider", "endpoint", "model", "path", "body")}
     request |= {"key": row["call_key"], "slot": {name: row[name] for name in SLOT}}
     request["headers"] = json.loads(row["headers"])
-    call = {"request": request, "attempts": json.loads(row["attempts"])}
-    entry = CachedCall.from_json(json.dumps({"version": 1, "entry": call}))
+    # Attempts are read as they are written: within other JSON they could end it.
+    attempts = ATTEMPTS.validate_json(row["attempts"], strict=True)
+    entry = _CALL.validate_python({"request": request, "attempts": attempts})
     check_call(entry.request.key, entry.request, entry.attempts)
     return entry
 
