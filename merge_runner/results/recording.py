@@ -41,7 +41,7 @@ from merge_runner.records import (
 )
 from merge_runner.results import instance
 from merge_runner.results.database import append, fetched
-from merge_runner.results.instance import Settings, in_memory
+from merge_runner.results.instance import Instance, Settings, in_memory
 from merge_runner.results.parquet import group_bytes
 from merge_runner.results.rows import Row
 from merge_runner.text_safety import first_line, quoted
@@ -79,7 +79,9 @@ READER_SETTINGS: Settings = {
     "autoinstall_known_extensions": False,
     "autoload_known_extensions": False,
     "threads": 1,
+    "enable_external_file_cache": False,  # a file may be replaced
 }
+READER = Instance(READER_SETTINGS)
 
 
 def export_recording(
@@ -275,10 +277,10 @@ def opened(file: Path) -> Iterator[tuple[duckdb.DuckDBPyConnection, dict[str, st
         raise UsageError(f"there is no recording {file}")
     # Escaped, so that the pattern matches this file only.
     pattern = quoted(re.sub(r"([*?\[])", r"[\1]", str(file.resolve())))
-    with in_memory(READER_SETTINGS) as connection:
+    with READER.cursor() as connection:
         try:
             connection.execute(
-                "CREATE VIEW recording AS FROM "
+                "CREATE TEMP VIEW recording AS FROM "
                 f"read_parquet({pattern}, file_row_number = true, hive_partitioning = false)"
             )
             columns = connection.execute("DESCRIBE recording").fetchall()
@@ -300,6 +302,7 @@ def opened(file: Path) -> Iterator[tuple[duckdb.DuckDBPyConnection, dict[str, st
             _refuse_bombs(file, pattern, connection)
             yield connection, metadata
         except (duckdb.Error, UnicodeDecodeError) as exc:
+            READER.drop()
             raise RecordingError(
                 f"{file} is damaged, or no Parquet file: {first_line(exc)}"
             ) from exc
