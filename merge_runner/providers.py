@@ -12,11 +12,7 @@ from functools import partial
 from typing import Annotated, Literal, Self
 from urllib.parse import SplitResult, urlsplit
 
-from pydantic import (
-    Field,
-    JsonValue,
-    PrivateAttr,
-)
+from pydantic import Field, JsonValue, PrivateAttr
 
 from merge_runner.config import Count, Frozen, NotNegative, Positive
 from merge_runner.errors import UsageError

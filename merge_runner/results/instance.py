@@ -67,13 +67,14 @@ class Instance:
     may be unusable and is replaced.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, settings: Settings = SETTINGS) -> None:
+        self._settings = settings
         self._connection: duckdb.DuckDBPyConnection | None = None
 
     def cursor(self) -> duckdb.DuckDBPyConnection:
         """Return a separate connection to the instance."""
         if self._connection is None:
-            self._connection = in_memory(SETTINGS)
+            self._connection = in_memory(self._settings)
         return self._connection.cursor()
 
     def drop(self) -> None:

@@ -11,10 +11,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, JsonValue, field_validator
 
-from merge_runner.records import (
-    DAMAGED,
-    canonical_json,
-)
+from merge_runner.records import DAMAGED, canonical_json
 from merge_runner.results.recording import opened
 
 SWEEPS_KEY = "sweeps"

@@ -23,6 +23,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import duckdb
+from pydantic import TypeAdapter
 
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import ResponseCache
@@ -40,7 +41,7 @@ from merge_runner.records import (
 )
 from merge_runner.results import instance
 from merge_runner.results.database import append, fetched
-from merge_runner.results.instance import Settings, in_memory
+from merge_runner.results.instance import Instance, Settings, in_memory
 from merge_runner.results.parquet import group_bytes
 from merge_runner.results.rows import Row
 from merge_runner.text_safety import first_line, quoted
@@ -67,6 +68,7 @@ COLUMNS = {
 SLOT = ("condition", "repetition", "side", "decision", "sample_set")
 # Far beyond any sweep; a file that claims more is hostile.
 MOST_CALLS = 10_000_000
+_CALL = TypeAdapter(CachedCall)
 BLOCK, MOST_BLOCK_BYTES = 2048, 2**28
 """Number of rows that DuckDB returns at once, and the maximum bytes of their texts."""
 MOST_GROUP_BYTES = 2 * MOST_BLOCK_BYTES
@@ -77,7 +79,9 @@ READER_SETTINGS: Settings = {
     "autoinstall_known_extensions": False,
     "autoload_known_extensions": False,
     "threads": 1,
+    "enable_external_file_cache": False,  # a file may be replaced
 }
+READER = Instance(READER_SETTINGS)
 
 
 def export_recording(
@@ -256,8 +260,9 @@ def _entry(row: dict[str, Any]) -> CachedCall:
     request = {name: row[name] for name in ("provider", "endpoint", "model", "path", "body")}
     request |= {"key": row["call_key"], "slot": {name: row[name] for name in SLOT}}
     request["headers"] = json.loads(row["headers"])
-    call = {"request": request, "attempts": json.loads(row["attempts"])}
-    entry = CachedCall.from_json(json.dumps({"version": 1, "entry": call}))
+    # Attempts are read as they are written: within other JSON they could end it.
+    attempts = ATTEMPTS.validate_json(row["attempts"], strict=True)
+    entry = _CALL.validate_python({"request": request, "attempts": attempts})
     check_call(entry.request.key, entry.request, entry.attempts)
     return entry
 
@@ -272,10 +277,10 @@ def opened(file: Path) -> Iterator[tuple[duckdb.DuckDBPyConnection, dict[str, st
         raise UsageError(f"there is no recording {file}")
     # Escaped, so that the pattern matches this file only.
     pattern = quoted(re.sub(r"([*?\[])", r"[\1]", str(file.resolve())))
-    with in_memory(READER_SETTINGS) as connection:
+    with READER.cursor() as connection:
         try:
             connection.execute(
-                "CREATE VIEW recording AS FROM "
+                "CREATE TEMP VIEW recording AS FROM "
                 f"read_parquet({pattern}, file_row_number = true, hive_partitioning = false)"
             )
             columns = connection.execute("DESCRIBE recording").fetchall()
@@ -297,6 +302,7 @@ def opened(file: Path) -> Iterator[tuple[duckdb.DuckDBPyConnection, dict[str, st
             _refuse_bombs(file, pattern, connection)
             yield connection, metadata
         except (duckdb.Error, UnicodeDecodeError) as exc:
+            READER.drop()
             raise RecordingError(
                 f"{file} is damaged, or no Parquet file: {first_line(exc)}"
             ) from exc

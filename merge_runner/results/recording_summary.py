@@ -10,10 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from merge_runner.records import (
-    DAMAGED,
-    is_scripted,
-)
+from merge_runner.records import DAMAGED, is_scripted
 from merge_runner.results.recorded_sweeps import carried_plugins, sweep_rows
 from merge_runner.results.recording import read_provenance, read_recording
 from merge_runner.text_safety import one_line

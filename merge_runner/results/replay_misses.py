@@ -12,9 +12,7 @@ from operator import attrgetter
 from pathlib import Path
 
 from merge_runner.llm.store import CachedCall
-from merge_runner.records import (
-    ChatRequest,
-)
+from merge_runner.records import ChatRequest
 from merge_runner.text_safety import one_line
 
 MOST_SHOWN = 70

@@ -149,9 +149,11 @@ class Store:
         """
         # Before the lock is taken, although trials that are already stored need no rows.
         played = [(_key(record), record.status, rows_of(record)) for record in records]
-        texts = [len(str(value)) for *_, rows in played for row in rows["calls"] for value in row]
+        calls = [call for record in records for call in record.calls]
+        texts = [call.request.body for call in calls]
+        texts += [attempt.reply or "" for call in calls for attempt in call.attempts]
         with write_database(self.path, patience_s) as connection:
-            limit_memory(connection, max(texts, default=0))
+            limit_memory(connection, max(map(len, texts), default=0))
             merge_small_groups(connection)
             _add_specs(connection, specs or {})
             differing = _add_trials(connection, played)

@@ -11,9 +11,7 @@ from merge_runner.errors import unknown_name
 from merge_runner.registry import require
 from merge_runner.results.database import append, by_name, read_database, write_database
 from merge_runner.results.instance import limit_memory
-from merge_runner.results.rows import (
-    KEY_COLUMNS,
-)
+from merge_runner.results.rows import KEY_COLUMNS
 from merge_runner.served_model import other_models
 
 FACTS = Path(__file__).with_name("facts.sql")

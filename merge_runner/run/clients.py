@@ -165,9 +165,7 @@ def open_rounds(
 
 
 def check_batches(plan: Plan, options: Options) -> None:
-    """Raise UsageError where a run cannot use batches as its options ask."""
-    if not options.batch:
-        return
+    """Raise UsageError where a run cannot use batches."""
     is_served = bool(os.environ.get("EMULATOR_BASE_URL"))
     in_process = plan.scripted and not is_served
     if options.replay or options.dask is not None or not plan.entries or in_process:

@@ -16,7 +16,6 @@ from merge_runner.results.database import unreadable_is_usage
 from merge_runner.results.recording import spilled
 from merge_runner.results.replay_misses import Miss, explain
 from merge_runner.results.store import Store
-from merge_runner.run.clients import check_batches
 from merge_runner.run.options import Options
 from merge_runner.run.plan import Plan
 from merge_runner.run.served_names import with_names
@@ -79,7 +78,10 @@ async def open_session(
     Asks a user's own server for the name of its model, and locks the models of a live run.
     ``say`` shows a line to the user. Raises UsageError.
     """
-    check_batches(plan, options)
+    if options.batch:
+        from merge_runner.run.clients import check_batches
+
+        check_batches(plan, options)
     recorded = partial(spilled, options.recordings) if options.recordings else None
     with closing(ResponseCache(options.cache, overlay=recorded)) as cache:
         plan = await with_names(plan, options, cache, say)

@@ -9,9 +9,8 @@ from collections.abc import Callable, Sequence
 from contextlib import AsyncExitStack, closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.templates import answer_counts
 from merge_runner.paths import SHIPPED_RECORDINGS
@@ -21,12 +20,10 @@ from merge_runner.results.database import unreadable_is_usage
 from merge_runner.results.recorded_sweeps import recorded_part
 from merge_runner.results.replay_misses import described
 from merge_runner.results.store import Store
-from merge_runner.run.clients import open_rounds
 from merge_runner.run.estimate import Estimate, earlier_answers, estimate, usual_latencies_s
 from merge_runner.run.interrupt import NEVER, Stopping
 from merge_runner.run.options import Options
 from merge_runner.run.plan import Plan, usual_prompts
-from merge_runner.run.players import open_player
 from merge_runner.run.playing import play_and_store
 from merge_runner.run.progress import Progress, TrialCounts, show_progress
 from merge_runner.run.progress_file import write_snapshot
@@ -36,6 +33,9 @@ from merge_runner.run.session import Session, misses_of, open_session
 from merge_runner.run.summary import as_dict
 from merge_runner.run.trials import Player
 from merge_runner.run.writer import Flusher
+
+if TYPE_CHECKING:
+    from merge_runner.llm.batch.rounds import Rounds
 
 
 async def play(
@@ -98,6 +98,10 @@ async def run(
             store, rounds = Store(db), None
             player: Player = replay
             if plan.entries and not options.sends_nothing:
+                # A replay has no client, whose modules take a tenth of its start.
+                from merge_runner.run.clients import open_rounds
+                from merge_runner.run.players import open_player
+
                 rounds = open_rounds(plan, options, session.cache, session.say)
                 player = await open_player(session, store, rounds, stack)
             progress = _progress(session, player, rounds)

@@ -25,7 +25,7 @@ from merge_runner.errors import SweepStopped, UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.ledger import CallLabel, Ledger, reasons
 from merge_runner.records import SLOT_HEADER, ReplayMiss
-from merge_runner.run.cluster_assignment import Assignment
+from merge_runner.run.cluster import Assignment
 from merge_runner.run.cluster_connection import connected
 from merge_runner.run.cluster_worker import Chunk, Played, RemoteCoordinator
 from tests.support.cluster import SIX, SMALL, all_held, ended, held_from, repetition_of, workers_of
