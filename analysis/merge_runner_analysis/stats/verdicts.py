@@ -413,7 +413,8 @@ def _standardised(both: Both) -> Estimate:
         return Estimate(problem=Fact(Why.NOBODY_THERE))
     counts = shared.groupby("condition")[BOXES.column].agg(["sum", "size"]).astype(int)
     k, n = counts.to_numpy().T
-    rate, as_good_as = contrasts.weighted(k, n, played[counts.index].to_numpy(float))
+    shares = played[counts.index].to_numpy() / played[counts.index].sum()
+    rate, as_good_as = float(shares @ (k / n)), 1 / float(shares**2 @ (1 / n))
     low, high = wilson(rate, as_good_as)
     return Estimate(100 * rate, 100 * low, 100 * high, len(shared), weight=as_good_as)
 
