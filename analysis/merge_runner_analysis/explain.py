@@ -173,12 +173,7 @@ def _rows(group: Group, rests_on: str) -> list[tuple[Any, str, str, str]]:
     return [*zip(rows.index, *columns, strict=True)]
 
 
-@remembered
-def _specs(group: Group) -> list[str]:
-    return sorted(group.trials["spec_hash"].unique())
-
-
 def _query(group: Group, trials: Sequence[str]) -> str:
-    specs = _specs(group)
+    specs = sorted(group.trials["spec_hash"].unique())
     named = QUERY.format(specs=", ".join(map(quoted, specs)), trials=", ".join(map(quoted, trials)))
     return named if trials else ""

@@ -145,7 +145,7 @@ class Group:
         """The trials that a vehicle finished without a collision."""
         return self.trials[self.trials["status"] == "finished"]
 
-    @property
+    @cached_property
     def ended_outcomes(self) -> pd.DataFrame:
         """The outcomes of trials that did not fail."""
         return self.outcomes[self.outcomes["status"] != "failed"]

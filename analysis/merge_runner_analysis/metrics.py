@@ -27,12 +27,13 @@ JUDGED = ("collided", "collided_boxes")
 class Metric:
     """A number of each trial, and how it is summarised. Raises UsageError where these disagree.
 
-    ``value`` is SQL over the columns of ``trials`` and ``trial_metrics``, or one of JUDGED; a
-    subquery over another table knows the trial as ``trials.trial_id`` and ``trials.spec_hash``. A
-    proportion is of a BOOLEAN. ``trials`` are those that count, unless their value is NULL;
-    ``weight`` is SQL of how much a trial counts in a mean. ``meaning`` describes one trial's
-    number, or the whole of a proportion; intervals and axes end at ``least``. ``paper_of_drivers``
-    and ``paper_of_humans`` are columns of ``paper_ablation_quantitative.csv``.
+    ``name`` ends with the unit. ``value`` is SQL over the columns of ``trials`` and
+    ``trial_metrics``, or one of JUDGED; a subquery over another table knows the trial as
+    ``trials.trial_id`` and ``trials.spec_hash``. A proportion is of a BOOLEAN. ``trials`` are those
+    that count, unless their value is NULL; ``weight`` is SQL of how much a trial counts in a mean.
+    ``meaning`` describes one trial's number, or the whole of a proportion; intervals and axes end
+    at ``least``. ``paper_of_drivers`` and ``paper_of_humans`` are columns of
+    ``paper_ablation_quantitative.csv``.
     """
 
     name: str

@@ -285,7 +285,7 @@ class Played:
     truth: Truth
 
     def trials(self, multiple: float, *, sides: bool) -> pd.DataFrame:
-        """Return so many times its trials by cell, perhaps of a side, with an ``image`` of both."""
+        """Return so many times its trials by cell, with an ``image`` if read from both sides."""
         trials = _trials_of(self.truth, self.conditions, round(multiple * self.repetitions))
         names, images = trials["condition"], pd.Series(None, trials.index, dtype=object)
         if sides and self.equal:

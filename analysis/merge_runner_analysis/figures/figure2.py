@@ -58,6 +58,8 @@ HEADINGS = {
 MISSING = "human recordings\nare not imported"
 # The share of bounds of intervals that a scale shows: a few wide ones must not flatten the others.
 SHOWN = 0.95
+# A panel with more traces is an image, which takes 30 ms to make.
+MANY_TRACES = 100
 
 
 def figure2(study: Study, chosen: list[Group]) -> Figure:
@@ -188,12 +190,10 @@ def _draw_traces(axis: Axes, study: Study, group: Group, first: str, styles: Sty
         _say(axis, "no such trial" if group.measured else MISSING)
         return
     for velocity, look in styles.items():
-        # Many traces must not be one blot.
-        alpha = min(0.4, max(0.06, 25 / count))
-        lines = LineCollection(
-            traces.get(velocity, []), color=look["color"], lw=0.4, alpha=alpha, rasterized=True
-        )
-        lines.set(capstyle="projecting", joinstyle="round")
+        # Many traces must not be one blot, nor a large file.
+        alpha, is_raster = min(0.4, max(0.06, 25 / count)), count > MANY_TRACES
+        lines = LineCollection(traces.get(velocity, []), color=look["color"], lw=0.4, alpha=alpha)
+        lines.set(capstyle="projecting", joinstyle="round", rasterized=is_raster)
         axis.add_collection(lines)
     axis.autoscale_view()
     # The vehicle that goes first drives faster, which leaves room below its traces. The one that

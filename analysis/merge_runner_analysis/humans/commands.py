@@ -78,7 +78,10 @@ def human_status(db: DbOption = DEFAULT_DB, as_json: JsonOption = False) -> None
     tables: dict[str, pd.DataFrame] = {}
     notes: list[str] = []
     if db.exists() and not (trials := humans.human_trials(db)).empty:
-        tables = {"pairs": humans.by_pair(trials), "conditions": humans.by_condition(trials)}
+        tables = {
+            "pairs": humans.counted(trials, "pair"),
+            "conditions": humans.by_condition(trials),
+        }
         notes = list(humans.findings(trials))
     if as_json:
         counts = {name: table.to_dict("index") for name, table in tables.items()}

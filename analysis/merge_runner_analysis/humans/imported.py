@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner_analysis.frames import load
 from merge_runner_analysis.published import HUMAN_TRIALS, PAIRS, published
@@ -51,25 +52,19 @@ def findings(trials: pd.DataFrame) -> Iterator[str]:
         )
 
 
-def by_pair(trials: pd.DataFrame) -> pd.DataFrame:
-    """Return counts of each pair: trials and OUTCOMES."""
-    return _counted(trials, "pair")
-
-
 def by_condition(trials: pd.DataFrame) -> pd.DataFrame:
     """Return counts of each condition over the published pairs, and the published ones."""
     published_pairs = trials[trials["pair"].isin(PAIRS.values())]
     known = published("human_outcomes").set_index("condition")[OUTCOMES].astype(str)
-    counts = _counted(published_pairs, "condition").reindex(HUMAN_CONDITIONS, fill_value=0)
+    counts = counted(published_pairs, "condition").reindex(HUMAN_CONDITIONS, fill_value=0)
     return counts.assign(published=known.agg(" ".join, axis=1))
 
 
-def _counted(trials: pd.DataFrame, by: str) -> pd.DataFrame:
-    first = trials["merged_first"]
-    counted = trials.assign(
-        trials=1,
-        left_first=first == "left",
-        right_first=first == "right",
+def counted(trials: pd.DataFrame, by: str) -> pd.DataFrame:
+    """Return the numbers of trials and OUTCOMES by a column."""
+    ways = {side: trials["merged_first"] == side for side in SIDES}
+    frame = trials.assign(
+        trials=1, left_first=ways["left"], right_first=ways["right"],
         collided=trials["status"] == "collided",
-    )
-    return counted.groupby(by)[["trials", *OUTCOMES]].sum().astype(int)
+    )  # fmt: skip
+    return frame.groupby(by)[["trials", *OUTCOMES]].sum().astype(int)

@@ -116,12 +116,6 @@ def _likeliest(
     return np.clip(second + apart, 0, 1), second
 
 
-def weighted(k: NDArray[np.int_], n: NDArray[np.int_], weights: Array) -> tuple[float, float]:
-    """Return a rate of which conditions have weights, and the trials that it is as good as."""
-    shares = weights / weights.sum()
-    return float(shares @ (k / n)), 1 / float(shares**2 @ (1 / n))
-
-
 def shared_cells(first: Trials, second: Trials, measure: str) -> Cells | None:
     """Return the rates of two groups in the conditions of both, if there are any."""
     cells, belongs, hits, varies = _within_shared(first, second, measure)

@@ -179,7 +179,7 @@ def _file(study: Study) -> tuple[StudyFile | None, str]:
 
 @remembered
 def measured(study: Study) -> list[Metric]:
-    """Return the metrics with values, the primary one first; equal rules are one."""
+    """Return the metrics that some trial has, the primary one first."""
     trials = [group.trials for group in study.models]
     same = all(rows[COLLISIONS.column].equals(rows[BOXES.column]) for rows in trials)
     return [
@@ -265,7 +265,7 @@ def _counted(frame: Columns, metric: Metric) -> Estimate:
 def _compared(study: Study, level: Columns, reference: Columns, metric: Metric) -> Comparison:
     """Return both values and their difference, None where that is not known.
 
-    Shown by driver, factors compare the same trials again: they are compared once.
+    Several views show the same comparison, which is made once.
     """
     names = [name for name in sorted(level) if name != "row"]
     key = (metric.name, *(of[name].tobytes() for of in (level, reference) for name in names))

@@ -17,6 +17,8 @@ digits of a simulation from ruling.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
@@ -41,7 +43,7 @@ def measure_profiles(speeds: pd.DataFrame) -> pd.DataFrame:
     """
     steady = np.zeros(len(speeds), bool)
     gain = np.full(len(speeds), np.nan)
-    sampled: dict[int, dict[int, Array]] = {}
+    sampled: dict[int, Array] = {}
     columns = (speeds[name] for name in ("time_s", "velocity_mps", "resisted"))
     for row, (time_s, velocity_mps, resisted) in enumerate(zip(*columns, strict=True)):
         time, v = np.asarray(time_s, dtype=float), np.asarray(velocity_mps, dtype=float)
@@ -50,9 +52,8 @@ def measure_profiles(speeds: pd.DataFrame) -> pd.DataFrame:
         steady[row] = min(apart, default=np.inf) <= STEADY_MPS
         at = at_5_hz(time - time[:1], driven)
         if not steady[row] and len(at) >= SHORTEST_SAMPLES:
-            sampled.setdefault(len(at), {})[row] = at
-    for alike in sampled.values():
-        gain[[*alike]] = gains(np.stack([*alike.values()]))
+            sampled[row] = at
+    gain[[*sampled]] = gains([*sampled.values()])
     return speeds[KEY].reset_index(drop=True).assign(steady=steady, gain=gain)
 
 
@@ -72,30 +73,36 @@ def without_resistance(time_s: Array, velocity_mps: Array) -> Array:
     return np.asarray(velocity_mps + np.concatenate([[0.0], np.cumsum(lost)]))
 
 
-def gains(velocity_mps: Array) -> Array:
-    """Return the gains of vehicles with equally many samples at 5 Hz, (vehicles, samples)."""
-    n, parts = velocity_mps.shape[1], []
-    for start in range(0, len(velocity_mps), AT_ONCE):
-        lines, cubics = residuals(velocity_mps[start : start + AT_ONCE])
+def gains(velocity_mps: Sequence[Array]) -> Array:
+    """Return the gains of vehicles, (vehicles,), by their samples at 5 Hz."""
+    lengths = np.array([len(speeds) for speeds in velocity_mps])
+    by_length, gain = np.argsort(lengths), np.empty(len(lengths))
+    for start in range(0, len(lengths), AT_ONCE):
+        chosen = by_length[start : start + AT_ONCE]
+        n = lengths[chosen]
+        lines, cubics = residuals([velocity_mps[vehicle] for vehicle in chosen])
         # One acceleration from beginning to end leaves nothing to explain.
         whole = np.maximum(lines[0], n * STEADY_MPS**2)
         moving = _criterion(cubics / whole, CUBIC_COEFFICIENTS, n)
-        parts.append((moving - _criterion(lines / whole, LINE_COEFFICIENTS, n)) / n)
-    return np.concatenate(parts)
+        gain[chosen] = (moving - _criterion(lines / whole, LINE_COEFFICIENTS, n)) / n
+    return gain
 
 
-def _criterion(left: Array, coefficients: int, n: int) -> Array:
+def _criterion(left: Array, coefficients: int, n: NDArray[np.int_]) -> Array:
     """Return the lowest criterion of 1, 2, ... pieces: ``left`` of 1 is (pieces, vehicles)."""
-    pieces = np.arange(1, len(left) + 1)
+    pieces = np.arange(1, len(left) + 1)[:, None]
     numbers = pieces * coefficients + pieces - 1
-    criterion = n * np.log(left + TOLERANCE**2) + (numbers * np.log(n))[:, None]
-    return np.asarray(criterion.min(axis=0))
+    return np.asarray((n * np.log(left + TOLERANCE**2) + numbers * np.log(n)).min(axis=0))
 
 
-def residuals(velocity_mps: Array) -> tuple[Array, Array]:
+def residuals(velocity_mps: Sequence[Array]) -> tuple[Array, Array]:
     """Return (pieces, vehicles) least sums of squares of 1, 2, ... lines, and of cubics; or inf."""
-    y = (velocity_mps - velocity_mps[:, :1]).T
-    n, vehicles = y.shape
+    lengths = [len(speeds) for speeds in velocity_mps]
+    # Sums over the first samples do not depend on those after a vehicle's own.
+    n, vehicles = max(lengths), len(lengths)
+    y = np.zeros((n, vehicles))
+    for vehicle, speeds in enumerate(velocity_mps):
+        y[: len(speeds), vehicle] = speeds - speeds[0]
     i = np.arange(n)[:, None]
     nothing = np.zeros((1, vehicles))
     terms = (y**2, y, i * y, i**2 * y, i**3 * y)
@@ -108,7 +115,7 @@ def residuals(velocity_mps: Array) -> tuple[Array, Array]:
         line, cubic = _last_piece(sums, end)
         _extend(lines, end, line)
         _extend(cubics, end, cubic)
-    return lines[1:, n], cubics[1:, n]
+    return lines[1:, lengths, range(vehicles)], cubics[1:, lengths, range(vehicles)]
 
 
 def _last_piece(sums: list[Array], end: int) -> tuple[Array, Array]:

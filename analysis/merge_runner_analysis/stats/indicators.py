@@ -170,11 +170,6 @@ class Score(NamedTuple):
     sizes: tuple[int, ...]
 
     @property
-    def rules(self) -> dict[str, dict[str, Judgement]]:
-        """The verdicts by the name of their rule."""
-        return {"paper": self.paper, "robust": self.robust}
-
-    @property
     def ceiling(self) -> dict[str, dict[str, float]]:
         """The human ceiling for the group's size."""
         return ceiling(self.sizes)

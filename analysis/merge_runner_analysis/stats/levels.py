@@ -142,10 +142,8 @@ def crossing(study: Study, factors: Sequence[str], levels: Mapping[str, str]) ->
     """Return the trials at levels of several factors; mock models have another level."""
     chosen = [g for g in study.models if all(_level_of(g, f) == at for f, at in levels.items())]
     crossed = []
-    for scripted in (False, True):
+    for scripted in sorted({group.scripted for group in chosen}):
         groups = [group for group in chosen if group.scripted == scripted]
-        if not groups:
-            continue
         mark = " [scripted]" if scripted and len(groups) < len(chosen) else ""
         name = ", ".join(levels[factor] for factor in factors)
         pooled = _with_cells(groups, {*levels})

@@ -79,26 +79,27 @@ def linear(value: Array, weight: Array, cells: NDArray[np.int_]) -> Array:
 
 def mean_of(trials: pd.DataFrame, column: str, shares: pd.Series | None = None) -> Estimate:
     """Return the mean by ``shares`` of conditions, with a jackknife over human pairs."""
-    known = trials[column].notna()
-    pairs = trials.loc[known, "pair"].dropna().unique() if "pair" in trials else ()
-    if not len(pairs):
-        return mean(trials.loc[known, column].to_numpy(float))
-    trials = trials.loc[known, ["condition", "pair", column]]
+    if "pair" not in trials or trials["pair"].isna().all():
+        return mean(trials[column].to_numpy(float))
+    trials = trials[["condition", "pair", column]].dropna()
+    if trials.empty:
+        return NOTHING
     if shares is None:
         shares = trials["condition"].value_counts()
-    whole = _weighted_mean(trials, column, shares)
-    if len(pairs) < 2:
+    cells = trials.groupby(["pair", "condition"])[column].agg(["size", "sum"]).unstack(fill_value=0)
+    # Of all pairs, then without one after the other; conditions without a trial have no weight.
+    sizes, sums = (
+        np.vstack([of.sum(axis=0), of.sum(axis=0) - of])
+        for of in (cells["size"].to_numpy(), cells["sum"].to_numpy())
+    )
+    weights = (sizes > 0) * shares.reindex(cells["size"].columns, fill_value=0).to_numpy()
+    with np.errstate(invalid="ignore"):  # one pair alone may have driven there
+        means = (sums / np.maximum(sizes, 1) * weights).sum(axis=1) / weights.sum(axis=1)
+    whole = float(means[0])
+    if (pairs := len(sizes) - 1) < 2:
         return Estimate(whole, n=len(trials))
-    parts = [_weighted_mean(trials[trials["pair"] != pair], column, shares) for pair in pairs]
-    freedom = len(pairs) - 1
-    se = float(((np.array(parts) - whole) ** 2).sum() * freedom / len(pairs)) ** 0.5
-    return interval_of(whole, se, freedom, len(trials))
-
-
-def _weighted_mean(trials: pd.DataFrame, column: str, shares: pd.Series) -> float:
-    means = trials.groupby("condition")[column].mean()
-    weights = shares.reindex(means.index, fill_value=0)
-    return float(means @ weights / weights.sum())
+    se = float(((means[1:] - whole) ** 2).sum() * (pairs - 1) / pairs) ** 0.5
+    return interval_of(whole, se, pairs - 1, len(trials))
 
 
 def median(sample: np.ndarray) -> Estimate:

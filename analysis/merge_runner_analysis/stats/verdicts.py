@@ -14,8 +14,8 @@ on has the level at which Holm tested it, so that both agree.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import astuple, dataclass, replace
-from functools import partial
+from dataclasses import astuple, dataclass, field, replace
+from functools import cache, cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -28,7 +28,7 @@ from merge_runner_analysis.metrics import BOXES, COLLISIONS, GAP
 from merge_runner_analysis.published import HUMAN_GAP_SD_M, PAIRS, human_outcomes, published
 from merge_runner_analysis.stats import contrasts, intervals, measures, regressions
 from merge_runner_analysis.stats.estimate import Estimate
-from merge_runner_analysis.stats.indicators import TESTED, fits, judge, less_humans
+from merge_runner_analysis.stats.indicators import TESTED, Judgement, fits, judge, less_humans
 from merge_runner_analysis.stats.regressions import CONDITION, GAP_TERMS, MIN_PAIRS, Regression
 from merge_runner_analysis.stats.score_interval import wilson
 from merge_runner_analysis.study import Study
@@ -50,12 +50,23 @@ PUBLISHED = Fact(Why.PUBLISHED)
 WITHIN_LEVEL = 1 - 2 * ALPHA
 
 
-class Both(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Both:
     """A driver in conditions of humans, the humans, and its likeness to them in I5."""
 
     group: Group
     human: Group
-    likeness: Estimate = Estimate()
+    likeness: Estimate = field(default_factory=Estimate)
+
+    @cached_property
+    def estimates(self) -> dict[str, tuple[Estimate, Estimate]]:
+        """The driver's and the humans' estimate of each measure."""
+        return {name: (of.driver(self), of.human(self)) for name, of in STATISTICS.items()}
+
+    @cached_property
+    def judgements(self) -> dict[str, Judgement]:
+        """The driver's indicators by the robust rule."""
+        return judge(fits(self.group).firth, fits(self.group).hc3, robust=True)
 
 
 class Counted(NamedTuple):
@@ -79,12 +90,6 @@ class Statistic:
     human: Callable[[Both], Estimate]
     test: Callable[[Both], Estimate | None] | None = None
     indicator: str = ""
-
-    def tested(self, both: Both) -> Estimate | None:
-        """Return the test, if it can be made."""
-        if self.test:
-            return self.test(both)
-        return intervals.difference(self.driver(both), self.human(both))
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,13 +116,11 @@ def compared(study: Study, group: Group) -> tuple[Comparison, ...]:
     both = Both(alike, study.human, _likeness(study, alike))
     tests = tests_of(both)
     states = decided(both, tests)
-    judgements = judge(fits(alike).firth, fits(alike).hc3, robust=True)
     counts = counted(both)
     comparisons = []
     for name, measure in MEASURES.items():
-        statistic = STATISTICS[name]
-        driver, human = statistic.driver(both), statistic.human(both)
-        why = judgements[statistic.indicator].why if statistic.indicator else None
+        indicator, (driver, human) = STATISTICS[name].indicator, both.estimates[name]
+        why = both.judgements[indicator].why if indicator else None
         remarks = driver.problem, human.problem, None if driver.problem else why
         state, tested = states.get(name, OPEN if driver.undecided else ""), Estimate()
         if name in tests:
@@ -139,15 +142,18 @@ def of_humans(study: Study) -> dict[str, Estimate]:
 def counted(both: Both) -> dict[str, Counted]:
     """Return raw counts by measure, of those with trials that could go so."""
     played = both.human.outcomes["condition"].isin(both.group.ended["condition"])
-    humans = both.human.outcomes[played]
-    crashed = measures.values(replace(both.human, published_outcomes=humans), BOXES).astype(bool)
     counts = {}
-    for name in ("collisions", "headway", "velocity"):
-        of_humans = crashed if name == "collisions" else _went_first(humans, name)
-        went = went_so(both.group, name)
+    for name, of_humans in _humans_went_so(both.human).items():
+        went, humans = went_so(both.group, name), of_humans[played[of_humans.index]]
         if len(went):
-            counts[name] = Counted(int(went.sum()), len(went), int(of_humans.sum()), len(of_humans))
+            counts[name] = Counted(int(went.sum()), len(went), int(humans.sum()), len(humans))
     return counts
+
+
+@remembered
+def _humans_went_so(human: Group) -> dict[str, pd.Series]:
+    first = {name: _went_first(human.outcomes, name) for name in ("headway", "velocity")}
+    return {"collisions": measures.values(human, BOXES).astype(bool), **first}
 
 
 def went_so(group: Group, measure: str) -> pd.Series:
@@ -179,9 +185,11 @@ def comparable(group: Group) -> Group:
 
 def tests_of(both: Both) -> dict[str, Estimate]:
     """Return a driver's tests with their levels and p corrected over all, as far as they can be."""
-    tests = {
-        name: test for name, statistic in STATISTICS.items() if (test := statistic.tested(both))
-    }
+    tests = {}
+    for name, statistic in STATISTICS.items():
+        default = partial(intervals.difference, *both.estimates[name])
+        if test := statistic.test(both) if statistic.test else default():
+            tests[name] = test
     p = {name: test.p for name, test in tests.items() if test.p is not None}
     p_holm = dict(zip(p, contrasts.corrected([*p.values()]), strict=True))
     levels = holm_levels(p, p_holm)
@@ -193,8 +201,7 @@ def tests_of(both: Both) -> dict[str, Estimate]:
 
 def decided(both: Both, tests: Mapping[str, Estimate]) -> dict[str, str]:
     """Return the state of each measure that is tested, by ``Measure.rule``."""
-    judgements = judge(fits(both.group).firth, fits(both.group).hc3, robust=True)
-    traits = {name for name, judgement in judgements.items() if judgement.passed}
+    traits = {name for name, judgement in both.judgements.items() if judgement.passed}
     states = {}
     for name, test in tests.items():
         measure, statistic = MEASURES[name], STATISTICS[name]
@@ -203,9 +210,7 @@ def decided(both: Both, tests: Mapping[str, Estimate]) -> dict[str, str]:
         if _within(measure, test):
             states[name] = SHOWN
         elif measure.margin is None and statistic.indicator in traits:
-            driver, human = (
-                abs(of(both).value or 0.0) for of in (statistic.driver, statistic.human)
-            )
+            driver, human = (abs(estimate.value or 0.0) for estimate in both.estimates[name])
             states[name] = (WEAKER if driver < human else STRONGER) if differs else SHOWN
     return states
 
@@ -247,7 +252,7 @@ def _rates(both: Both) -> Estimate | None:
     cells = contrasts.shared_cells(group.ended_outcomes, human.outcomes, BOXES.column)
     if cells is None or measures.undecided(group, BOXES):
         return None
-    (k, n), humans, p = measures.counts(group, BOXES), _standardised(both), cells.p
+    (k, n), (_, humans), p = measures.counts(group, BOXES), both.estimates["collisions"], cells.p
     assert humans.value is not None
     assert humans.weight is not None
     rate, human_rate = (k / n, n), (humans.value / 100, humans.weight)
@@ -320,16 +325,26 @@ def human_gap(human: Group, group: Group) -> Estimate:
             return Estimate(n=len(known), problem=Fact(Why.NO_GAP_THERE, (len(lacking),)))
         shared = known[known["condition"].isin(shares.index)]
         return measures.mean_of(shared, GAP.column, None if group is human else shares)
-    row = published("paper_ablation_quantitative").query("driver == 'human'").iloc[0]
-    fit, outcomes = human_fit(human), human_outcomes().query("status == 'finished'")
-    moved = np.zeros(len(GAP_TERMS))
+    (value, usual, spread), fit, moved = (
+        _published_gap(),
+        human_fit(human),
+        np.zeros(len(GAP_TERMS)),
+    )
     if gaps is not None and len(gaps):
-        moved = _gap_design(gaps).mean(axis=0) - _gap_design(outcomes).mean(axis=0)
+        moved = _gap_design(gaps).mean(axis=0) - usual
     assert fit.covariance is not None
-    spread = published("human_gap_intercepts")["intercept_m"].std() / len(PAIRS) ** 0.5
     se = float(spread**2 + moved @ fit.covariance @ moved) ** 0.5
-    value = float(row["gap_m"]) + float(moved @ [term.b for term in fit.terms.values()])
+    value += float(moved @ [term.b for term in fit.terms.values()])
     return replace(intervals.estimate(value, se, len(PAIRS) - 1, fit.n), source=PUBLISHED)
+
+
+@cache
+def _published_gap() -> tuple[float, regressions.Array, float]:
+    """Return the humans' mean gap in m, the mean regressors of its trials, and its error in m."""
+    row = published("paper_ablation_quantitative").query("driver == 'human'").iloc[0]
+    outcomes = human_outcomes().query("status == 'finished'")
+    spread = float(published("human_gap_intercepts")["intercept_m"].std() / len(PAIRS) ** 0.5)
+    return float(row["gap_m"]), _gap_design(outcomes).mean(axis=0), spread
 
 
 def _gap_design(trials: pd.DataFrame) -> regressions.Array:
@@ -398,7 +413,8 @@ def _standardised(both: Both) -> Estimate:
         return Estimate(problem=Fact(Why.NOBODY_THERE))
     counts = shared.groupby("condition")[BOXES.column].agg(["sum", "size"]).astype(int)
     k, n = counts.to_numpy().T
-    rate, as_good_as = contrasts.weighted(k, n, played[counts.index].to_numpy(float))
+    shares = played[counts.index].to_numpy() / played[counts.index].sum()
+    rate, as_good_as = float(shares @ (k / n)), 1 / float(shares**2 @ (1 / n))
     low, high = wilson(rate, as_good_as)
     return Estimate(100 * rate, 100 * low, 100 * high, len(shared), weight=as_good_as)
 

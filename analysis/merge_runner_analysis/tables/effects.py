@@ -115,7 +115,9 @@ def _row(study: Study, effect: Effect, others: dict[str, Value] | None = None) -
     difference = effect.difference
     level, reference = effect.level.name, effect.reference.name
     if effect.across and not study.selection.by:
-        level, reference = (TIMES.join(pair) for pair in _crossed(effect.level, effect.across[1]))
+        level, reference = (
+            f"{of.name}{TIMES}{of.at.partition('=')[2]}" for of in (effect.level, effect.across[1])
+        )
     values: dict[str, Value] = {
         "at": _place(effect.level, effect.across),
         "factor": effect.factor,
@@ -143,11 +145,6 @@ def _row(study: Study, effect: Effect, others: dict[str, Value] | None = None) -
         copies=effect.left_out,
         untested=others is None and effect.at_level.value is None and _is_copied(study, effect),
     )
-
-
-def _crossed(*levels: Level) -> Iterator[tuple[str, str]]:
-    """Return each level's name with that of its level of the other factor."""
-    return ((level.name, level.at.partition("=")[2]) for level in levels)
 
 
 def _is_copied(study: Study, effect: Effect) -> bool:

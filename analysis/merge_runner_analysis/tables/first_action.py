@@ -63,7 +63,14 @@ def first_action(study: Study) -> Table:
             "of the slopes on own relative velocity and own projected headway in a logit of M as "
             "the first word, of humans in one of who merged first; empty where a driver has no "
             "word, or the logit no finite estimate",
-            *_first_notes(study),
+            *(
+                [
+                    f"human: slope as published: {_published_slope()['caution']}",
+                    f"human: exchange rate: {citation('human_outcomes')}",
+                ]
+                if study.human in study.groups
+                else []
+            ),
         ),
     )
 
@@ -131,10 +138,3 @@ def _estimate(name: str, estimate: Estimate | None) -> dict[str, Value]:
 
 def _published_slope() -> pd.Series:
     return published("human_first_action_trials").set_index("measure").loc["slope_mps2_per_mps"]
-
-
-def _first_notes(study: Study) -> Iterator[str]:
-    if study.human not in study.groups:
-        return
-    yield f"human: slope as published: {_published_slope()['caution']}"
-    yield f"human: exchange rate: {citation('human_outcomes')}"

@@ -25,7 +25,7 @@ from merge_runner_analysis.wording import INDICATORS
 # The indicators that rest on who merged first.
 OF_OUTCOMES = ("I1", "I2")
 SCORE = "Score"
-RULES = {"paper": "by the paper's test", "robust": "by the robust tests"}
+RULES = ("by the paper's test", "by the robust tests")
 RESAMPLED = "share of resampled human data sets of this size that pass"
 NOTES = (
     "✓ by the paper's rule: signs and p < .05 of Wald tests; robust: likelihood-ratio tests of "
@@ -138,10 +138,10 @@ def ceiling_values(group: Group, judged: Score, name: str) -> dict[str, Value]:
 def reasons(judged: Score, *names: str) -> str:
     """Return why verdicts are missing, or what they rest on if not on a test."""
     which: dict[str, list[str]] = {}
-    for rule, judgements in judged.rules.items():
+    for rule, judgements in zip(RULES, (judged.paper, judged.robust), strict=True):
         for name in names:
             if name in judgements and judgements[name].why:
-                which.setdefault(f"{RULES[rule]}: {judgements[name].why}", []).append(name)
+                which.setdefault(f"{rule}: {judgements[name].why}", []).append(name)
     return "; ".join(f"{', '.join(names)} {why}" for why, names in which.items())
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 
-import pandas as pd
-
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.published import HUMAN_DOI, HUMAN_TRIALS
 from merge_runner_analysis.study import Study
@@ -42,11 +42,10 @@ def _of_trials(table: Table, study: Study) -> Iterator[str]:
             "trials in which a decision had a fallback are left out (--without-fallbacks): long "
             "ones more often than those that a crash ended early, so that shares of crashes rise"
         )
-    driven = [group.trials for group in groups if group.setting]
+    driven = [group for group in groups if group.setting]
     if driven and not study.file:
-        known, trials = study.frames.studies, pd.concat(driven)
-        sizes = {name: int(known.holds(name, trials).sum()) for name in known.orders}
-        pooled = [f"{name} ({n} trials)" for name, n in sizes.items() if n]
+        sizes = sum((_studies_of(study, group) for group in driven), Counter[str]())
+        pooled = [f"{name} ({sizes[name]} trials)" for name in sizes]
         if len(pooled) > 1:
             yield (
                 f"trials of several studies: {', '.join(pooled)}. A difference "
@@ -55,12 +54,9 @@ def _of_trials(table: Table, study: Study) -> Iterator[str]:
     if study.human in groups:
         yield from _human_notes(study, table)
         for group in groups:
-            driven_in = group.trials["condition"]
-            unknown = driven_in[~driven_in.isin(HUMAN_CONDITIONS)]
-            if len(unknown):
-                names = ", ".join(sorted({*unknown}))
+            if unknown := _without_humans(group):
                 yield (
-                    f"{group.id}: no human drove {names} ({len(unknown)} trials), "
+                    f"{group.id}: no human drove {', '.join(unknown)} ({unknown.total()} trials), "
                     "which rates and regressions rest on too, but no difference from the humans"
                 )
     if counts := [f"{g.id}: {g.repeated} of {len(g.stored.trials)}" for g in groups if g.repeated]:
@@ -78,6 +74,19 @@ def _of_trials(table: Table, study: Study) -> Iterator[str]:
             "of two different drivers left stands for the one that is named first, wherever it "
             f"sat: odds that it goes first. {'; '.join(pairs)}"
         )
+
+
+@remembered
+def _studies_of(study: Study, group: Group) -> Counter[str]:
+    known = study.frames.studies
+    return +Counter({name: int(known.holds(name, group.trials).sum()) for name in known.orders})
+
+
+@remembered
+def _without_humans(group: Group) -> Counter[str]:
+    """Return the number of trials in each condition that no human drove."""
+    conditions = group.trials["condition"]
+    return Counter(sorted(conditions[~conditions.isin(HUMAN_CONDITIONS)]))
 
 
 def _human_notes(study: Study, table: Table) -> Iterator[str]:

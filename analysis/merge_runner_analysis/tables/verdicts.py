@@ -9,6 +9,7 @@ from typing import Any
 from merge_runner.config import ScenarioConfig
 from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.drivers import language_models
 from merge_runner_analysis.frames import KEYS
 from merge_runner_analysis.grouping import Group
@@ -135,6 +136,7 @@ def _driver_rows(study: Study, group: Group) -> Iterator[Row]:
         yield replace(row, copies=copies)
 
 
+@remembered
 def _copies(study: Study, group: Group) -> tuple[tuple[str, str], ...]:
     """Return a mock model's trials that are copies of others, with words that it does not read."""
     once = distinct(study, group).trials

@@ -10,7 +10,7 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner.trial_records import StateRow, TrialRecord, TrialSpec
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.frames import load
-from merge_runner_analysis.humans.imported import by_condition, by_pair, findings, human_trials
+from merge_runner_analysis.humans.imported import by_condition, counted, findings, human_trials
 from merge_runner_analysis.metrics import BOXES, COLLISIONS
 from merge_runner_analysis.published import PAIRS, human_outcomes
 from merge_runner_analysis.stats.measures import counts, known
@@ -91,7 +91,7 @@ def test_a_complete_import_leads_to_the_trials_behind_the_published_outcomes(sto
     assert list(findings(trials)) == []
     assert list(by_condition(trials).index) == list(CONDITIONS)
     assert (by_condition(trials)["trials"] == 90).all()
-    assert dict(by_pair(trials)["trials"]) == dict.fromkeys(PAIRS.values(), 110)
+    assert dict(counted(trials, "pair")["trials"]) == dict.fromkeys(PAIRS.values(), 110)
     assert (study.human.label, study.human.traced, study.complete) == ("human", True, True)
     assert counts(study.human, BOXES) == (28, 990)
     assert not known(study.human, COLLISIONS)
@@ -106,7 +106,7 @@ def test_another_data_set_is_named_under_every_table_with_humans(stored):
 def test_trials_of_other_pairs_are_in_no_row_and_in_no_query(stored):
     study = Study(stored(moved(5)))
     assert len(study.human.trials) == by_condition(moved(5))["trials"].sum() == 985
-    assert by_pair(moved(5))["trials"]["experiment_7"] == 5
+    assert counted(moved(5), "pair")["trials"]["experiment_7"] == 5
     (source,) = explain(study, made(study, "who-first"), "human/intercept").sources
     trials = load(source.query, study.db)["trial_id"]
     assert trials.tolist() == list(source.trials)
