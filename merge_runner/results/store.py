@@ -152,7 +152,7 @@ class Store:
         texts = [len(str(value)) for *_, rows in played for row in rows["calls"] for value in row]
         with write_database(self.path, patience_s) as connection:
             limit_memory(connection, max(texts, default=0))
-            merge_small_groups(connection)
+            merge_small_groups(connection, sum(len(rows["calls"]) for *_, rows in played))
             _add_specs(connection, specs or {})
             differing = _add_trials(connection, played)
             if sweep_id is not None:
