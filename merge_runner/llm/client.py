@@ -139,7 +139,7 @@ class LlmClient:
             call.pending_batch = self.batch.rounds.pending.get(call.request.key)
         if call.pending_batch:
             self.budget.readmit(call.order)
-        if not self.budget.is_running(call.trials):
+        if call.order not in self.budget.running:
             self.calls.wait(call, Wait(NO_ROOM, blocked=True))
             await self.budget.admit(call.trials)
             call.wait = None

@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 
 from merge_runner.errors import UsageError
 
+A_FEW = 16
 BUSY_S = 600.0  # another process may be writing long replies to a slow disk
 # Live runs share it; a release of reservations holds it exclusively.
 LIVE = "live.lock"
@@ -90,7 +91,9 @@ class GroupWriter:
             await asyncio.wait([running])
             failed = running.exception()
             results = repeat(failed) if failed else running.result()
-            for future, result in zip(futures, results, strict=False):
+            for number, (future, result) in enumerate(zip(futures, results, strict=False), 1):
+                if number % A_FEW == 0:  # or all callers would go on in one round of the loop
+                    await asyncio.sleep(0)
                 if future.cancelled():
                     continue
                 if isinstance(result, BaseException):

@@ -15,6 +15,8 @@ import duckdb
 BYTES_OF_A_CALL, MERGED_BYTES = 1_000, 2**26
 """Compressed bytes of a call with short replies and its share of the states; and the excess of the
 file's size up to which its row groups are merged."""
+MANY_CALLS = 2_048
+"""Half a row group: calls that are added at once and leave few small groups."""
 SIZES = """
 SELECT greatest(max(stats(request).max_string_length), max(stats(reply).max_string_length), 0),
     (SELECT count(*) FROM calls)
@@ -98,14 +100,16 @@ def limit_memory(connection: duckdb.DuckDBPyConnection, longest: int = 0) -> Non
     connection.execute(f"SET memory_limit = '{limit}'; SET threads = {2 - is_little}")
 
 
-def merge_small_groups(connection: duckdb.DuckDBPyConnection) -> None:
-    """Let the next write merge small row groups, unless the rows have long texts.
+def merge_small_groups(connection: duckdb.DuckDBPyConnection, added: int) -> None:
+    """Let the next write merge small row groups, unless it adds many calls or long texts.
 
-    Merging takes as much memory as the texts of a full group, and rewrites the group each time.
+    Merging takes as much memory as the texts of a full group, and rewrites the group each time: the
+    file is held twice as long.
     """
     [(calls, path)] = connection.execute(
         "SELECT estimated_size, path FROM duckdb_tables() JOIN duckdb_databases() "
         "USING (database_name) WHERE table_name = 'calls' AND database_name = current_database()"
     ).fetchall()
     most_bytes = calls * BYTES_OF_A_CALL + MERGED_BYTES
-    connection.execute(f"SET max_vacuum_tasks = {100 * (Path(path).stat().st_size <= most_bytes)}")
+    merges = added < MANY_CALLS and Path(path).stat().st_size <= most_bytes
+    connection.execute(f"SET max_vacuum_tasks = {100 * merges}")

@@ -154,7 +154,7 @@ class Store:
         texts += [attempt.reply or "" for call in calls for attempt in call.attempts]
         with write_database(self.path, patience_s) as connection:
             limit_memory(connection, max(map(len, texts), default=0))
-            merge_small_groups(connection)
+            merge_small_groups(connection, sum(len(rows["calls"]) for *_, rows in played))
             _add_specs(connection, specs or {})
             differing = _add_trials(connection, played)
             if sweep_id is not None:

@@ -22,7 +22,7 @@ from merge_runner.trial_records import TrialRecord, TrialSpec
 
 # More than bad luck explains, since nothing is answered between them; few enough to stop early.
 FAILURES_IN_A_ROW = 10
-# Calls that begin in one round of the event loop, so that each round stays short.
+# Trials or calls that begin in one round of the event loop, so that each round stays short.
 A_FEW = 16
 
 
@@ -91,7 +91,11 @@ class LocalRunner:
 
         try:
             async with asyncio.TaskGroup() as group:
-                playing = [group.create_task(work()) for _ in specs[: self.in_flight]]
+                playing = []
+                for _ in specs[: self.in_flight]:
+                    playing.append(group.create_task(work()))
+                    if len(playing) % A_FEW == 0:
+                        await asyncio.sleep(0)
                 if self.rounds is not None:
                     watching = group.create_task(self.rounds.watch(self._is_idle))
                     await asyncio.gather(*playing)

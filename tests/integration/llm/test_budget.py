@@ -5,11 +5,8 @@ import contextlib
 import math
 from functools import partial
 from types import SimpleNamespace
-from uuid import uuid4
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from merge_runner.errors import CacheFailed, RecordingError, TrialSuspended, UsageError
 from merge_runner.llm.attempts import Meter
@@ -22,18 +19,6 @@ from merge_runner.run.plan import make_plan
 from tests.support.cases import cases
 from tests.support.clients import budget_of
 from tests.support.harness import each
-
-CAP = 100
-calls = st.lists(
-    st.tuples(
-        st.integers(0, 8),  # the trial
-        st.integers(0, 120),  # the worst case
-        st.none() | st.integers(0, 100),  # the share of it that is spent, None if unknown
-        st.integers(0, 4),  # how long it is in flight
-        st.sampled_from("mn"),  # the model
-    ),
-    max_size=25,
-)
 
 
 @pytest.fixture(scope="module")
@@ -78,36 +63,6 @@ def now(ledger, operation, *arguments):
 
 def set_aside(budget, trial, worst, driver=""):
     return budget.reserve([trial], f"key {trial}", asked(worst, driver))
-
-
-@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(calls, st.integers(0, 60))
-async def test_what_is_spent_and_set_aside_never_exceeds_the_cap(cache, plan, trial_usd):
-    ledger = Ledger(cache, f"sweep {uuid4()}")
-    budget = budget_of(ledger, CAP, each(trial_usd))
-    reserve = ledger.reserve
-
-    def watched(*arguments):
-        begun = reserve(*arguments)
-        assert ledger.committed_usd <= CAP + 1e-6
-        return begun
-
-    ledger.reserve = watched
-
-    async def call(trial, worst, share, turns, model):
-        actual = None if share is None else worst * share / 100
-        try:
-            await attempt(budget, trial, worst, actual, turns, model)
-        finally:
-            budget.leave(trial)
-
-    # The limit only ends a test in which somebody waits for ever.
-    async with asyncio.timeout(20):
-        results = await asyncio.gather(*(call(*each) for each in plan), return_exceptions=True)
-    assert {type(result) for result in results} <= {type(None), TrialSuspended}
-    unknown = [share is None for _, _, share, _, _ in plan]
-    paid = [result is None for result in results]
-    assert ledger.read().open_attempts == sum(map(min, unknown, paid))
 
 
 class Trials:

@@ -15,6 +15,7 @@ from merge_runner.results.database import (
 )
 from merge_runner.results.instance import (
     BYTES_OF_A_CALL,
+    MANY_CALLS,
     MERGED_BYTES,
     SETTINGS,
     in_memory,
@@ -49,7 +50,7 @@ def test_small_groups_are_merged_to_ones_that_fit_into_memory(tmp_path):
         connection.execute(schema_sql())
     for _ in range(30):
         with opened(read_only=False) as connection:
-            merge_small_groups(connection)
+            merge_small_groups(connection, 20)
             append(connection, "sweep_trials", [("sweep", "trial", "spec")] * 1_000)
     with opened(read_only=True) as connection:
         groups = connection.execute(
@@ -59,11 +60,11 @@ def test_small_groups_are_merged_to_ones_that_fit_into_memory(tmp_path):
     assert max(groups) <= (ROWS_OF_A_GROUP,)
 
 
-def test_small_groups_are_merged_unless_texts_are_long(tmp_path):
-    def tasks(size):
+def test_small_groups_are_merged_unless_texts_are_long_or_calls_many(tmp_path):
+    def tasks(size, added=20):
         """The tasks of merging where the file has this size."""
         os.truncate(file, size)
-        merge_small_groups(connection)
+        merge_small_groups(connection, added)
         return connection.execute("SELECT current_setting('max_vacuum_tasks')").fetchone()
 
     file = tmp_path / "file.duckdb"
@@ -73,7 +74,7 @@ def test_small_groups_are_merged_unless_texts_are_long(tmp_path):
     connection.execute("CHECKPOINT")
     short = 10_000 * BYTES_OF_A_CALL + MERGED_BYTES
     assert tasks(short) == (100,)
-    assert tasks(short + 1) == (0,)
+    assert tasks(short + 1) == tasks(short, MANY_CALLS) == (0,)
 
 
 @pytest.mark.parametrize(

@@ -2,16 +2,11 @@
 
 import asyncio
 import contextlib
-import random
 import re
-import tempfile
 from collections import Counter
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from merge_runner.errors import CacheFailed, EndpointRefused, ProviderDown, QuotaExhausted
 from merge_runner.llm.batch.rounds import BatchSender, Rounds
@@ -22,7 +17,7 @@ from merge_runner.llm.ledger import Ledger
 from merge_runner.providers import ModelEntry, Price
 from merge_runner.records import CallFailed, Slot
 from tests.support.clients import answer, budget_of, client_of, error
-from tests.support.virtual_time import in_virtual_time, now_s
+from tests.support.virtual_time import now_s
 
 pytestmark = pytest.mark.usefixtures("virtual_time")
 PRICE = Price(input=1.0, output=100.0, source="made up")
@@ -526,42 +521,3 @@ async def test_under_a_cap_a_round_takes_what_fits_and_the_next_ones_the_rest(ca
     assert len(service.sizes) > 1
     assert max(service.sizes) * 0.005 <= 0.06
     assert run.ledger.read().spent_usd == pytest.approx(10 * ONE_USD)
-
-
-class Dear(Memory):
-    """Bills up to the worst case of each line, or what it did not cost, as the seed says."""
-
-    def __init__(self, seed):
-        super().__init__()
-        self.chance = random.Random(seed)
-        self.bill_usd = 0.0
-
-    async def results(self, paths):
-        async for key, _ in super().results(paths):
-            written = self.chance.randint(0, 100)
-            kind = self.chance.choice(["ok"] * 8 + ["failed", "expired"])
-            if kind != "ok":
-                yield key, error(500) if kind == "failed" else None
-                continue
-            self.bill_usd += (10 + 100 * written) / 1e6 / 2
-            yield key, answer("M", usage=(10, written))
-
-
-@given(seed=st.integers(0, 1000), cents=st.integers(1, 12), runs=st.integers(1, 3))
-@settings(max_examples=4)
-def test_the_bill_of_batches_never_exceeds_the_cap(seed, cents, runs):
-    @in_virtual_time
-    async def sweep():
-        with tempfile.TemporaryDirectory() as folder:
-            cache = ResponseCache(Path(folder))
-            service, alone_usd = Dear(seed), 0.0
-            for number in range(runs):
-                run = Run(cache, service, cap=cents / 100)
-                await run.ask(12, decision=number)
-                await run.end()
-                alone_usd += len(run.alone.asked) * ONE_USD
-            assert service.bill_usd + alone_usd <= cents / 100 + 1e-9
-            assert run.ledger.read().spent_usd == pytest.approx(service.bill_usd + alone_usd)
-            cache.close()
-
-    sweep()
