@@ -84,12 +84,12 @@ def test_every_page_fits_its_window_and_axe_finds_nothing_serious(page):
     found = []
     for address in PAGES:
         opened(page, address)
-        for scheme, width in (("light", 1024), ("dark", 420)):
+        for scheme, width in (("light", 1440), ("light", 1100), ("light", 1024), ("dark", 420)):
             page.emulate_media(color_scheme=scheme)
             page.set_viewport_size({"width": width, "height": 900})
             page.evaluate(DRAWN_ANEW)
-            wrong = [over for over in [page.evaluate(OVER)] if over > 0] + serious(page)
-            wrong += page.evaluate(WITHIN)
+            wrong = [over for over in [page.evaluate(OVER)] if over > 0] + page.evaluate(WITHIN)
+            wrong += serious(page) if width <= 1024 else []
             found += [(address, scheme, width, one) for one in wrong]
     assert found == []
 
