@@ -9,6 +9,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
+from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -54,6 +55,11 @@ def client_of(db: Path, computing: Computing | None = None, **options) -> TestCl
     client = TestClient(explorer(site), base_url=f"http://{HOST}", raise_server_exceptions=False)
     client.site = site
     return client
+
+
+def words_of(html: str) -> str:
+    """What a piece of a page says, without tags."""
+    return " ".join(unescape(re.sub(r"<[^>]*>", " ", html)).split())
 
 
 def listed(html: str) -> int:

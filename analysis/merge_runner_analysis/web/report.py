@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import datetime
 from difflib import unified_diff
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from merge_runner.prompts.blocks import BASELINE, title_of
 from merge_runner.records import NO_DECISION
 from merge_runner.results.database import read_database
 from merge_runner.results.provenance import program
-from merge_runner_analysis.cache import digest_of, finished, keep_finished
+from merge_runner_analysis.cache import digest_of, kept
 from merge_runner_analysis.explain import Source, sources_of, sql_command
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.figures.gallery import rendered, write_figures
@@ -111,16 +112,16 @@ def write_report(
 
 def finished_figures(study: Study, say: Callable[[str], object] = str) -> dict[str, str]:
     """Return every figure by name as SVG in Base64: the stored one, else a new drawing."""
-    files = {f"{name}.svg": name for name in FIGURES}  # a table may have the name alone
-    stored = finished(study.db, study.state, study.options, list(files))
-    drawn = {}
-    for file, name in files.items():
-        if file not in stored:
-            say(f"drawing {name}")
-            drawn[file] = base64.b64encode(rendered(study, name, "svg")).decode()
-    if drawn:
-        keep_finished(study.db, study.state, study.options, drawn)
-    return {name: (stored | drawn)[file] for file, name in files.items()}
+
+    def draw(name: str) -> str:
+        say(f"drawing {name}")
+        return base64.b64encode(rendered(study, name, "svg")).decode()
+
+    return {
+        # A table may have the name alone.
+        name: kept(study.db, study.state, study.options, f"{name}.svg", partial(draw, name))
+        for name in FIGURES
+    }
 
 
 def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> str:

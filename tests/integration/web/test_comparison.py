@@ -13,7 +13,7 @@ from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.web.report import report_html
 from merge_runner_analysis.web.site import Site
 from merge_runner_analysis.wording import UNREADABLE, brackets, capital, money, number, p_value
-from tests.support.serving import client_of, listed
+from tests.support.serving import client_of, listed, words_of
 from tests.support.studies import Said, write_study, yielding
 from tests.support.tables import values_of
 
@@ -45,12 +45,8 @@ def client(db):
     return client_of(db)
 
 
-def text_of(html):
-    return " ".join(unescape(re.sub(r"<[^>]*>", " ", html)).split())
-
-
 def test_a_less_b_is_the_table_of_effects_with_its_interval_and_both_p(db, client):
-    page = text_of(client.get(f"/drivers/{A}?with={B}").text)
+    page = words_of(client.get(f"/drivers/{A}?with={B}").text)
     rows = values_of(Study(db, Selection([B, A])), "effects")
     tested = [
         row for name, row in rows.items() if name.startswith("model=") and row["p"] is not None
@@ -69,13 +65,13 @@ def test_a_less_b_is_the_table_of_effects_with_its_interval_and_both_p(db, clien
 
 def test_the_headline_says_crashes_in_counts_then_points_interval_and_p(client):
     page = client.get(f"/drivers/{A}?with={B}").text
-    claim = text_of(re.search(r'<p class="answer">(.*?)</p>', page, re.S)[1])
+    claim = words_of(re.search(r'<p class="answer">(.*?)</p>', page, re.S)[1])
     assert re.fullmatch(
         rf"{A} crashed in 11 of 54 trials, {B} in 33 of 55\. In the same situations {A} crashed "
         r"less often, by \d\d\.\d\d points \[\d\d\.\d\d, \d\d\.\d\d\]; corrected p < 0\.001\.",
         claim,
     )
-    turned = text_of(client.get(f"/drivers/{B}?with={A}").text)
+    turned = words_of(client.get(f"/drivers/{B}?with={A}").text)
     assert f"{B} crashed in 33 of 55 trials, {A} in 11 of 54" in turned
     assert f"{B} crashed more often, by" in turned
 
@@ -85,8 +81,8 @@ def test_two_models_without_factors_are_what_the_first_page_and_the_report_answe
     table = make_tables(study, ["verdicts"])
     claim = f"{A} crashed in 11 of 54 trials, {B} in 33 of 55. "
     answer = re.search(r'<p class="answer">(.*?)</p>', client.get("/").text, re.S)[1]
-    assert text_of(answer).startswith(claim)
-    assert claim in text_of(report_html(study, table, {}))
+    assert words_of(answer).startswith(claim)
+    assert claim in words_of(report_html(study, table, {}))
 
 
 def test_a_comparison_that_is_computed_while_its_page_is_made_is_still_awaited(db, monkeypatch):
@@ -114,7 +110,7 @@ def test_a_comparison_that_is_computed_while_its_page_is_made_is_still_awaited(d
 
     monkeypatch.setattr(Site, "computed", computed)
     for address in (f"/drivers/{A}?with={B}", "/"):
-        assert "Computing" in text_of(made.get(address).text), address
+        assert "Computing" in words_of(made.get(address).text), address
 
 
 def test_the_measure_that_a_study_of_models_asks_about_is_tested_by_itself(db, tmp_path):
@@ -162,5 +158,5 @@ def test_a_stored_study_that_cannot_be_read_is_said_in_a_line_and_the_pages_work
     assert "of_a_later_version" in said
     assert "\n" not in said
     with client_of(db) as client:
-        assert capital(said) in text_of(client.get("/").text)
+        assert capital(said) in words_of(client.get("/").text)
         assert client.get(f"/drivers/{A}?with={B}").status_code == 200

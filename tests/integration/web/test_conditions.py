@@ -7,6 +7,7 @@ import pytest
 
 from merge_runner_analysis.web.pages import conditions
 from merge_runner_analysis.web.pages.conditions import BAND, PANELS, TRACES
+from merge_runner_analysis.web.reading import records
 from merge_runner_analysis.web.scope import scope_of
 from tests.support.serving import Page, client_of, in_process, never
 from tests.support.studies import Drive, as_humans, write_study, yielding
@@ -30,13 +31,7 @@ def client(tmp_path_factory):
 def query(client):
     """Asks the database; gives rows as dicts."""
     with duckdb.connect(str(client.site.db), read_only=True) as connection:
-
-        def rows(sql, keys=()):
-            found = connection.execute(sql, [list(part) for part in zip(*keys, strict=True)])
-            names = [column[0] for column in found.description]
-            return [dict(zip(names, row, strict=True)) for row in found.fetchall()]
-
-        yield rows
+        yield lambda sql, keys=(): records(connection, sql, [*map(list, zip(*keys, strict=True))])
 
 
 def test_a_driver_is_looked_at_with_the_prompts_that_it_was_given(client):

@@ -16,7 +16,7 @@ from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import TABLES, make_tables
 from merge_runner_analysis.tables.formats import names_of, render, shown_columns, shown_rows
 from merge_runner_analysis.web.report import report_html
-from tests.support.serving import client_of
+from tests.support.serving import client_of, words_of
 
 DECIMAL = re.compile(r"[<-]?\d+\.\d+")
 NUMBERS = {"number", "percent", "interval", "p"}
@@ -76,7 +76,7 @@ def expected(column, name, row):
 
 def plain(html):
     """The words of a piece of a page, with a minus sign that Python reads."""
-    return " ".join(unescape(re.sub(r"<[^>]*>", " ", html)).replace("−", "-").split())
+    return words_of(html).replace("−", "-")
 
 
 def rows_of(html, before=""):
@@ -168,12 +168,3 @@ def test_a_verdicts_numbers_are_those_of_the_csv_on_the_page_of_the_study_and_of
                 assert decimals_of(text) <= known_of(row), (name, text)
                 if row["estimate"] and text:
                     assert rounded(row["estimate"]) in decimals_of(text), (name, text)
-
-
-def test_the_differences_of_prompts_have_the_digits_of_the_csv(tables, client):
-    text = plain(client.get("/prompts").text)
-    told = [row for row in as_csv(tables["contrasts"]).values() if row["difference"]]
-    for row in told:
-        ends = ", ".join(rounded(row[name]) for name in ("ci_low", "ci_high"))
-        holm = p_value(row["p_holm"])
-        assert f"{rounded(row['difference'])} [{ends}], Holm {holm}" in text

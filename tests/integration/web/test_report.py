@@ -1,6 +1,5 @@
 """The report: one file that needs nothing else, and says what can and cannot be concluded."""
 
-import html
 import re
 import struct
 from dataclasses import replace
@@ -17,6 +16,7 @@ from merge_runner_analysis.published import published
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables import TABLES, make_tables
 from merge_runner_analysis.web.report import alarms, report_html, write_report
+from tests.support.serving import words_of
 from tests.support.studies import Said, changed, write_study, yielding
 
 
@@ -28,7 +28,7 @@ class Page:
         self.ids, self.links, self.sources = (
             re.findall(rf'<[^>]* {name}="([^"]*)"', text) for name in ("id", "href", "src")
         )
-        self.text = " ".join(html.unescape(re.sub(r"<[^>]*>", " ", text)).split())
+        self.text = words_of(text)
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,6 @@ from merge_runner_analysis.web.site import NotThere, Site, download
 
 TABLE_FILES = {"csv": TableFormat.CSV, "tex": TableFormat.LATEX}
 FIGURE_FILES = {"svg": "image/svg+xml", "png": "image/png"}
-# Matplotlib writes styles into its SVG, and traces as pictures.
 # The list of tables, by what they answer.
 GROUPS = {
     "Do they drive like people?": ("verdicts", "first-action", "criticality"),
@@ -32,6 +31,7 @@ GROUPS = {
     ),
     "More": ("attempts",),
 }
+# Matplotlib writes styles into its SVG, and traces as pictures.
 DRAWN = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox"
 
 
