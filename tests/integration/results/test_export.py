@@ -81,8 +81,7 @@ async def test_a_folder_with_anything_else_is_left_as_it_is(merge_runner, golden
         folder = tmp_path / name.partition(".")[0]
         folder.mkdir()
         (folder / name).write_text("# mine")
-        run = await merge_runner("export", folder, "--db", golden / "golden.duckdb")
-        assert run.code == 2
+        run = await merge_runner("export", folder, "--db", golden / "golden.duckdb", code=2)
         assert "is there and no earlier export: name another folder" in run.err
         assert [path.read_text() for path in folder.iterdir()] == ["# mine"]
     run = await merge_runner("export", "out")

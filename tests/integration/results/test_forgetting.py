@@ -29,8 +29,7 @@ async def test_a_forgotten_sweep_takes_what_no_other_has_which_is_played_again_w
         refused = await merge_runner("forget", *asked)
         assert (refused.code, said in refused.err) == (2, True), refused.err
     whole = await merge_runner("digest")
-    gone = await merge_runner("forget", two_sweeps[1], "--yes")
-    assert gone.code == 0, gone.err
+    gone = await merge_runner("forget", two_sweeps[1], "--yes", code=0)
     assert f"removed: 1 sweeps ({two_sweeps[1]}) and the 2 trials of no other one" in gone.err
     left = [f"emulator/baseline/{condition}/rep01" for condition in ("L_4_8", "N_0_0")]
     for table in ("trials", "states", "decisions", "calls", "sweep_trials"):

@@ -22,8 +22,7 @@ async def test_a_live_run_stops_after_20_invalid_decisions_and_keeps_what_was_an
         assert "(no array). To mend that look at what" in message
         again = await merge_runner(*SWEEP, **server.env)
         assert (again.code, server.requests) == (1, MOST_INVALID), "it asked on"
-        whole = await merge_runner(*SWEEP, "--reps", 1, "--keep-going", **server.env)
-        assert whole.code == 0, whole.err
+        whole = await merge_runner(*SWEEP, "--reps", 1, "--keep-going", code=0, **server.env)
         assert whole.summary["invalid_decisions"] == whole.summary["decisions"] > MOST_INVALID
         assert whole.summary["fallbacks"] == whole.summary["invalid_decisions"]
         assert set(server.asked.values()) == {1}, "an answered call was asked again"
@@ -55,8 +54,7 @@ async def test_a_run_in_batches_stops_after_the_first_round_and_pays_it_once(mer
     sweep = (*SWEEP, "--reps", 2, "--batch")
     async with watched(faults=PROSE) as server:
         for _ in range(2):
-            stopped = await merge_runner(*sweep, **server.env)
-            assert stopped.code == 1
+            stopped = await merge_runner(*sweep, code=1, **server.env)
             assert "none of the first 20 decisions of emulator" in stopped.summary["messages"][0]
         assert server.paths.count("/v1/batches") == 1, "it began another round"
         assert "/v1/chat/completions" not in server.paths
@@ -70,11 +68,9 @@ async def test_what_the_emulator_cannot_read_is_told_and_the_model_random_rehear
         '[prompts.german]\nremove = ["C1", "C2", "C3.safety", "C3.human", "C4", "C5"]\n'
         'replace = { C0 = "Sie fahren {own_speed} m/s. Nennen Sie {plan_actions} Zahlen." }\n'
     )
-    unread = await merge_runner("sweep", "mine.toml", "--json")
-    assert unread.code == 1
+    unread = await merge_runner("sweep", "mine.toml", "--json", code=1)
     assert "cannot read this prompt: it does not say `Your speed: N m/s`, `Speed" in unread.err
     assert "The model `random` answers any prompt" in unread.err
-    run = await merge_runner("sweep", "mine.toml", "--model", "random", "--json")
-    assert run.code == 0, run.err
+    run = await merge_runner("sweep", "mine.toml", "--model", "random", "--json", code=0)
     assert run.summary["trials"]["failed"] == run.summary["invalid_decisions"] == 0
     assert run.summary["decisions"] > 10

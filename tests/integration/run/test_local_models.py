@@ -52,8 +52,7 @@ async def test_a_server_s_one_model_is_asked_of_several_one_must_be_chosen_and_a
     async with watched(serving("qwen3-8b")) as server:
         told = await merge_runner(*LOCAL, "--dry-run", LOCAL_BASE_URL=f"{server.url}/v1")
         assert (told.summary["trials"], server.requests) == (1, 0)
-        run = await merge_runner(*LOCAL, LOCAL_BASE_URL=f"{server.url}/v1")
-        assert run.code == 0, run.err
+        run = await merge_runner(*LOCAL, LOCAL_BASE_URL=f"{server.url}/v1", code=0)
         lists = " has not listed its models yet: .* serves qwen3-8b, which is asked\n"
         assert re.search(lists, run.err, re.DOTALL)
         assert {json.loads(body)["model"] for body in server.asked if body} == {"qwen3-8b"}
@@ -61,13 +60,11 @@ async def test_a_server_s_one_model_is_asked_of_several_one_must_be_chosen_and_a
     assert (await merge_runner("recording", "export", "local.parquet")).code == 0
     async with watched(serving("qwen3-8b", "llama3.2:latest")) as server:
         at = {"LOCAL_BASE_URL": f"{server.url}/v1"}
-        unnamed = await merge_runner(*LOCAL, **at)
-        assert unnamed.code == 2
+        unnamed = await merge_runner(*LOCAL, code=2, **at)
         assert "serves qwen3-8b, llama3.2:latest: name one with LOCAL_MODEL, or" in unnamed.err
         assert not any(server.asked), "no prompt was sent"
         # Ollama knows a model by its name without the usual tag, too.
-        chosen = await merge_runner(*LOCAL, "--db", "llama", **at, LOCAL_MODEL="llama3.2")
-        assert chosen.code == 0, chosen.err
+        await merge_runner(*LOCAL, "--db", "llama", code=0, **at, LOCAL_MODEL="llama3.2")
     asked = query(tmp_path / "llama", "SELECT DISTINCT model_requested FROM calls")[1]
     assert asked == [("llama3.2",)]
     replay = ("replay", *LOCAL[1:], "--db")
@@ -99,10 +96,8 @@ async def test_no_trial_has_failed_where_nothing_was_ever_answered(merge_runner,
     assert run.summary["trials"]["failed"] == 0
     async with watched(serving(status=404)) as server:
         at = {"LOCAL_BASE_URL": f"{server.url}/v1"}
-        again = await merge_runner(*NAMED, **at)
-        assert again.code == 0, again.err
-        run = await merge_runner(*LOCAL, **at)
-        assert run.code == 2
+        await merge_runner(*NAMED, code=0, **at)
+        run = await merge_runner(*LOCAL, code=2, **at)
         assert re.search("models that it does not list .HTTP 404.*one with LOCAL_MODEL", run.err)
     stored = await merge_runner(*NAMED, **at)  # where all has been played, no server is needed
     assert (stored.code, stored.summary["trials"]["stored_before"]) == (0, 1), stored.err

@@ -25,8 +25,7 @@ async def test_22_situations_are_asked_as_often_as_wanted_and_nothing_else_is(me
         ask = (*FIRST, "--reps", 2, "--json")
         told = (await merge_runner(*ask, "--dry-run", **server.env)).summary
         assert (told["trials"], told["calls"], server.requests) == (22, 44, 0)
-        run = await merge_runner(*ask, **server.env)
-        assert run.code == 0, run.err
+        run = await merge_runner(*ask, code=0, **server.env)
         assert run.summary["calls"] == {"live": 44, "cached": 0}
         slots = [json.loads(headers[SLOT_HEADER]) for headers in server.headers]
     assert sorted((s["decision"], s["condition"], s["side"], s["repetition"]) for s in slots) == (
@@ -112,13 +111,11 @@ async def test_no_more_is_spent_than_the_cap_and_more_money_goes_on(merge_runner
         assert (unasked.code, "--yes" in unasked.err) == (2, True)
         assert server.requests == 0
         cap = ("--yes", "--in-flight", 1, "--max-cost")
-        capped = await merge_runner(*ask, *cap, 2.1, **server.env)
-        assert capped.code == 3, capped.err
+        capped = await merge_runner(*ask, *cap, 2.1, code=3, **server.env)
         assert 0 < capped.summary["sweep_cost_usd"] <= 2.1
         waiting = "(1 of paid/baseline, 2 of paid/A1: what has ended is not balanced)"
         assert f"3 trials wait for money {waiting}: " in capped.summary["messages"][0]
-        run = await merge_runner(*ask, *cap, 20, **server.env)
-        assert run.code == 0, run.err
+        await merge_runner(*ask, *cap, 20, code=0, **server.env)
         assert set(server.asked.values()) == {1}
         assert server.requests == 8
     assert "mine/paid/set0/first" in (await merge_runner("ledger")).out
@@ -163,8 +160,7 @@ async def test_no_question_depends_on_an_answer_and_each_driver_of_a_pair_is_sum
     for middle, name in ((None, "usual"), (wordless, "wordless")):
         async with watched(middle) as server:
             places = ("--cache", name, "--db", f"{name}.duckdb")
-            run = await merge_runner(*ask, "--json", *places, **server.env)
-            assert run.code == 0, run.err
+            run = await merge_runner(*ask, "--json", *places, code=0, **server.env)
             asked.append(server.asked)
             looks.append(run.summary["first_looks"])
     assert asked[0] == asked[1]

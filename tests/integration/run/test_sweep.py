@@ -25,8 +25,7 @@ PAIR = ("baseline", "--model", "projected-order+emulator", "--model", "constant"
 
 
 async def test_a_sweep_stores_every_trial_and_its_summary_is_five_lines(merge_runner):
-    run = await merge_runner("sweep", "--reps", 1)
-    assert run.code == 0, run.err
+    run = await merge_runner("sweep", "--reps", 1, code=0)
     trials, decisions, calls, who, checked = run.out.splitlines()
     ways = re.fullmatch(
         r"trials: 11 \((\d+) left first, (\d+) right first(?:, (\d) collided)?\)", trials
@@ -62,8 +61,7 @@ async def test_an_estimate_assumes_no_more_tokens_than_a_reply_may_have(merge_ru
 
 async def test_several_sweeps_are_all_looked_at_and_played_one_after_the_other(merge_runner):
     names = ("baseline", "ablations", "--variants", "baseline", "--reps", 1, "--json")
-    run = await merge_runner("sweep", *names, "--conditions", "L_4_8")
-    assert run.code == 0, run.err
+    run = await merge_runner("sweep", *names, "--conditions", "L_4_8", code=0)
     summaries = [json.loads(line) for line in run.out.splitlines()]
     assert [each["trials"]["stored_before"] for each in summaries] == [0, 1]
     again = await merge_runner("replay", *names, "--conditions", "L_4_8", "--db", "replayed.duckdb")
@@ -147,8 +145,7 @@ async def test_a_stub_never_answers_for_the_endpoint_nor_another_model_in_silenc
             run = await merge_runner(*sweep, **env)
             assert (run.code, run.out.count("another model answered")) == (0, other_models)
         assert one.requests == other.requests > 0
-    ambiguous = await merge_runner("replay", "baseline", "--reps", 1, "--model", "o3")
-    assert ambiguous.code == 2
+    ambiguous = await merge_runner("replay", "baseline", "--reps", 1, "--model", "o3", code=2)
     assert one.url in ambiguous.err
 
 
@@ -198,8 +195,7 @@ async def test_ctrl_c_saves_what_is_in_flight_and_the_same_command_goes_on(
         assert process.returncode == 130, err
         assert "Run the same command again" in json.loads(out)["messages"][0]
         assert b"Traceback" not in err
-        again = await merge_runner(*SMALL, **server.env)
-        assert again.code == 0
+        await merge_runner(*SMALL, code=0, **server.env)
         assert not gate.asked_again
     assert results_digest(tmp_path / DB) == quiet
 
@@ -231,8 +227,7 @@ async def test_a_terminal_that_closes_loses_no_call_that_is_in_flight(
         process.send_signal(signal.SIGTERM)
         gate.open()
         assert await process.wait() == 130
-        again = await merge_runner(*SMALL, **server.env)
-        assert again.code == 0, again.err
+        await merge_runner(*SMALL, code=0, **server.env)
         assert not gate.asked_again
     assert results_digest(tmp_path / DB) == quiet
 
@@ -258,8 +253,7 @@ async def test_programs_drive_without_a_call_alone_and_against_a_model(merge_run
         alone = await merge_runner(*SMALL, "--model", program, "--in-flight", 10**9)
         assert alone.summary["trials"][ends] == 11
         assert alone.summary["calls"] == {"live": 0, "cached": 0}
-    mixed = await merge_runner(*SMALL, "--conditions", "N_0_0", "--model", "emulator+constant")
-    assert mixed.code == 0
+    await merge_runner(*SMALL, "--conditions", "N_0_0", "--model", "emulator+constant", code=0)
     sql = (
         "select distinct model_left, model_right, side, call_key is null from decisions "
         "join trials using (trial_id, spec_hash) where source = 'llm' order by all"

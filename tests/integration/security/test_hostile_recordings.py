@@ -220,6 +220,12 @@ def test_other_keys_and_metadata_are_refused(file, cache):
     bad = rewritten(file, "UPDATE calls SET call_key = md5(body)")
     assert "does not belong to its key" in refusal(bad, cache)
     assert "keys of version '9'" in refusal(rewritten(file, key_version="9"), cache)
+    for change, said in (
+        ("UPDATE calls SET attempts = replace(attempts, '0.1', '0.2')", "not as it was exported"),
+        ("DELETE FROM calls WHERE decision = 1", "not as it was exported"),
+        ("INSERT INTO calls FROM calls LIMIT 1", "repeats"),
+    ):
+        assert said in refusal(rewritten(file, change), cache)
     assert "not as it was exported" in refusal(rewritten(file, calls="4"), cache)
     assert "not as it was exported" in refusal(rewritten(file, content_sha256="0"), cache)
     raw = file.read_bytes()

@@ -33,8 +33,7 @@ def played(prepare, tmp_path_factory):
     """A new study of which a part was played, from outside of its folder."""
     above = tmp_path_factory.mktemp("above")
     write_folder(above / "mine")
-    run = prepare(above, "sweep", "mine/study.toml", *PART)
-    assert run.code == 0, run.err
+    prepare(above, "sweep", "mine/study.toml", *PART, code=0)
     assert [path.name for path in above.iterdir()] == ["mine"]
     return above / "mine"
 
@@ -72,16 +71,14 @@ async def test_a_recording_alone_replays_its_study_in_an_empty_folder_once_its_c
     db = mine / "results/merge.duckdb"
     places = ("--db", db, "--cache", mine / "cache/responses")
     (mine / "plugin.py").write_text((mine / "plugin.py").read_text() + "\n# changed\n")
-    sweep = await merge_runner("sweep", "study.toml", *PART, "--trust", cwd=mine)
-    assert sweep.code == 0, sweep.err
+    await merge_runner("sweep", "study.toml", *PART, "--trust", cwd=mine, code=0)
     file = tmp_path / "study.parquet"
     assert (await merge_runner("recording", "export", file, *places)).code == 0
     empty = tmp_path / "empty"
     empty.mkdir()
     refused = await merge_runner("replay", file, cwd=empty)
     assert (refused.code, "runs code (plugin.py)" in refused.err) == (2, True)
-    again = await merge_runner("replay", file, "--trust", cwd=empty)
-    assert again.code == 0, again.err
+    await merge_runner("replay", file, "--trust", cwd=empty, code=0)
     assert results_digest(empty / "results/merge.duckdb") == results_digest(db)
     for words, said in (
         (("replay", file, "--reps", 1), "replayed as it was played"),
@@ -138,8 +135,7 @@ async def test_an_error_names_the_study_s_own_file_of_models(merge_runner, tmp_p
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/study.toml").write_text("models = ['small']\n[repetitions]\nbaseline = 1\n")
     (tmp_path / "mine/models.toml").write_text(a_model("small"))
-    run = await merge_runner("sweep", "mine/study.toml", "--tpm", 1)
-    assert run.code == 2
+    run = await merge_runner("sweep", "mine/study.toml", "--tpm", 1, code=2)
     assert "lower max_output_tokens of [small] in mine/models.toml" in run.err.splitlines()[-1]
 
 
@@ -179,6 +175,5 @@ async def test_the_commented_lines_of_the_study_can_be_used(merge_runner, study)
     text = (study / "study.toml").read_text()
     used = re.sub(r"^# (?=\[|total_usd|persona = |opponent = )", "", text, flags=re.MULTILINE)
     (study / "study.toml").write_text(used)
-    run = await merge_runner("sweep", "study.toml", "--dry-run", cwd=study)
-    assert run.code == 0, run.err
+    run = await merge_runner("sweep", "study.toml", "--dry-run", cwd=study, code=0)
     assert re.search(r"trials +110 ", run.out)

@@ -29,8 +29,7 @@ OF_ONE = ("--study", "one.toml")
 
 def test_a_study_of_several_is_checked_exported_and_recorded_alone(both, prepare):
     def said(*words, db="both.duckdb"):
-        run = prepare(both, *words, "--db", db)
-        assert run.code == 0, run.err
+        run = prepare(both, *words, "--db", db, code=0)
         return run.out
 
     assert said("digest", *OF_ONE) == said("digest", db="alone.duckdb") != said("digest")
@@ -67,6 +66,5 @@ def test_a_study_of_several_is_checked_exported_and_recorded_alone(both, prepare
 def test_a_study_that_was_not_played_is_refused(both, prepare, words, message):
     (both / "third.toml").write_text(OTHER)
     db = () if "--recording" in words else ("--db", "both.duckdb")
-    run = prepare(both, *words, *db)
-    assert run.code == 2
+    run = prepare(both, *words, *db, code=2)
     assert message in run.err

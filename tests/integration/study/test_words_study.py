@@ -27,8 +27,7 @@ def db(prepare, tmp_path_factory):
     folder = tmp_path_factory.mktemp("words")
     (folder / "words.toml").write_text(PLANTED)
     for part in (("--only", "hurry=yes"), ()):
-        done = prepare(folder, "sweep", "words.toml", *part, *FAST)
-        assert done.code == 0, done.err
+        prepare(folder, "sweep", "words.toml", *part, *FAST, code=0)
     return folder / "results/merge.duckdb"
 
 
@@ -88,22 +87,18 @@ async def test_it_replays_from_its_recording_to_the_same_digest_and_is_audited(
 ):
     (tmp_path / "words.toml").write_text(PLANTED)
     cache = db.parents[1] / "cache/responses"
-    recorded = await merge_runner("recording", "export", "r.parquet", "--cache", cache, "--db", db)
-    assert recorded.code == 0, recorded.err
+    await merge_runner("recording", "export", "r.parquet", "--cache", cache, "--db", db, code=0)
     again = ("replay", "words.toml", "--recording", "r.parquet", "--db", "again", *FAST)
-    replayed = await merge_runner(*again)
-    assert replayed.code == 0, replayed.err
+    await merge_runner(*again, code=0)
     assert results_digest(tmp_path / "again") == results_digest(db)
     assert query(tmp_path / "again", FIRST) == query(db, FIRST)
-    audit = await merge_runner("audit", "--db", "again")
-    assert audit.code == 0, audit.out
+    await merge_runner("audit", "--db", "again", code=0)
 
 
 async def test_a_run_says_where_several_prompts_gave_the_same_trials(merge_runner, tmp_path):
     text = STUDY.replace("repetitions = 20", "repetitions = 2")
     (tmp_path / "words.toml").write_text(text)
-    told = await merge_runner("sweep", "words.toml", "--only", "opponent=self", *FAST)
-    assert told.code == 0, told.err
+    told = await merge_runner("sweep", "words.toml", "--only", "opponent=self", *FAST, code=0)
     assert (
         "the same trials with these prompts: baseline, hurry=yes, persona=taxi, persona=taxi "
         "hurry=yes. The emulator reads no words: plant an effect to rehearse "

@@ -15,7 +15,8 @@ from merge_runner_analysis.provenance import provenance, tally
 from merge_runner_analysis.published import published
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables import TABLES, make_tables
-from merge_runner_analysis.web.report import alarms, report_html, write_report
+from merge_runner_analysis.web.report import report_html, write_report
+from tests.integration.analysis.test_groups import alarms_of
 from tests.support.serving import words_of
 from tests.support.studies import Said, changed, write_study, yielding
 
@@ -79,11 +80,6 @@ def asking(folder, said, *, variant="baseline"):
     """A study of o3 in which the first six trials had this said at their first decision."""
     drives = [replace(d, said={0: said}) for d in yielding("o3", variant, reps=1)[:6]]
     return Study(write_study(folder / "t.duckdb", drives))
-
-
-def alarms_of(study):
-    found = alarms(study, provenance(study.db)).items()
-    return {title: f"{'; '.join(texts)}. {meaning}" for title, (texts, meaning) in found}
 
 
 def test_what_went_wrong_stands_at_the_top_before_any_number(page):
