@@ -89,29 +89,23 @@ CHANGED = {
 LEFT_GOES_FIRST = "left vehicle goes first"
 # Sentence parts: a driver has more than another, has less, or no difference is shown in it.
 COMPARED = {
-    LEFT_FIRST.name: (
-        "goes before its opponent more often",
-        "goes before its opponent less often",
-        "how often it goes before its opponent",
-    ),
+    LEFT_FIRST.name: ("goes first more often", "goes first less often", "how often it goes first"),
     LEFT_GOES_FIRST: (
-        "lets the left vehicle go first more often",
-        "lets the left vehicle go first less often",
+        *(f"lets the left vehicle go first {often} often" for often in ("more", "less")),
         "how often the left vehicle goes first",
     ),
-    GAP.name: ("leaves a larger gap", "leaves a smaller gap", "the gap"),
+    GAP.name: ("leaves a larger gap", "leaves a smaller gap", CHANGED[GAP.name]),
     RMSE.name: (
         "departs more from its initial speed",
         "keeps closer to its initial speed",
-        "how far it departs from its initial speed",
+        CHANGED[RMSE.name],
     ),
     JOINT.name: (
-        "has both drivers change their speed more often",
-        "has both drivers change their speed less often",
-        "how often both change their speed",
+        *(f"has both drivers change their speed {often} often" for often in ("more", "less")),
+        CHANGED[JOINT.name],
     ),
-    VALID.name: ("has more valid replies", "has fewer valid replies", "how many replies are valid"),
-    COST.name: ("costs more", "costs less", "its cost"),
+    VALID.name: ("has more valid replies", "has fewer valid replies", CHANGED[VALID.name]),
+    COST.name: ("costs more", "costs less", CHANGED[COST.name]),
 }
 # The collision rules that trials may be played by, as sentences name them, and their meaning.
 PLAYED_RULES = {
@@ -125,11 +119,6 @@ RULES_MEAN = {
     "shared_lane": "the vehicles are less than a length apart once one is in the shared lane",
 }
 PEOPLES_RULE = "the vehicles' outlines overlap, checked 20 times a second"
-# Where an interval leaves out 0 and the corrected p shows no difference.
-UNCORRECTED = (
-    "An interval may leave out 0 where no difference is shown: it is of one test alone, and the "
-    "corrected p allows for the number of tests."
-)
 # Of a rehearsal, with the planted effects.
 PLANTED = "planted in the scripted stand-in for this rehearsal"
 # The vehicle that going first is counted for: (subject of a sentence, its meaning).
@@ -494,8 +483,7 @@ def apart(driver: str, other: str, rows: Mapping[str, Values], *, of_left: bool)
     corrected = f"corrected p {equal_p(p)}"
     if p >= ALPHA:
         result = f"No difference is shown: {number(difference)} points {brackets(ci)}"
-        also = UNCORRECTED if ci and ci[0] * ci[1] > 0 else ""
-        return f"{claim}. {result}; {corrected}.", " ".join(filter(None, (also, others)))
+        return f"{claim}. {result}; {corrected}.", others
     # Where trials are fewer, the ends change their signs and their places.
     ends = ci and sorted(end if difference > 0 else -end for end in ci)
     result = f"{number(abs(difference))} points {brackets(ends)}".rstrip()
@@ -616,8 +604,6 @@ def _likeness(drivers: Mapping[str, Mapping[str, Values]], *, every: bool) -> tu
         for name, of in drivers.items()
         if of["collisions"].get("undecided")
     ]
-    if len(drivers) > 1:
-        untold.append(_count(drivers))
     alike = [name for name in drivers if name not in unlike]
     if not unlike:
         return f"No difference from people is shown for {joined(alike)}.", " ".join(untold)
@@ -677,16 +663,6 @@ def _too_few(drivers: Mapping[str, Mapping[str, Values]], *, alone: bool) -> str
         for name, of in drivers.items()
     ]
     return f"{TOO_FEW}: {joined(counts)}."
-
-
-def _count(drivers: Mapping[str, Mapping[str, Values]]) -> str:
-    """Return how many comparisons a headline rests on, and how they are corrected."""
-    every = [values for of in drivers.values() for values in of.values()]
-    tested = sum(values.get("p_holm") is not None for values in every)
-    return (
-        f"By all measures together, {sum(map(differs, every))} of {tested} comparisons with people "
-        "show a difference (corrected p below 0.05)."
-    )
 
 
 def difference_sentence(values: Values, it: str) -> str:

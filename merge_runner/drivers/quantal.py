@@ -104,7 +104,7 @@ PROGRAMS.register(
     "quantal",
     Program(
         QuantalDriver,
-        "level-1 quantal response on four actions (ours)",
+        "the better of four actions is the likelier, if the other keeps its speed (our own model)",
         {
             "horizon_s": 5.0,
             "precision": 1.7,

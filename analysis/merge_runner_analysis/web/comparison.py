@@ -14,7 +14,6 @@ from merge_runner_analysis.web.effect_rows import (
     amount,
     difference_mark,
     interval_text,
-    is_uncorrected,
     metric_of,
     name_of,
     unbroken,
@@ -27,7 +26,6 @@ from merge_runner_analysis.web.scope import Scope
 from merge_runner_analysis.web.site import Site
 from merge_runner_analysis.wording import (
     LEFT_GOES_FIRST,
-    UNCORRECTED,
     apart,
     capital,
     number,
@@ -129,7 +127,7 @@ def _corrected(rows: Sequence[Row]) -> str:
     primary = [name_of(row) for row in tested if row.values["primary"]]
     many = f"Corrected for {len(tested) - len(primary)} tests (Holm)"
     alone = f"; {primary[0]}, the primary measure, is tested by itself" if primary else ""
-    return f"{many}{alone}. {UNCORRECTED * any(map(is_uncorrected, tested))}".rstrip()
+    return f"{many}{alone}."
 
 
 def _name(row: Row, of_left: bool) -> str:
@@ -180,7 +178,7 @@ def _difference(row: Row, trials: tuple[TrialsOf, TrialsOf], name: str) -> Diffe
         unbroken(f"{amount(row, end)} {unit_of(row)}"),
         p_value(values["p"]),
         p_value(values["p_corrected"]),
-        row.note,
+        row.note.replace(f"{values['measure']}: ", ""),
     )
 
 

@@ -110,12 +110,6 @@ def is_shown(row: Row) -> bool:
     return is_tested(row) and value_of(row, "p_corrected") < ALPHA
 
 
-def is_uncorrected(row: Row) -> bool:
-    """Return whether the interval leaves out 0 though the corrected p shows no difference."""
-    ends = interval_of(row)
-    return is_tested(row) and not is_shown(row) and ends is not None and ends[0] * ends[1] > 0
-
-
 def factors_of(row: Row) -> set[str]:
     """Return the factor of a level, or those of a crossing."""
     return {*str(row.values["factor"]).split(TIMES)}

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from merge_runner.config import ScenarioConfig
+from merge_runner_analysis.metrics import BOXES
 from merge_runner_analysis.published import HUMAN, human_counts
 from merge_runner_analysis.tables.model import Table
 from merge_runner_analysis.web.marks import Cell, band, cells, measures_of
@@ -145,10 +146,10 @@ def by_kind(drivers: Sequence[Driver]) -> dict[str, list[Driver]]:
 def noted(drivers: Sequence[Driver], headings: Mapping[str, str]) -> list[tuple[str, str, str]]:
     """Return the notes on numbers of the measures with a heading: driver, heading and note."""
     return [
-        (driver.name, heading, capital(str(driver.cells[name].values["note"])))
+        (driver.name, heading, capital(note.replace(f"{BOXES.heading}: ", "")))
         for driver in drivers
         for name, heading in headings.items()
-        if name in driver.cells and driver.cells[name].values["note"]
+        if name in driver.cells and (note := str(driver.cells[name].values["note"]))
     ]
 
 

@@ -27,7 +27,6 @@ from merge_runner_analysis.web.effect_rows import (
     is_interaction,
     is_shown,
     is_tested,
-    is_uncorrected,
     level_text,
     metric_of,
     name_of,
@@ -48,7 +47,6 @@ from merge_runner_analysis.wording import (
     PLANTED,
     SAME_TRIALS,
     TIMES,
-    UNCORRECTED,
     UNREADABLE,
     capital,
     joined,
@@ -95,9 +93,8 @@ class Answer:
     """The claim, what else there is to say, charts, and the effects behind them.
 
     ``asked`` is the question in words, for a study that has none of its own; ``crossed`` a factor
-    at whose levels another one may be shown, ``has_self`` whether drivers meet a copy of their own.
-    ``who`` says of which driver who goes first is counted, ``uncorrected`` why an interval may
-    leave out 0 where no difference is shown, and ``problem`` what is wrong with the stored study.
+    at whose levels another one may be shown. ``who`` says of which driver who goes first is
+    counted, and ``problem`` what is wrong with the stored study.
     """
 
     asked: str
@@ -113,8 +110,6 @@ class Answer:
     changes: list[Change]
     others: list[Change]
     could: str
-    has_self: bool
-    uncorrected: str
     problem: str
 
 
@@ -171,8 +166,6 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
         _changes(tested, sides, metric),
         _changes(others, sides, metric),
         unbroken(_could(tested)),
-        any((row.values["factor"], row.values["level"]) == (OPPONENT, SELF) for row in known),
-        UNCORRECTED * (UNCORRECTED not in rest and any(map(is_uncorrected, (*tested, *others)))),
         next((note for note in effects.notes if note.startswith(UNREADABLE)), ""),
     )
 
@@ -218,7 +211,6 @@ def answered(rows: Sequence[Row], driver: str = EGO[0], planted: str = "") -> tu
     rest += [f"{capital(level_text(row))} changes it, too: {test_text(row)}." for row in sure[1:]]
     unshown = [row for row in primary if row not in sure]
     rest += _not_shown(unshown)
-    rest += [UNCORRECTED] * any(map(is_uncorrected, unshown[:FEW]))
     rest += [f"{capital(text)}." for text in copied]
     if not sure:
         rest.append(_seen(primary))

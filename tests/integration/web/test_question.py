@@ -208,6 +208,10 @@ def test_the_first_screen_answers_a_study_of_two_factors(page, db, outcomes):
     slope = 100 * fitted(every, "hurry", ("persona", "opponent"))["C(hurry)[T.yes]"]
     beside = page.locator("main").inner_text().replace("\N{NO-BREAK SPACE}", " ")
     assert f"The difference is +{slope:.2f} points" in beside
+    assert "persona=taxi adds 0.2 to the log-odds" in beside
+    assert "(an even chance becomes 82 %)" in beside
+    (shown,) = re.findall(r"(\d+) trials without a crash, (\d+) with one", beside)
+    assert sum(map(int, shown)) == query(db, "SELECT count(*) FROM trials")[1][0][0]
     shares = [float(share) for share in re.findall(r"(\d+\.\d\d) %", said)]
     assert shares[0] - shares[1] == pytest.approx(slope, abs=0.011)
     none, taxi = (

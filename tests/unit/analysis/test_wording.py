@@ -92,8 +92,7 @@ WILD = driver(86, collisions="unlike", gap="unlike", collided=24)
         (
             {"o3": driver(), "wild": WILD},
             "wild does not drive like people: it crashed in 24 of 110 trials, people in 28 of 990.",
-            "No difference from people is shown for o3. By all measures together, 2 of 8 "
-            "comparisons with people show a difference (corrected p below 0.05).",
+            "No difference from people is shown for o3.",
         ),
     ],
 )
@@ -158,7 +157,7 @@ def test_two_drivers_are_told_apart_with_names_and_numbers():
     )
     smaller = "Compared with b, a leaves a smaller gap (3.10 against 4.20 m)."
     assert rest == f"{smaller} No difference is shown in how often the left vehicle goes first."
-    assert "how often it goes before its opponent." in apart("a", "b", rows, of_left=False)[1]
+    assert "how often it goes first." in apart("a", "b", rows, of_left=False)[1]
     claim, _ = apart("a", "b", rows | {"collided_percent": crashed | {"p_corrected": 0.4}},
                      of_left=True)  # fmt: skip
     assert "of 110. No difference is shown: −38.64 points [−50.00, −27.00]; corrected" in claim

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from merge_runner_analysis.tables.model import Column, Row, Table
 from merge_runner_analysis.web import effect_rows
 from merge_runner_analysis.web.question import UNREAD, answer_of, answered
-from merge_runner_analysis.wording import EGO, LEFT, PLANTED, SAME_TRIALS, UNCORRECTED
+from merge_runner_analysis.wording import EGO, LEFT, PLANTED, SAME_TRIALS
 
 GOES_FIRST, GAP, COST = "goes first (%)", "gap (m)", "cost (USD)"
 METRICS = {GOES_FIRST: "left_first_percent", "coll. (%)": "collided_percent", GAP: "gap_m",
@@ -64,7 +64,7 @@ SEEN = "A change of 10.00 points or more would be shown by four of five such stu
             [effect(p=0.2), effect(measure=GAP, p=0.0001, estimate=3.8, estimate_reference=4.3)],
             "No change of who goes first is shown by hurry.",
             "Hurry=yes is not shown to change it: +13.00 points [6.00, 20.00], "
-            f"corrected p = 0.200. {UNCORRECTED} {SEEN} Hurry changes the gap at the merge point: "
+            f"corrected p = 0.200. {SEEN} Hurry changes the gap at the merge point: "
             "3.80 m with hurry=yes, 4.30 m with hurry=no.",
         ),
         (
@@ -104,7 +104,7 @@ SEEN = "A change of 10.00 points or more would be shown by four of five such stu
             "No change of who goes first is shown by hurry and persona.",
             "Hurry=yes is not shown to change it: +13.00 points [6.00, 20.00], corrected p = "
             "0.200. Persona=yes is not shown to change it: +1.00 points [−6.00, 8.00], corrected p "
-            f"= 0.300. {UNCORRECTED} A change of 10.00 points by hurry, 10.00 points by persona or "
+            "= 0.300. A change of 10.00 points by hurry, 10.00 points by persona or "
             "more would be shown by four of five such studies.",
         ),
         (
@@ -237,19 +237,6 @@ def test_a_small_price_keeps_two_digits():
     assert effect_rows.test_text(effect(measure=COST, difference=-0.0005, **cheap)) == (
         "−0.00050 USD [−0.0012, 0.00031], corrected p = 0.001"
     )
-
-
-@pytest.mark.parametrize(
-    ("difference", "p", "is_said"), [(13.0, 0.2, True), (1.0, 0.2, False), (13.0, 0.01, False)]
-)
-def test_where_an_interval_leaves_out_0_without_a_difference_the_page_says_why(
-    difference, p, is_said
-):
-    made = answer([effect(), effect("persona", p, difference=difference)], levels_of("hurry"))
-    assert (UNCORRECTED in unspaced(made.rest)) is is_said
-    assert not made.uncorrected  # it is said once
-    made = answer([effect(), effect(measure=GAP, p=p, difference=difference)], levels_of("hurry"))
-    assert bool(made.uncorrected) is is_said
 
 
 def test_what_a_person_sees_at_once_is_said_of_several_other_changes():

@@ -14,7 +14,6 @@ from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.display_text import with_minus
 from merge_runner_analysis.web.effect_rows import MIDDLE
 from merge_runner_analysis.web.judged import (
-    Driver,
     by_condition,
     by_kind,
     humans_of,
@@ -24,7 +23,7 @@ from merge_runner_analysis.web.judged import (
 from merge_runner_analysis.web.marks import rate
 from merge_runner_analysis.web.scope import Scope, scope_of, unmarked
 from merge_runner_analysis.web.site import NotThere, Site
-from merge_runner_analysis.wording import DIFFERS, MEASURES, OPEN, SHOWN, UNLIKE, shown_state
+from merge_runner_analysis.wording import MEASURES
 
 # Outcomes and served models of the attempts of a driver's trials with a prompt.
 ATTEMPTS = """
@@ -85,7 +84,6 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         first=first,
         result=site.words.search(trials) if was_asked else None,
         kept=trials,
-        summary=_summary(driver) if driver and driver.cells else "",
         attempts=site.catalogue.ask(ATTEMPTS, unmarked(name), scope.prompt),
         accounts=[
             row
@@ -114,19 +112,6 @@ def _counted(cells: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str]]:
         ),
         ("Crashes", "collided", "ended"),
     ]
-
-
-def _summary(driver: Driver) -> str:
-    """Return the number of human traits that are shown, and of measures that are open."""
-    states = {
-        name: state for name, cell in driver.cells.items() if (state := shown_state(cell.values))
-    }
-    traits = [states[name] for name in states if name not in {"collisions", "gap"}]
-    shown = sum(state in {SHOWN, *DIFFERS} - {UNLIKE} for state in traits)
-    return (
-        f"{shown} of {len(traits)} patterns of people are found; "
-        f"{[*states.values()].count(OPEN)} of {len(states)} measures cannot be told yet."
-    )
 
 
 def _first(site: Site, driver: str, scope: Scope) -> tuple[Job | None, str]:

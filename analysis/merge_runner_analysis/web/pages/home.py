@@ -15,13 +15,7 @@ from merge_runner_analysis.web.question import Answer, answer_of
 from merge_runner_analysis.web.runs import standing_of
 from merge_runner_analysis.web.scope import Bar, Scope, descriptions_of, scope_of, unmarked
 from merge_runner_analysis.web.site import Site, news_of
-from merge_runner_analysis.wording import (
-    HEADINGS,
-    LANGUAGE_MODEL,
-    MEASURES,
-    MOCK,
-    headline,
-)
+from merge_runner_analysis.wording import HEADINGS, LANGUAGE_MODEL, MOCK, headline
 
 TABLES = ("effects", "levels")  # of what a study's factors change
 Jobs = list[Job]
@@ -51,10 +45,6 @@ def _rivals(
     return [job], [job] * is_awaited, apart
 
 
-def _is_tested(driver: Driver, measure: str) -> bool:
-    return measure in driver.cells and driver.cells[measure].values.get("p_holm") is not None
-
-
 def _beside_people(
     drivers: Sequence[Driver],
     short: Mapping[str, str],
@@ -73,11 +63,6 @@ def _beside_people(
             (driver, likeness_of(driver)) for kind in by_kind(drivers).values() for driver in kind
         ],
         "likeness_headings": HEADINGS,
-        "more_compared": [
-            measure.label
-            for name, measure in MEASURES.items()
-            if name not in HEADINGS and any(_is_tested(driver, name) for driver in drivers)
-        ],
         "people": people_of(conditions, human),
         "could_see": could_see(drivers),
     }
