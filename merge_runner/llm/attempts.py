@@ -45,12 +45,6 @@ class Meter:
         """Calls: live, cached, and of these shared and recorded."""
         return self.calls_live, self.calls_cached, self.calls_shared, self.calls_recorded
 
-    def count_attempt(self, attempt: Attempt) -> None:
-        """Count one live attempt."""
-        self.outcomes[attempt.outcome] += 1
-        self.cost_usd += attempt.cost_usd or 0.0
-        self.cost_unknown += attempt.cost_usd is None
-
     def add(self, other: Meter) -> None:
         """Add the counts of another meter."""
         for name in (count.name for count in fields(self)):
@@ -84,7 +78,9 @@ def record(
         batch_id=sent.batch_id,
     )
     call.attempts.append(attempt)
-    meter.count_attempt(attempt)
+    meter.outcomes[attempt.outcome] += 1
+    meter.cost_usd += usd or 0.0
+    meter.cost_unknown += usd is None
     if reading.service_tier in endpoint.underpriced_tiers:
         meter.underpriced[reading.service_tier] += 1
     # The reservation is 0 where a user has released it meanwhile.

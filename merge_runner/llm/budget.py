@@ -61,15 +61,6 @@ class Reservation:
         """Return the reservation of an attempt that an earlier run, of any sweep, has begun."""
         return cls(budget, trial, key, label, budget.ledger.reserved_usd(key), queued=False)
 
-    async def ask_coordinator(self) -> None:
-        """Wait until the coordinator has reserved the attempt; raise TrialSuspended.
-
-        Nothing is sent or durable here yet, so the wait can be cancelled.
-        """
-        coordinator = self.budget.ledger.coordinator
-        if coordinator and not await coordinator.reserve(self.key, self.usd, self.label):
-            raise TrialSuspended(USED_UP)
-
     async def begin(self, number: int) -> None:
         """Reserve durably, right before the attempt is sent; raise TrialSuspended."""
         if not self.queued:  # it is reserved: by an earlier run, or for a batch that was refused
@@ -185,8 +176,7 @@ class Budget:
         """Trials that wait for money, for admission or for an attempt."""
         return {trial for waiter in self.queue.waiters for trial in waiter.trials}
 
-    def is_running(self, trials: Sequence[int]) -> bool:
-        """Return whether one of the trials is admitted."""
+    def _is_running(self, trials: Sequence[int]) -> bool:
         return not self.running.keys().isdisjoint(trials)
 
     async def admit(self, trials: Sequence[int]) -> None:
@@ -194,10 +184,10 @@ class Budget:
 
         ``trials`` may change meanwhile. Raise TrialSuspended if no other trial can free money.
         """
-        if self.ledger.cap is not None and not self.is_running(trials):
+        if self.ledger.cap is not None and not self._is_running(trials):
             await self.queue.wait(
                 Waiter(trials, is_admission=True),
-                lambda: self.is_running(trials) or self._may_begin(min(trials)),
+                lambda: self._is_running(trials) or self._may_begin(min(trials)),
             )
             self.queue.reorder(min(trials))
 

@@ -35,10 +35,10 @@ class Call:
     ``label`` names it and bounds the cost of an attempt, ``worst`` bounds its tokens. ``left_s``
     remains for its attempts and the waits between them; waits for the rate limiter do not count.
     ``attempts`` has all attempts, the first ``earlier`` of them by earlier runs. ``wait`` is None
-    while it is in flight or being saved. ``task`` makes the call, ``trials`` wait for it,
-    by their order; ``order`` is the lowest. ``bypass_batch`` is set after a batch without a result
-    for it; ``pending_batch`` is the batch of an earlier run in which it waits. Its recorded reply
-    may be ``damaged``.
+    while it is in flight or being saved. ``task`` makes the call, ``trials`` wait for it, by their
+    order; ``order`` is the lowest. Other calls wait for a probe. ``bypass_batch`` is set after a
+    batch without a result for it; ``pending_batch`` is the batch of an earlier run in which it
+    waits. Its recorded reply may be ``damaged``.
     """
 
     request: ChatRequest
@@ -51,6 +51,7 @@ class Call:
     earlier: int = 0
     wait: Wait | None = None
     trials: list[int] = field(default_factory=list)
+    is_probe: bool = False
     bypass_batch: bool = False
     pending_batch: Batch | None = None
     given_up: bool = False

@@ -214,8 +214,7 @@ class LlmClient:
             reservation = Reservation.resume(self.budget, call.order, key, label)
         else:
             call.wait = Wait(NO_MONEY, blocked=True)
-            is_probe = not self.endpoint.verified
-            reservation = await self.budget.reserve(call.trials, key, label, is_probe=is_probe)
+            reservation = await self.budget.reserve(call.trials, key, label, is_probe=call.is_probe)
         with closing(reservation):
             sent = await sender.send(call, reservation)
             usd = attempt_usd(sent, call.worst, self.endpoint, sender.price_factor)

@@ -39,6 +39,7 @@ class Probe:
             self._alone.release()
             yield
             return
+        call.is_probe = True
         note = asyncio.get_running_loop().call_later(LONG_WAIT_S, self._note_wait, call)
         is_released = True
         try:

@@ -113,11 +113,12 @@ class World:
         columns = {
             side: (v.positions, v.velocities, v.accelerations) for side, v in self._vehicles.items()
         }
-        return tuple(
+        rows = [
             StateRow(step, time_s, side, positions[step], velocities[step], accelerations[step])
             for step, time_s in enumerate(times_s)
             for side, (positions, velocities, accelerations) in columns.items()
-        )
+        ]
+        return tuple(rows)
 
     def _history(self, samples: list[float], before: float) -> tuple[float, ...]:
         length = self._config.memory_samples

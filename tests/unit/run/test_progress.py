@@ -8,7 +8,6 @@ import pytest
 
 from merge_runner.llm.attempts import Meter
 from merge_runner.llm.call import Wait
-from merge_runner.records import Attempt, Usage
 from merge_runner.run.estimate import Estimate
 from merge_runner.run.estimate_lines import estimate_lines
 from merge_runner.run.plan import make_plan
@@ -31,10 +30,9 @@ def rows(shown):
 
 
 def test_every_figure_is_that_of_the_meters():
-    first = Meter(calls_live=30, calls_cached=20, calls_shared=8, calls_recorded=5)
-    meters = [first, Meter(calls_live=4)]
-    meters[0].count_attempt(Attempt(1, "ok", usage=Usage(100, 0, 50), cost_usd=1.5))
-    meters[1].count_attempt(Attempt(1, "timeout"))
+    first = Meter(calls_live=30, calls_cached=20, calls_shared=8, calls_recorded=5, cost_usd=1.5)
+    meters = [first, Meter(calls_live=4, cost_unknown=1)]
+    meters[0].outcomes["ok"] = meters[1].outcomes["timeout"] = 1
     meters[1].mismatches["o3 -> gpt-4o"] = 2
     shown = progress(runner(*meters, running=5), began_at=ago(60))
     shown.trials.stored += 7
