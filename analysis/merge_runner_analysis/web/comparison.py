@@ -13,6 +13,7 @@ from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.effect_rows import (
     amount,
     difference_mark,
+    ends_of,
     interval_text,
     metric_of,
     name_of,
@@ -164,8 +165,8 @@ def no_trials(_what: str, _count: int) -> Filter:
 
 def _difference(row: Row, trials: tuple[TrialsOf, TrialsOf], name: str) -> Difference:
     values: Any = row.values
-    ci, is_tested = values["ci"], values["difference"] is not None
-    end = max(map(abs, (values["difference"], *(ci or ())))) if is_tested else 0.0
+    is_tested = values["difference"] is not None
+    end = ends_of([row])[metric_of(row)] if is_tested else 0.0
     first, second = (
         _side(row, of, filter_of) for of, filter_of in zip(("", "_reference"), trials, strict=True)
     )

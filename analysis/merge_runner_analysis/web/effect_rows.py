@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from typing import Any
 
 from merge_runner_analysis.tables.model import Row
@@ -113,6 +114,15 @@ def is_shown(row: Row) -> bool:
 def factors_of(row: Row) -> set[str]:
     """Return the factor of a level, or those of a crossing."""
     return {*str(row.values["factor"]).split(TIMES)}
+
+
+def ends_of(rows: Iterable[Row]) -> dict[str, float]:
+    """Return the greatest distance from 0 of differences and their intervals, by metric."""
+    ends: dict[str, float] = {}
+    for row in rows:
+        values = (value_of(row, "difference"), *(interval_of(row) or ()))
+        ends[metric_of(row)] = max(ends.get(metric_of(row), 0.0), *map(abs, values))
+    return ends
 
 
 def difference_mark(row: Row, end: float) -> Mark:

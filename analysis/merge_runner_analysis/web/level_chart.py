@@ -57,16 +57,13 @@ def level_chart(
     title: str, rows: Sequence[Row], shapes: dict[str, str], metric: str
 ) -> Chart | None:
     """Return a chart of the levels of these rows, a point for each driver, on one axis."""
-    of_model = [row for row in rows if row.values["factor"] != MODEL]
     drawn = [
         row
-        for row in of_model
-        if row.values["driver"] in shapes and row.values["value"] is not None
+        for row in rows
+        if row.values["factor"] != MODEL
+        and row.values["value"] is not None
+        and (row.values["driver"] or "") in (shapes or {""})
     ]
-    if not shapes:
-        drawn = [
-            row for row in of_model if not row.values["driver"] and row.values["value"] is not None
-        ]
     if not drawn:
         return None
     ends = [end for row in drawn for end in (interval_of(row) or (value_of(row, "value"),))]

@@ -19,9 +19,9 @@ from merge_runner_analysis.web.effect_rows import (
     count_of,
     difference_mark,
     difference_text,
+    ends_of,
     estimate_text,
     factors_of,
-    interval_of,
     interval_text,
     is_copied,
     is_interaction,
@@ -319,10 +319,7 @@ def _named(row: Row) -> str:
 
 def _changes(rows: Sequence[Row], sides: dict[str, Row], primary: str) -> list[Change]:
     """Return the effects with both sides of each; those of a measure have one axis."""
-    ends: dict[str, float] = {}
-    for row in rows:
-        values = (value_of(row, "difference"), *(interval_of(row) or ()))
-        ends[metric_of(row)] = max(ends.get(metric_of(row), 0.0), *map(abs, values))
+    ends = ends_of(rows)
     return [_change(row, sides, ends[metric_of(row)], primary) for row in rows]
 
 

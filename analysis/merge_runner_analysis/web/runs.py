@@ -18,21 +18,15 @@ from merge_runner_analysis.web.phrases import called
 from merge_runner_analysis.web.reading import Row
 
 REFUSED = 2
-# Reasons for an early end of a run, by exit code.
+# Reasons for an early end of a run, by exit code: in a sentence, and in a list.
 REASONS = {
-    REFUSED: "the service refused the key or the model, or a setting was wrong",
-    3: "the account's quota or --max-cost was used up",
-    4: "a replay makes no calls, and some replies are not recorded",
-    130: "it was interrupted (Ctrl-C)",
-}
-
-
-# The same in a list.
-ENDED_AS = {
-    REFUSED: "refused: key, model or setting",
-    3: "cap or quota reached",
-    4: "replies not recorded",
-    130: "interrupted (Ctrl-C)",
+    REFUSED: (
+        "the service refused the key or the model, or a setting was wrong",
+        "refused: key, model or setting",
+    ),
+    3: ("the account's quota or --max-cost was used up", "cap or quota reached"),
+    4: ("a replay makes no calls, and some replies are not recorded", "replies not recorded"),
+    130: ("it was interrupted (Ctrl-C)", "interrupted (Ctrl-C)"),
 }
 
 
@@ -141,7 +135,7 @@ def ended_as(run: Row) -> str:
     if run["state"] != "stopped":
         return "checking what is stored" if run["state"] == "checking" else str(run["state"])
     failed = f"{run['failed']} trials failed" if run["failed"] else "ended by an error"
-    return ENDED_AS.get(run["row"]["exit_code"], failed)
+    return REASONS.get(run["row"]["exit_code"], ("", failed))[1]
 
 
 def assessment_of(run: Row) -> tuple[str, str]:
@@ -174,7 +168,7 @@ def assessment_of(run: Row) -> tuple[str, str]:
         gone = "The run was cut off: its process is gone, or frozen."
         return "stopped", f"{gone} {counted} are stored{failures}."
     if reason := REASONS.get(row["exit_code"]):
-        return "stopped", f"Stopped: {reason}. {counted} have an outcome{failures}."
+        return "stopped", f"Stopped: {reason[0]}. {counted} have an outcome{failures}."
     if ended == planned:
         text = f"Ended with faults: {counted} have an outcome, but what is stored does not hold "
         audit = f"merge-runner audit --sweep {run['sweep_id']}"

@@ -78,7 +78,7 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         apart=apart,
         linked=True,
         middle=MIDDLE,
-        others=[other for other in by_name.values() if other is not driver],
+        others=[(other, other) for other in by_name if other != name],
         **values | {"human": humans_of(values["table"], driver)},
         awaited=awaited,
         first=first,

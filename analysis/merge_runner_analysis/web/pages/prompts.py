@@ -15,13 +15,7 @@ from merge_runner.records import SIDES
 from merge_runner_analysis.metrics import COLLISIONS
 from merge_runner_analysis.tables.formats import printed
 from merge_runner_analysis.tables.model import Table
-from merge_runner_analysis.web.effect_rows import (
-    MIDDLE,
-    difference_mark,
-    interval_of,
-    metric_of,
-    value_of,
-)
+from merge_runner_analysis.web.effect_rows import MIDDLE, difference_mark, ends_of, metric_of
 from merge_runner_analysis.web.judged import Driver, judged
 from merge_runner_analysis.web.phrases import UNKNOWN, block_meaning
 from merge_runner_analysis.web.scope import scope_of, unmarked
@@ -131,10 +125,7 @@ def differences(
     """
     # A driver that is not judged has none.
     rows = [row for row in table.rows if row.values.get("difference") is not None]
-    ends: dict[str, float] = {}
-    for row in rows:
-        values = (value_of(row, "difference"), *(interval_of(row) or ()))
-        ends[metric_of(row)] = max(ends.get(metric_of(row), 0.0), *map(abs, values))
+    ends = ends_of(rows)
     drivers: dict[str, dict[str, dict[str, Any]]] = {}
     for row in rows:
         driver, _, prompt = row.groups[0].rpartition("/")
