@@ -208,15 +208,15 @@ def test_runs_show_how_they_ended_and_what_the_audit_finds_and_a_scope_changes_n
     change(
         study,
         "UPDATE sweeps SET ended_at = started_at + INTERVAL 2 HOURS, exit_code = 1",
-        "UPDATE trials SET end_time_s = 99 WHERE status = 'finished'",
+        "UPDATE calls SET attempt = attempt + 1 WHERE decision = 0",
     )
     client = client_of(study)
     text, whole, part = (
         text_of(client, f"/sweeps{of}") for of in ("/sweep-1", "", "?condition=N_0_0")
     )
     assert ("lasted 2.0 h" in text, " 2.0 h " in whole) == (True, True)
-    assert "found: outcome: sweep-1" in text
-    assert "found: outcome: sweep-1" in whole
+    assert "found: attempt: sweep-1" in text
+    assert "found: attempt: sweep-1" in whole
     [run] = audit_database(study, ["sweep-1"])
     assert all(" ".join(note.split()) in text for note in run.notes)
     said = re.search(r"How each ended .*", whole)[0]
