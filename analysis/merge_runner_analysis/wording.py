@@ -31,8 +31,10 @@ HUMANS, LANGUAGE_MODEL, PROGRAM, MOCK = "humans", "language model", "program", "
 # States. A trait is shown by its own test; the others need a difference with a corrected p < .05.
 SHOWN, WEAKER, STRONGER, UNLIKE, OPEN = "shown", "weaker", "stronger", "unlike", "inconclusive"
 DIFFERS = frozenset({WEAKER, STRONGER, UNLIKE})
-ENOUGH = 20  # trials with an outcome; with fewer of them a headline says nothing of likeness
-TOO_FEW = f"Too few trials finished for a verdict (at least {ENOUGH}, and half of all, are needed)"
+ENOUGH = 20  # trials with an outcome; fewer, or fewer than half of those that ended, say nothing
+TOO_FEW = (
+    f"Too few trials without a crash for a verdict (at least {ENOUGH}, and half of all, are needed)"
+)
 ALPHA = 0.05  # that of all tests: to import it would take pandas, which no page needs
 # So far from people, in points and in m, a driver still is like them.
 MARGINS = {"collisions": 5.0, "gap": 1.0}
@@ -42,21 +44,29 @@ VERDICTS = {
     WEAKER: "less than people's",
     STRONGER: "more than people's",
     UNLIKE: "unlike people's",
-    OPEN: "cannot tell yet",
+    OPEN: "cannot tell",
 }
 DIRECTIONS = {
     "collisions": {WEAKER: "fewer than people's", STRONGER: "more than people's"},
     "gap": {WEAKER: "smaller than people's", STRONGER: "larger than people's"},
 }
-VERDICT_RULE = (
-    "like people: their pattern is found, with p below .05 in a regression over all its trials "
-    "(logistic for who goes first, linear for the gap by headway), or the whole interval of the "
-    "difference from people lies within 5 points (crashes), 1 m (gap, and how far relative "
-    "velocity moves it) or half a standard deviation (accelerations held). Less, more, unlike: a "
-    "difference from people is shown, with a p below .05 that is corrected for the number of the "
-    "driver's measures (Holm). Cannot tell yet: neither of the two; that is not “alike”. With "
-    f"fewer than {ENOUGH} trials there is no verdict"
+# The rule of a verdict, a line a state; ``{tests}`` is the number of a driver's tests, if known.
+VERDICT_RULES = (
+    "Like people in crashes or gap: the whole interval of the difference lies within 5 points, "
+    "or 1 m",
+    "Like people in who goes first: their pattern is found, with p below .05, by a logistic "
+    "regression (Firth) over all trials without a crash, not by the counts shown",
+    "Fewer, more, smaller, larger, unlike: a difference is shown, with p below .05, corrected "
+    "(Holm) for the driver's {tests}tests",
+    f"No verdict: fewer than {ENOUGH} trials, or fewer than half of those that ended",
+    "Cannot tell: neither likeness nor a difference is shown",
 )
+FITTED_RULE = (
+    "Like people in the gap by headway: more headway, more gap, with p below .05 in a linear "
+    "regression; by relative velocity: it moves the gap by less than 1 m; in accelerations held: "
+    "within half a standard deviation of people"
+)
+VERDICT_RULE = ". ".join((*VERDICT_RULES, FITTED_RULE)).format(tests="")
 # Measures that the first page shows, with its headings.
 HEADINGS = {
     "collisions": "Crashes",
@@ -64,6 +74,14 @@ HEADINGS = {
     "velocity": "Side by side, the slower goes first",
     "gap": "Gap at the merge point",
 }
+# What drivers that are like people do in them, and what there is no verdict on.
+LIKENESS = {
+    "collisions": ("crash as often as people", "crashes"),
+    "headway": ("let the one ahead go first, as people do", "who goes first with one ahead"),
+    "velocity": ("let the slower go first side by side, as people do",
+                 "who goes first side by side"),
+    "gap": ("leave gaps like people's", "the gap"),
+}  # fmt: skip
 # Names of metrics in sentences and pages; others keep the label of the table.
 METRIC_NAMES = {
     LEFT_FIRST.name: "goes first",
@@ -110,7 +128,7 @@ COMPARED = {
 # The collision rules that trials may be played by, as sentences name them, and their meaning.
 PLAYED_RULES = {
     "euclid2d": "the paper's rule",
-    "rectangle": "people's rule, checked at each time step",
+    "rectangle": "people's rule",
     "shared_lane": "the rule of the shared lane",
 }
 RULES_MEAN = {
@@ -118,24 +136,29 @@ RULES_MEAN = {
     "rectangle": "the vehicles' outlines overlap",
     "shared_lane": "the vehicles are less than a length apart once one is in the shared lane",
 }
-PEOPLES_RULE = "the vehicles' outlines overlap, checked 20 times a second"
+PEOPLES_RULE = "the vehicles' outlines overlap, checked every 0.05 s"
+CORRECTED = "p is corrected (Holm) for"
 # Of a rehearsal, with the planted effects.
 PLANTED = "planted in the scripted stand-in for this rehearsal"
 # The vehicle that going first is counted for: (subject of a sentence, its meaning).
 LEFT = (
     "the left driver",
-    "goes first: counted for the left driver, as both drivers are equal and get the same",
+    "goes first is counted for the left driver, as both drivers are equal and get the same",
 )
 EGO = (
     "the driver under study",
-    "goes first: counted for the driver under study (ego), the one that alone gets a level's words "
-    "or settings, else the one that is named first",
+    "goes first is counted for the driver under study. This is the one that alone gets a level's "
+    "words or settings, else the one named first",
 )
-HALVES = "where two equal drivers get the same, a trial counts half for each"
+HALVES = (
+    "Where two equal drivers get the same, a trial counts half for each, so that their share is "
+    "50 % by construction"
+)
 UNREADABLE = "the stored study cannot be read by this version"
 # Note on levels that no driver reads.
 SAME_TRIALS = "not tested: the same trials at both levels, as the drivers do not read what differs"
 MISSING, MINUS = "–", "−"
+FEW = 3  # of more levels or drivers than these the extremes alone are named
 TIMES = " × "  # between the factors of an interaction
 
 Values = Mapping[str, Any]
@@ -145,15 +168,14 @@ class Why(Enum):
     """Why a number is missing, or what is to be known of it, with places for its values."""
 
     # Fits; ``s`` makes a plural of the first value.
-    NO_FIRST = "no finished trial with a first merger"
-    NO_GAP = "no finished trial with a gap"
+    NO_FIRST = "no trial in which one went first without a crash"
+    NO_GAP = "no trial with a gap"
     FEW_FIRST = (
-        "{} finished trial{s} with a first merger, too few or in too few conditions to tell what "
-        "headway and speed do"
+        "{} trial{s} in which one went first without a crash, too few or in too few situations to "
+        "tell what headway and speed do"
     )
     FEW_GAPS = (
-        "{} finished trial{s} with a gap, too few or in too few conditions to tell what headway "
-        "and speed do"
+        "{} trial{s} with a gap, too few or in too few situations to tell what headway and speed do"
     )
     SAME_FIRST = "who merged first is the same in all {} trials: nothing to explain"
     SEPARATION = "separation: no finite estimate of {}; see Firth's fit"
@@ -187,7 +209,9 @@ class Why(Enum):
         "and {} %"
     )
     UNDECIDED_BOXES = (
-        UNDECIDED + '. A study whose [scenario] has collision_rule = "rectangle" decides them'
+        "by people's rule {0} to {1} of {2} trials crashed: {0} surely did, and of {3} that "
+        "another crash rule ended it is not known. A study played by people's rule (collision_rule "
+        '= "rectangle") decides them'
     )
     # Comparisons with humans.
     OF_HUMANS = "humans: {}"
@@ -363,13 +387,18 @@ SEEN_FIRST = ("collisions", "headway", "velocity", "gap", "gap-headway", "gap-ve
 def by_group(rows: Iterable[Any]) -> dict[str, dict[str, Values]]:
     """Return the values of a table's rows by the id of their driver and prompt, and by measure.
 
-    ``row`` and ``note`` are added. A group that is not judged has one entry, without a measure.
+    ``row``, ``note`` and how many trials ``ended`` are added. A group that is not judged has
+    one entry, without a measure.
     """
-    groups: dict[str, dict[str, Values]] = {}
+    groups: dict[str, dict[str, dict[str, Any]]] = {}
     for row in rows:
         values = {**row.values, "note": row.note, "row": row.id}
         groups.setdefault(row.groups[0], {})[row.values.get("measure") or ""] = values
-    return groups
+    for verdicts in groups.values():
+        ended = _ended(verdicts["collisions"]) if "collisions" in verdicts else 0
+        for values in verdicts.values():
+            values["ended"] = ended
+    return {name: {**verdicts} for name, verdicts in groups.items()}
 
 
 def sentences(rows: Iterable[Any]) -> list[str]:
@@ -406,7 +435,7 @@ def sentence(verdicts: Mapping[str, Values]) -> str:
         if shown_state(verdicts[name]) == OPEN
     ]
     if unclear:
-        parts.append(f"cannot tell yet: {'; '.join(unclear)}")
+        parts.append(f"cannot tell: {'; '.join(unclear)}")
     text = ". ".join(capital(part) for part in parts if part)
     return f"{text or 'Nothing can be compared with people'}."
 
@@ -431,8 +460,7 @@ def _more(values: Values) -> str:
 def crashes(values: Values) -> str:
     """Return the crashes by the rule that was played, then by the humans' where they differ.
 
-    ``crashed in 15 of 22 trials; people in 28 of 990``, or empty where no trial ended. Undecided
-    trials are counted apart.
+    ``crashed in 15 of 22 trials; people in 28 of 990``, or empty where no trial ended.
     """
     k, undecided = values.get("k") or 0, values.get("undecided") or 0
     ended = (values["n"] or 0) + undecided
@@ -442,7 +470,7 @@ def crashes(values: Values) -> str:
     text = f"crashed in {seen} trials"
     if undecided:
         rule = values.get("counted_by") or PLAYED_RULES["shared_lane"]
-        text += f" by {rule}; by people's rule {k} surely did, {undecided} cannot be told"
+        text += f" by {rule}, in {k} to {k + undecided} by people's rule"
     people = values.get("human_counted")
     if shown_state(values) in DIFFERS:
         than = f" ({people})" if people else ""
@@ -450,10 +478,12 @@ def crashes(values: Values) -> str:
     return f"{text}; people in {people}" if people else text
 
 
-def crash_text(rules: Sequence[str]) -> str:
-    """Return the meaning of a crash by the collision rules that were played."""
+def crash_text(rules: Sequence[tuple[str, Sequence[float]]]) -> str:
+    """Return the meaning of a crash by the collision rules that were played, with their steps."""
     return " or, by the scenario of the trial, ".join(
-        f"{RULES_MEAN[rule]} ({PLAYED_RULES[rule]})" for rule in rules
+        f"{RULES_MEAN[rule]}, checked every {' or '.join(map('{:g}'.format, steps_s))} s "
+        f"({PLAYED_RULES[rule]})"
+        for rule, steps_s in rules
     )
 
 
@@ -521,13 +551,18 @@ def share(collisions: Values) -> str:
     return f"{least} to {number(_percent(collisions, k + undecided))}" if undecided else least
 
 
+def _suffice(trials: int, ended: int) -> bool:
+    """Return whether so many trials, of those that ended, are enough for a verdict."""
+    return trials >= ENOUGH and 2 * trials >= ended
+
+
 def shown_state(values: Values) -> str:
-    """Return a state as sentences and marks show it: fewer than ENOUGH trials are inconclusive.
+    """Return a state as sentences and marks show it: too few trials are inconclusive.
 
     One of MARGINS within which a difference surely lies is like people's, else it has a direction.
     """
     state = str(values.get("state") or "")
-    if state and (values.get("n") or 0) < ENOUGH:
+    if state and not _suffice(values.get("n") or 0, values.get("ended") or 0):
         return OPEN
     if _is_within(values):
         return SHOWN
@@ -570,30 +605,45 @@ def headline(drivers: Mapping[str, Mapping[str, Values]]) -> tuple[str, str]:
 
 
 def _without_models(drivers: Mapping[str, Mapping[str, Values]]) -> tuple[str, str]:
-    """Return in how many drivers each measure is like people's, and who drove."""
+    """Return how many drivers are like people in each measure, and the extremes of several."""
     kinds = {_kind(of) for of in drivers.values()}
-    names = {PROGRAM: "programs", MOCK: "scripted stand-ins"}
-    who = "No language model drove here."
-    if LANGUAGE_MODEL in kinds:
-        who = "No language model is judged here."
-    elif drove := [name for kind, name in names.items() if kind in kinds]:
-        who = f"Only {joined(drove)} drove here; they tell nothing about a language model."
-    compared = [of for of in drivers.values() if "" not in of]
-    return (_tally(compared), who) if len(compared) > 1 else (who, "")
+    who = f"No language model {'is judged' if LANGUAGE_MODEL in kinds else 'drove'} here."
+    compared = {name: of for name, of in drivers.items() if "" not in of}
+    if len(compared) < 2:
+        return who, ""
+    return _tally([*compared.values()]), " ".join(filter(None, (_extremes(compared), who)))
 
 
 def _tally(drivers: Sequence[Mapping[str, Values]]) -> str:
-    like, unclear = [], []
-    for name, heading in HEADINGS.items():
+    like, unclear = list[str](), list[str]()
+    for name, (does, what) in LIKENESS.items():
         states = [shown_state(of[name]) for of in drivers if name in of]
         if {*states} <= {"", OPEN}:
-            unclear.append(f"“{heading}”")
+            unclear.append(what)
         else:
-            like.append(f"{states.count(SHOWN) or 'none'} in “{heading}”")
+            who = " drivers" * (not like)
+            like.append(f"{states.count(SHOWN) or 'none'} of {len(drivers)}{who} {does}")
     if not like:
-        return f"Whether {len(drivers)} drivers are like people cannot be told yet."
-    rest = f"; cannot be told yet: {', '.join(unclear)}" if unclear else ""
-    return f"Like people, of {len(drivers)} drivers: {', '.join(like)}{rest}."
+        return f"Whether {len(drivers)} drivers are like people cannot be told."
+    rest = f" No verdict is possible on {joined(unclear)}." if unclear else ""
+    return f"{capital('; '.join(like))}.{rest}"
+
+
+def _extremes(drivers: Mapping[str, Mapping[str, Values]]) -> str:
+    """Return the fewest and most crashes, and the smallest and largest gap, of many drivers."""
+    crashed, gaps = {}, {}
+    for name, of in drivers.items():
+        if counted := of.get("collisions", {}).get("counted"):
+            k, n = map(int, counted.split(" of "))
+            crashed[f"{counted} trials ({name})"] = k / n
+        if (gap := of.get("gap", {}).get("estimate")) is not None:
+            gaps[f"{number(gap)} m ({name})"] = gap
+    parts = [
+        f"{what} from {min(of, key=lambda text: of[text])} to {max(of, key=lambda text: of[text])}"
+        for what, of in (("crashes range", crashed), ("mean gaps", gaps))
+        if len(of) > FEW and len({*of.values()}) > 1
+    ]
+    return f"{capital(', '.join(parts))}." if parts else ""
 
 
 def _likeness(drivers: Mapping[str, Mapping[str, Values]], *, every: bool) -> tuple[str, str]:
@@ -610,10 +660,10 @@ def _likeness(drivers: Mapping[str, Mapping[str, Values]], *, every: bool) -> tu
     name = min(unlike, key=lambda name: _seen_first(unlike[name][0]))
     worst = unlike[name][0]
     if len(drivers) == 1 or alike:
-        claim = f"{name} does not drive like people: {difference_sentence(worst, 'it')}."
+        claim = f"{name} differs from people: {difference_sentence(worst, 'it')}."
     else:
-        who = "No language model here drives" if every else f"{joined([*drivers])} do not drive"
-        claim = f"{who} like people: {difference_sentence(worst, name)}."
+        who = "All language models here" if every else joined([*drivers])
+        claim = f"{who} differ from people: {difference_sentence(worst, name)}."
     if alike:
         untold.insert(0, f"No difference from people is shown for {joined(alike)}.")
     return claim, " ".join(untold)
@@ -632,8 +682,7 @@ def _differing(verdicts: Mapping[str, Values]) -> list[Values]:
 
 def _most(values: Values, verdicts: Mapping[str, Values]) -> bool:
     """Return whether a measure rests on trials enough, and on half of those that ended at least."""
-    n = values["n"] or 0
-    return n >= ENOUGH and 2 * n >= _ended(verdicts["collisions"])
+    return _suffice(values["n"] or 0, _ended(verdicts["collisions"]))
 
 
 def _ended(collisions: Values) -> int:
@@ -651,13 +700,13 @@ def _enough(verdicts: Mapping[str, Values]) -> bool:
     A driver that differs in measures of too few trials alone is not said to be alike.
     """
     outcomes = _finished(verdicts) + (verdicts["collisions"].get("k") or 0)
-    if outcomes < ENOUGH or 2 * outcomes < _ended(verdicts["collisions"]):
+    if not _suffice(outcomes, _ended(verdicts["collisions"])):
         return False
     return bool(_differing(verdicts)) or not any(map(differs, verdicts.values()))
 
 
 def _too_few(drivers: Mapping[str, Mapping[str, Values]], *, alone: bool) -> str:
-    """Return how many trials of each driver finished, of those that ended."""
+    """Return how many trials of each driver had no crash, of those that ended."""
     counts = [
         f"{'' if alone else name} {_finished(of)} of {_ended(of['collisions'])}".strip()
         for name, of in drivers.items()
@@ -720,9 +769,10 @@ def equal_p(p: float) -> str:
 
 def verdict_word(values: Values) -> str:
     """Return a state in words, as it stands in a list of verdicts."""
-    is_few = values.get("state") and (values.get("n") or 0) < ENOUGH
+    n = values.get("n") or 0
+    is_few = values.get("state") and not _suffice(n, values.get("ended") or 0)
     if is_few and not values.get("undecided"):
-        return f"fewer than {ENOUGH} trials"
+        return f"fewer than {ENOUGH} trials" if n < ENOUGH else "too few without a crash"
     words = VERDICTS | DIRECTIONS.get(str(values.get("measure")), {})
     return words.get(shown_state(values), "not compared")
 

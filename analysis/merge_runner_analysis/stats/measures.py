@@ -134,9 +134,10 @@ def undecided_note(group: Group, metric: Metric) -> Fact | None:
         return None
     k, n = counts(group, metric)
     every = n + cut_off
-    why = Why.UNDECIDED_BOXES if metric is BOXES else Why.UNDECIDED
+    if metric is BOXES:
+        return Fact(Why.UNDECIDED_BOXES, (k, k + cut_off, every, cut_off))
     ends = 100 * k / every, 100 * (k + cut_off) / every
-    return Fact(why, (metric.heading, cut_off, every, *ends))
+    return Fact(Why.UNDECIDED, (metric.heading, cut_off, every, *ends))
 
 
 def known(group: Group, metric: Metric) -> bool:

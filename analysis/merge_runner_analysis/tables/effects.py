@@ -18,7 +18,6 @@ from merge_runner_analysis.metrics import (
 )
 from merge_runner_analysis.stats.effects import (
     Effect,
-    asks_of_models,
     driver_effects,
     effects,
     primary,
@@ -31,7 +30,15 @@ from merge_runner_analysis.stats.measures import undecided_note
 from merge_runner_analysis.stats.sides import cells_seen, level_estimate
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Value, interval
-from merge_runner_analysis.wording import PLANTED, SAME_TRIALS, TIMES, note_of
+from merge_runner_analysis.wording import (
+    CORRECTED,
+    METRIC_NAMES,
+    PLANTED,
+    SAME_TRIALS,
+    TIMES,
+    joined,
+    note_of,
+)
 
 TEST = "of the test of Mantel and Haenszel, or of Welch's"
 UNTESTED = (
@@ -214,12 +221,13 @@ def _notes(study: Study, by: str) -> Iterator[str]:
         "factor, in the cells that all four have"
     )
     if tested:
-        without = "" if asks_of_models(study) else ", without those of the model"
-        yield (
-            "p, corrected: by Holm in two families. The effects of factors on "
-            f"{primary(study).heading}, the primary measure, are one{without}; all others are "
-            "the other one. detectable: found at p < .05, before correction, with power .8"
-        )
+        measure, (of_primary, others) = primary(study), _families(study, by)
+        name = METRIC_NAMES.get(measure.name, measure.heading)
+        first = f"the {len(of_primary)} test{'s' * (len(of_primary) != 1)} of “{name}”"
+        rest = f"the {others} others together"
+        names = f" by {joined([*dict.fromkeys(of_primary)])}" if of_primary else ""
+        yield f"{CORRECTED} {first}{names}, and apart from them for {rest}"
+        yield "detectable: found at p < .05, before correction, with power .8"
     counts = [
         f"{level.id}: {level.pooled.repeated} of {len(level.pooled.stored.trials)}"
         for level in chain.from_iterable(every)
@@ -234,16 +242,29 @@ def _notes(study: Study, by: str) -> Iterator[str]:
     yield RULES_NOTE
 
 
+def _families(study: Study, by: str) -> tuple[list[str], int]:
+    """Return the factors of the tests of the primary measure, and the number of the others."""
+    tested = [
+        effect
+        for effect in effects(study, by)
+        if effect.difference.p is not None
+        and (effect.difference.se or effect.difference.value)
+        and not (by and effect.across)
+    ]
+    of_primary = [effect.factor for effect in tested if effect.primary]
+    return of_primary, len(tested) - len(of_primary)
+
+
 def _planted(study: Study) -> list[str]:
     """Return the effects of words that a study plants in the mock models that drove."""
     planted = []
     for factor, levels in texts_of(study).items() if any(g.scripted for g in study.models) else ():
         for level, text in levels.items():
             if more := text.emulator.own_first:
-                even = 100 / (1 + exp(-more))
+                even, sure = (100 / (1 + exp(-more) / odds) for odds in (1, 19))
                 planted.append(
-                    f"{factor}={level} adds {more:g} to the log-odds that the driver with these "
-                    f"words goes first (an even chance becomes {even:.0f} %)"
+                    f"{factor}={level} turns a 50 % chance of going first into {even:.0f} %, and "
+                    f"95 % into {sure:.0f} %"
                 )
             if gap_m := text.emulator.gap_m:
                 planted.append(f"{factor}={level} adds {gap_m:g} m to the gap that drivers aim at")

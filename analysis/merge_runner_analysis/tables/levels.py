@@ -13,7 +13,7 @@ from merge_runner_analysis.stats.measures import counts, estimate
 from merge_runner_analysis.stats.sides import level_estimate, one_sided
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.model import ENDED, Column, Optional, Row, Table, Value, interval
-from merge_runner_analysis.wording import EGO, HALVES, LEFT, TIMES, note_of
+from merge_runner_analysis.wording import EGO, HALVES, LEFT, TIMES
 
 # More crossings than these are no chart.
 MOST_CROSSINGS = 8
@@ -55,7 +55,7 @@ def _counted_driver(study: Study) -> str:
     is_equal = all((of["model_left"] == of["model_right"]).all() for of in trials)
     if is_equal and all(of["focal"].isna().all() for of in trials):
         return LEFT[1]
-    return note_of(EGO[1], HALVES * one_sided(study))
+    return f"{EGO[1]}. {HALVES}" if one_sided(study) else EGO[1]
 
 
 def varied(study: Study) -> tuple[str, ...]:

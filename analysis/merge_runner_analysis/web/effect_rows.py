@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from math import floor, log10
 from typing import Any
 
+from merge_runner_analysis.metrics import DECIMALS
 from merge_runner_analysis.tables.model import Row
 from merge_runner_analysis.web.marks import Mark
 from merge_runner_analysis.wording import (
@@ -18,6 +20,7 @@ from merge_runner_analysis.wording import (
     number,
 )
 
+MOST_DECIMALS = 4
 NO_BREAK = "\N{NO-BREAK SPACE}"
 MIDDLE = Mark("", None, None, zero=50.0)  # no difference, on the axis of differences
 
@@ -71,7 +74,13 @@ def amount(row: Row, value: float) -> str:
 
 def interval_text(row: Row) -> str:
     """Return ``[6.06, 19.60]``, or nothing."""
-    return brackets(interval_of(row), money if unit_of(row) == "USD" else number)
+    if unit_of(row) == "USD":
+        return brackets(interval_of(row), money)
+    ends = interval_of(row)
+    # An end that is not 0 does not read as 0.
+    least = min((abs(end) for end in ends or () if end), default=1.0)
+    decimals = min(max(DECIMALS, -floor(log10(2 * least))), MOST_DECIMALS)
+    return brackets(ends, lambda end: number(end, decimals))
 
 
 def test_text(row: Row) -> str:

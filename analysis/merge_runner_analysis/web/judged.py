@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from merge_runner.config import ScenarioConfig
-from merge_runner_analysis.metrics import BOXES
 from merge_runner_analysis.published import HUMAN, human_counts
 from merge_runner_analysis.tables.model import Table
 from merge_runner_analysis.web.marks import Cell, band, cells, measures_of
@@ -41,9 +40,10 @@ FROM listed JOIN specs USING (spec_hash) GROUP BY ALL
 """
 # The collision rules by which drivers with prompts were played; $2 is the default one.
 RULES = """
-SELECT DISTINCT coalesce(spec->>'$.scenario.collision_rule', $2) AS rule
+SELECT coalesce(spec->>'$.scenario.collision_rule', $2) AS rule,
+    list_sort(list(DISTINCT coalesce((spec->>'$.scenario.step_s')::DOUBLE, $3))) AS steps_s
 FROM listed LEFT JOIN specs USING (spec_hash)
-WHERE list_contains($1::VARCHAR[], model || '/' || variant) ORDER BY rule
+WHERE list_contains($1::VARCHAR[], model || '/' || variant) GROUP BY rule ORDER BY rule
 """
 
 
@@ -143,14 +143,20 @@ def by_kind(drivers: Sequence[Driver]) -> dict[str, list[Driver]]:
     return {kind: [driver for driver in drivers if driver.kind == kind] for kind in KINDS}
 
 
-def noted(drivers: Sequence[Driver], headings: Mapping[str, str]) -> list[tuple[str, str, str]]:
-    """Return the notes on numbers of the measures with a heading: driver, heading and note."""
-    return [
-        (driver.name, heading, capital(note.replace(f"{BOXES.heading}: ", "")))
-        for driver in drivers
-        for name, heading in headings.items()
-        if name in driver.cells and (note := str(driver.cells[name].values["note"]))
-    ]
+def noted(
+    drivers: Sequence[Driver], headings: Mapping[str, str], without: Mapping[str, str] | None = None
+) -> list[tuple[list[str], str, str]]:
+    """Return the notes on numbers of the measures with a heading: drivers, heading and note.
+
+    A measure ``without`` situations for it has one note, which is given.
+    """
+    names: dict[tuple[str, str], list[str]] = {}
+    for driver in drivers:
+        for name, heading in headings.items():
+            values = driver.cells[name].values if name in driver.cells else {}
+            if note := (without or {}).get(name) or values.get("note"):
+                names.setdefault((heading, capital(str(note))), []).append(driver.name)
+    return [(of, heading, note) for (heading, note), of in names.items()]
 
 
 def by_condition(site: Site, scope: Scope, drivers: Sequence[Driver]) -> dict[str, Any]:
@@ -166,10 +172,11 @@ def by_condition(site: Site, scope: Scope, drivers: Sequence[Driver]) -> dict[st
     played = {name for *key, name in counted if tuple(key) in [driver for _, driver in of]}
     names = ordered(played or known)
     played_by = ["/".join(key) for _, key in of]
-    rules = site.catalogue.ask(RULES, played_by, ScenarioConfig().collision_rule)
+    default = ScenarioConfig()
+    rules = site.catalogue.ask(RULES, played_by, default.collision_rule, default.step_s)
     return {
         "names": names,
-        "crash": crash_text([row["rule"] for row in rules]),
+        "crash": crash_text([(row["rule"], row["steps_s"]) for row in rules]),
         "humans": [known.get(name) for name in names],
         "rows": [(driver, [counted.get((*key, name)) for name in names]) for driver, key in of],
     }

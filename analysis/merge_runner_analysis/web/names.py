@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from inspect import getdoc
@@ -13,7 +14,8 @@ from merge_runner.records import SIDES
 
 # The programs that drove in the trials of a database, as their specs have them.
 PLAYED = """
-SELECT DISTINCT side->>'$.program' AS program, side->>'$.based_on' AS based_on
+SELECT DISTINCT side->>'$.program' AS program, side->>'$.based_on' AS based_on,
+    (SELECT list(DISTINCT config->>'$.study.plugins') FROM sweeps) AS plugins
 FROM (SELECT unnest([spec->'$.left', spec->'$.right']) AS side FROM specs SEMI JOIN listed
     USING (spec_hash))
 WHERE program IS NOT NULL ORDER BY ALL
@@ -22,7 +24,6 @@ PARTS = (
     (re.compile(r" (at [^\s+]+?)(?=/set\d+(?: |$)|[\s+]|$)"), "the server that the model ran on"),
     (re.compile(r"(/set\d+)"), "another series of samples of the same driver"),
     (re.compile(r" (\[[0-9a-f]{8}\])"), "with other settings of the task than its other trials"),
-    (re.compile(r"(\+)"), "between two different drivers: who goes first is said of the first one"),
     (re.compile(rf"\b({EMULATOR})\b"), "the scripted stand-in that comes with this program"),
     (re.compile(r"\b(random)\b"), "a scripted stand-in that answers by chance, whatever it reads"),
 )
@@ -47,27 +48,35 @@ def opponents_text(names: Iterable[str]) -> str:
     """Return whom the drivers of these names meet."""
     is_pair = {"+" in name for name in names}
     if is_pair == {False}:
-        return "Each driver here meets a copy of itself."
-    of_pair = "A name with + has both drivers of a pair."
-    alone = "A driver named alone meets a copy of itself."
+        return "Each driver here met a copy of itself."
+    of_pair = "A+B: driver A met driver B."
+    alone = "A driver named alone met a copy of itself."
     return " ".join([of_pair] * (True in is_pair) + [alone] * (False in is_pair))
 
 
 def names_mean(programs: Iterable[Mapping[str, Any]], drivers: Iterable[str]) -> dict[str, str]:
     """Return the meanings of programs, and of the parts of drivers' names."""
-    meanings = {of["program"]: program_text(of["program"], of.get("based_on")) for of in programs}
+    meanings = {
+        of["program"]: program_text(of["program"], of.get("based_on"), of.get("plugins") or ())
+        for of in programs
+    }
     for name in drivers:
         for pattern, meaning in PARTS:
             meanings |= dict.fromkeys(pattern.findall(name), meaning)
     return dict(sorted(meanings.items()))
 
 
-def program_text(name: str, based_on: str | None = None) -> str:
-    """Describe a program, as far as its plug-in is loaded here."""
+def program_text(name: str, based_on: str | None = None, plugins: Iterable[str] = ()) -> str:
+    """Describe a program: as it is loaded here, else as the text of a run's ``plugins`` has it."""
     if (program := PROGRAMS.get(name)) is not None:
         doc = (getdoc(program.driver) or "").partition("\n")[0].rstrip(".")
         text = program.meaning or doc or "a driver of a plug-in, which does not say what it does"
         return f"a program: {text}"
     if based_on and based_on in PROGRAMS:
         return f"a program, otherwise set than usual: {PROGRAMS[based_on].meaning}"
-    return f"{based_on} otherwise set" if based_on else "a driver of this study's own plug-in"
+    if based_on:
+        return f"{based_on} otherwise set"
+    known = re.compile(rf'register\(\s*"{re.escape(name)}",\s*Program\(\s*\w+,\s*"([^"]+)"')
+    texts = (text for files in plugins if files for text in json.loads(files).values())
+    match = next(filter(None, map(known.search, texts)), None)
+    return f"a program{f': {match[1]}' if match else ', defined in this study'}"

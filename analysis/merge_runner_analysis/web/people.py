@@ -13,10 +13,12 @@ from merge_runner_analysis.web.judged import Driver
 from merge_runner_analysis.web.marks import Cell
 from merge_runner_analysis.wording import (
     HEADINGS,
+    MARGINS,
     OPEN,
     SHOWN,
     STRONGER,
     UNLIKE,
+    VERDICT_RULES,
     WEAKER,
     brackets,
     number,
@@ -25,6 +27,13 @@ from merge_runner_analysis.wording import (
 )
 
 MARKS = {SHOWN: "●", STRONGER: "▲", WEAKER: "▼", UNLIKE: "✕", OPEN: "○"}
+
+# Notes on measures that no situation allows.
+UNPOSED = {
+    "headway": "In none of the situations that people drove, too, would one driver be ahead",
+    "velocity": "In none of the situations that people drove, too, are both side by side at "
+    "different speeds",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,17 +56,48 @@ def likeness_of(driver: Driver) -> dict[str, Likeness]:
     return {name: _likeness(driver.cells[name]) for name in HEADINGS if name in driver.cells}
 
 
-def could_see(drivers: Sequence[Driver]) -> str:
-    """Return the differences from people that four of five studies find; empty without any."""
-    parts = []
+def counted(driver: Driver) -> int | None:
+    """Return the number of a driver's trials that are compared, where it is not that of all."""
+    crashes = driver.cells["collisions"].values if "collisions" in driver.cells else {}
+    n = int(str(crashes.get("counted") or "0 of 0").split(" of ")[1])
+    is_all = driver.facts is not None and driver.facts["trials"] == n
+    return None if is_all or not driver.cells else n
+
+
+def could_see(drivers: Sequence[Driver], short: Mapping[str, str]) -> str:
+    """Return the least differences from people with 80 % power; empty without any."""
+    parts, unknown = [], ""
     for name, unit in {"collisions": "points in crashes", "gap": "m in the gap"}.items():
-        values = [driver.cells[name].values for driver in drivers if name in driver.cells]
-        sizes = [of["detectable"] for of in values if of.get("detectable") is not None]
+        values = [(short[of.name], of.cells[name].values) for of in drivers if name in of.cells]
+        sizes = {
+            driver: of["detectable"] for driver, of in values if of.get("detectable") is not None
+        }
         if sizes:
-            ends = dict.fromkeys(number(size) for size in (min(sizes), max(sizes)))
-            parts.append(f"{' to '.join(ends)} {unit}")
-    of_driver = ", depending on the driver" if any(" to " in part for part in parts) else ""
-    return unbroken(" or ".join(parts)) + of_driver
+            ends = dict.fromkeys(
+                (min(sizes, key=sizes.__getitem__), max(sizes, key=sizes.__getitem__))
+            )
+            shown = [
+                f"{number(sizes[driver])}{f' ({driver})' * (len(sizes) > 1)}" for driver in ends
+            ]
+            parts.append(f"{' to '.join(shown)} {unit}")
+        elif any(of.get("undecided") for _, of in values):
+            unknown = "; in crashes unknown, as another crash rule ended some trials"
+    return unbroken(", ".join(parts)) + unknown * bool(parts)
+
+
+def verdict_rules(drivers: Sequence[Driver], gap: Mapping[str, Any]) -> list[str]:
+    """Return the rule of a verdict, a line a state; ``gap`` is people's value."""
+    tests = {sum(c.values.get("p_holm") is not None for c in of.cells.values()) for of in drivers}
+    numbers = " to ".join(map(str, dict.fromkeys((min(tests, default=0), max(tests, default=0)))))
+    likeness, *others = (rule.format(tests=f"{numbers} ") for rule in VERDICT_RULES)
+    if ends := gap.get("ci"):
+        half = (ends[1] - ends[0]) / 2
+        if half > MARGINS["gap"] / 2:
+            likeness += (
+                f" (people's gap is known to ± {number(half)} m, by nine pairs: more trials hardly "
+                "help)"
+            )
+    return [likeness, *others]
 
 
 def _likeness(cell: Cell) -> Likeness:
@@ -67,12 +107,16 @@ def _likeness(cell: Cell) -> Likeness:
     if counted:
         k, n = map(int, str(counted).split(" of "))
         share = f"{number(100 * k / n)} %"
-        if values.get("undecided"):  # it is not by people's rule
-            share += f" by {values['counted_by']}"
+        if undecided := values.get("undecided"):  # it is not by people's rule
+            surely = values["k"] or 0
+            share += f" by {values['counted_by']}; {surely} to {surely + undecided} by people's"
         return Likeness(mark, word, k, n, unbroken(share), row)
     estimate = values.get("estimate")
     known = cell.measure.name == "gap" and estimate is not None
-    text = f"{number(estimate)} m {brackets(values.get('ci'))}".rstrip() if known else ""
+    ends = brackets(values.get("ci"))
+    if estimate is not None and ends == brackets((estimate, estimate)):
+        ends = "in every trial"
+    text = f"{number(estimate)} m {ends}".rstrip() if known else ""
     return Likeness(mark, word, None, None, unbroken(text), row)
 
 

@@ -40,8 +40,10 @@ from merge_runner_analysis.web.marks import Mark
 from merge_runner_analysis.web.names import short_names
 from merge_runner_analysis.wording import (
     CHANGED,
+    CORRECTED,
     EGO,
     ENOUGH,
+    FEW,
     LEFT,
     METRIC_NAMES,
     PLANTED,
@@ -55,8 +57,7 @@ from merge_runner_analysis.wording import (
 
 # Reason for equal trials at both levels with a mock model.
 UNREAD = "not tested: the scripted stand-in does not read it, and no effect is planted for it"
-# More levels that show nothing are counted, not listed.
-FEW = 3
+SEEN = (COLLISIONS.name, GAP.name, RMSE.name)  # the most visible measures, in this order
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +95,8 @@ class Answer:
 
     ``asked`` is the question in words, for a study that has none of its own; ``crossed`` a factor
     at whose levels another one may be shown. ``who`` says of which driver who goes first is
-    counted, and ``problem`` what is wrong with the stored study.
+    counted, ``corrected`` for which tests p is corrected, and ``problem`` what is wrong with the
+    stored study.
     """
 
     asked: str
@@ -104,6 +106,7 @@ class Answer:
     drivers: list[tuple[str, str]]
     counted: str
     who: str
+    corrected: str
     charts: list[Chart]
     crossed: str
     crossings: str
@@ -158,14 +161,15 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
         unbroken(rest),
         capital(name_of(primary)),
         [(short[driver], shape) for driver, shape in shapes.items()],
-        _counted(_of_one_factor(shown, drawn), metric),
+        _counted(_of_one_factor(shown, drawn), metric, effects.rows),
         capital(who),
+        next((note for note in effects.notes if note.startswith(CORRECTED)), ""),
         [chart for chart in charts if chart],
         OPPONENT if OPPONENT in names[1:] else names[-1] if len(names) > 1 else "",
         unbroken(_interactions(tested, {str(row.values["factor"]) for row in known})),
         _changes(tested, sides, metric),
         _changes(others, sides, metric),
-        unbroken(_could(tested)),
+        unbroken(_could([*tested, *others])),
         next((note for note in effects.notes if note.startswith(UNREADABLE)), ""),
     )
 
@@ -199,7 +203,7 @@ def answered(rows: Sequence[Row], driver: str = EGO[0], planted: str = "") -> tu
         counts = sorted(count_of(row, name) for row in few for name in ("n", "n_reference"))
         trials = " to ".join(dict.fromkeys(map(str, (counts[0], counts[-1]))))
         asked = f"whether {joined(_factors(few))} changes {what}"
-        return capital(f"{rehearsed}too few trials finished to say {asked}: {trials} a level."), ""
+        return capital(f"{rehearsed}too few trials to say {asked}: {trials} a level."), ""
     sure = [row for row in primary if is_shown(row)]
     rest = []
     if sure:
@@ -219,21 +223,22 @@ def answered(rows: Sequence[Row], driver: str = EGO[0], planted: str = "") -> tu
     ]
     rest += [f"{_named(row)} interact: {test_text(row)}." for row in crossed if is_shown(row)]
     also = [
-        row for row in tested if is_shown(row) and not is_interaction(row) and row not in primary
+        row
+        for row in tested
+        if is_shown(row) and not is_interaction(row) and row not in primary
+        and row.values["factor"] != MODEL and metric_of(row) in METRIC_NAMES
+    ]  # fmt: skip
+    also.sort(key=lambda row: (_seen_first(row), value_of(row, "p")))
+    rest += [
+        f"{capital(str(row.values['factor']))} changes {_changed(row)}: {_both(row, driver)}."
+        for row in [row for row in also if metric_of(row) in SEEN][:FEW] or also[: not sure]
     ]
-    also = [row for row in also if row.values["factor"] != MODEL and metric_of(row) in METRIC_NAMES]
-    if not sure and also:
-        row = min(also, key=lambda row: (_seen_first(row), value_of(row, "p")))
-        rest.append(
-            f"{capital(str(row.values['factor']))} changes {_changed(row)}: {_both(row, driver)}."
-        )
     return capital(claim), " ".join(filter(None, [*rest, *notes]))
 
 
 def _seen_first(row: Row) -> int:
     """Return the rank of an effect's measure: the most visible one is the first."""
-    seen = (COLLISIONS.name, GAP.name, RMSE.name)
-    return seen.index(metric_of(row)) if metric_of(row) in seen else len(seen)
+    return SEEN.index(metric_of(row)) if metric_of(row) in SEEN else len(SEEN)
 
 
 def _not_shown(rows: Sequence[Row]) -> Iterator[str]:
@@ -260,29 +265,39 @@ def _interactions(rows: Sequence[Row], drawn: set[str]) -> str:
 
 
 def _could(rows: Sequence[Row]) -> str:
-    """Return the minimum detectable effects of the primary measure, in sentences."""
-    main = [row for row in rows if row.values.get("primary")]
-    crossed = [row for row in rows if is_interaction(row)]
-    return " ".join(filter(None, (_seen(main), _seen(crossed, "An interaction"))))
+    """Return the minimum detectable effects by measure: ``goes first 4.26 points (hurry)``."""
+    names = dict.fromkeys(map(name_of, rows))
+    sizes = {name: _sizes([row for row in rows if name_of(row) == name]) for name in names}
+    return "; ".join(f"{name} {size}" for name, size in sizes.items() if size)
 
 
-def _seen(rows: Sequence[Row], what: str = "A change") -> str:
-    """Return ``A change of 4.26 points by hurry, 5.05 by opponent or more would have been ...``.
+def _seen(rows: Sequence[Row]) -> str:
+    """Return the minimum detectable effects in a sentence."""
+    sizes = _sizes(rows)
+    return f"The study had 80 % power for an effect of {sizes}." if sizes else ""
 
-    Of a factor with several levels it is the largest, and of more than FEW factors, too.
+
+def _sizes(rows: Sequence[Row]) -> str:
+    """Return the detectable effect of each factor, or of more than FEW the largest.
+
+    Of a factor with several levels it is the largest.
     """
-    known = [row for row in rows if row.values.get("detectable") is not None]
-    if not known:
-        return ""
-    least: dict[str, float] = {}
-    for row in known:
+    least: dict[str, Row] = {}
+    for row in rows:
         factor = str(row.values["factor"])
-        least[factor] = max(least.get(factor, 0.0), value_of(row, "detectable"))
-    sizes = {name: f"{amount(known[0], size)} {unit_of(known[0])}" for name, size in least.items()}
-    size = sizes[max(least, key=lambda name: least[name])]
-    if 1 < len(least) <= FEW:
-        size = ", ".join(f"{of} by {name}" for name, of in sizes.items())
-    return f"{what} of {size} or more would be shown by four of five such studies."
+        if row.values.get("detectable") is not None:
+            known = [row, *filter(None, [least.get(factor)])]
+            least[factor] = max(known, key=lambda row: value_of(row, "detectable"))
+    if not least:
+        return ""
+    if len(least) > FEW:
+        factor = max(least, key=lambda name: value_of(least[name], "detectable"))
+        least = {"any factor": least[factor]}
+    first, *others = (
+        (amount(row, value_of(row, "detectable")), f" ({factor})") for factor, row in least.items()
+    )
+    unit = unit_of(rows[0])
+    return ", ".join([f"{first[0]} {unit}{first[1] * bool(others)}", *map("".join, others)])
 
 
 def _factors(rows: Iterable[Row]) -> list[str]:
@@ -295,8 +310,8 @@ def _both(row: Row, driver: str) -> str:
     of, reference = (estimate_text(row, name) for name in ("estimate", "estimate_reference"))
     if metric_of(row) == LEFT_FIRST.name:
         return (
-            f"in the same situations, {driver} goes first in {of} with {factor}={level} and in "
-            f"{reference} with {factor}={_called(factor, base)}"
+            f"in the same situations and without a crash, {driver} goes first in {of} with "
+            f"{factor}={level} and in {reference} with {factor}={_called(factor, base)}"
         )
     return f"{of} with {factor}={level}, {reference} with {factor}={_called(factor, base)}"
 
@@ -351,8 +366,6 @@ def _change(row: Row, sides: dict[str, Row], end: float, primary: str) -> Change
             f"{second}={otherwise}"
         )
     detail = detail or (_called(factor, of) if is_own else f"{factor}: {_called(factor, of)}")
-    if is_own and row.values.get("primary"):
-        detail += ", primary test"
     return Change(
         capital(factor) if is_own else capital(name_of(row)),
         detail,
@@ -389,14 +402,17 @@ def _crossing_of(levels: Sequence[Row]) -> str:
     return f"In combination: {', '.join(crossed[0].split(TIMES))}" if crossed else ""
 
 
-def _counted(levels: Sequence[Row], metric: str) -> str:
+def _counted(levels: Sequence[Row], metric: str, effects: Sequence[Row]) -> str:
     """Return how many trials the measure counts, as in ``58 trials without a crash, 12 with one``.
 
-    Trials of equal drivers, words and course are one: ``80 that repeat another one are left out``.
+    Trials of equal drivers, words and course are one: ``80 that repeat another one are left out``,
+    with the levels that change nothing.
     """
     trials = f"{sum(count_of(row, 'n') for row in levels):,} trials"
     repeated = sum(count_of(row, "repeated") for row in levels)
-    left_out = f"; {repeated:,} that repeat another one are left out" if repeated else ""
+    copied = joined([level_text(row) for row in effects if is_copied(row)] or [""])
+    why = f" ({copied} changes nothing)" if copied else ""
+    left_out = f"; {repeated:,} that repeat another one{why} are left out" if repeated else ""
     crashed = sum(count_of(row, "crashed") for row in levels)
     what = " that ended" if metric == COLLISIONS.name else " that count"
     if metric == LEFT_FIRST.name:

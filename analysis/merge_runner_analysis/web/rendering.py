@@ -88,6 +88,7 @@ def environment(
         whole="{:,}".format,
         minus=lambda text: with_minus(str(text)),
         plain=plain,
+        capitalised=capital,
         used_terms=used_terms,
     )
     verdicts = {SHAPES[state]: words for state, words in VERDICTS.items()}

@@ -141,7 +141,7 @@ def ended_as(run: Row) -> str:
 def assessment_of(run: Row) -> tuple[str, str]:
     """Say whether a run is finished, and can be trusted: of what kind that is, and a sentence."""
     ended, planned, state, row = (run[name] for name in ("ended", "planned", "state", "row"))
-    counted = f"{ended} of {planned or '?'} trials"
+    counted = f"{ended} of {planned} trials" if planned else f"{ended} trials"
     failures = f", {run['failed']} failed" if run["failed"] else ""
     if state == "checking":
         return "running", f"Nearly done: {counted} ended{failures}; the audit runs."
@@ -153,7 +153,7 @@ def assessment_of(run: Row) -> tuple[str, str]:
         if ended < planned:
             text = f"It had finished, but the database holds only {ended} of its {planned} trials."
             return "stopped", text
-        text = f"Finished: all {ended} trials ended"
+        text = f"Complete: all {ended} trials ended"
         if why := not_judged(run["driver"], row["invalid"], row["asked"]):
             return "doubtful", f"{text}; {why}."
         troubles = {"failed requests (retried)": row["faults"], "invalid replies": row["invalid"]}
@@ -165,7 +165,7 @@ def assessment_of(run: Row) -> tuple[str, str]:
             return "doubtful", f"{text}; but another model gave {others} answers."
         return "finished", f"{text}."
     if state == "lost":
-        gone = "The run was cut off: its process is gone, or frozen."
+        gone = "The run was cut off: its process stopped or hangs."
         return "stopped", f"{gone} {counted} are stored{failures}."
     if reason := REASONS.get(row["exit_code"]):
         return "stopped", f"Stopped: {reason[0]}. {counted} have an outcome{failures}."

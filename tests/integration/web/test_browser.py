@@ -69,7 +69,9 @@ def judged_by(page, shape):
 
 def test_from_the_study_to_a_verdict_and_to_why_the_worst_condition_collides_and_a_note(page, db):
     page.goto("/")
-    words = "Too few trials finished for a verdict (at least 20, and half of all, are needed): "
+    words = (
+        "Too few trials without a crash for a verdict (at least 20, and half of all, are needed): "
+    )
     expect(page.locator(".answer")).to_contain_text(words, timeout=2000 * HANGS_S)
     page.locator("#answers").get_by_role("rowheader", name="smollm2").get_by_role(
         "link"
@@ -403,7 +405,7 @@ def held_server(tmp_path):
 def test_a_sweep_is_followed_to_its_end_without_a_reload(page, tmp_path, held_server, monkeypatch):
     monkeypatch.setattr(computing, "STANDS_S", 0.0)
     url, let_go = held_server
-    db, ended = tmp_path / "merge.duckdb", "Finished: all 2 trials ended"
+    db, ended = tmp_path / "merge.duckdb", "Complete: all 2 trials ended"
     sweep = subprocess.Popen(
         [PROGRAM, "sweep", "baseline", "--reps", "1", "--conditions", "L_4_0,N_0_0", "--db", db],
         cwd=tmp_path, env=environment(EMULATOR_BASE_URL=url),

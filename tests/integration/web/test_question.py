@@ -157,7 +157,7 @@ def test_likeness_to_people_is_said_in_counts_that_lead_to_their_trials(db):
         # Numbers of all prompts are not narrowed by one; which one is compared is said beside it.
         assert 'name="variant"' not in text
         assert 'name="model"' not in text
-        assert "Prompt Baseline, beside 990 trials" in Page(text).text
+        assert "Prompt Baseline. With other prompts: " in Page(text).text
 
 
 def test_the_gap_of_people_is_that_of_the_situations_that_were_played(db):
@@ -208,8 +208,8 @@ def test_the_first_screen_answers_a_study_of_two_factors(page, db, outcomes):
     slope = 100 * fitted(every, "hurry", ("persona", "opponent"))["C(hurry)[T.yes]"]
     beside = page.locator("main").inner_text().replace("\N{NO-BREAK SPACE}", " ")
     assert f"The difference is +{slope:.2f} points" in beside
-    assert "persona=taxi adds 0.2 to the log-odds" in beside
-    assert "(an even chance becomes 82 %)" in beside
+    assert "persona=taxi turns a 50 % chance of going first into 55 %, and 95 % into 96 %" in beside
+    assert "chance of going first into 82 %, and 95 % into 99 %" in beside
     (shown,) = re.findall(r"(\d+) trials without a crash, (\d+) with one", beside)
     assert sum(map(int, shown)) == query(db, "SELECT count(*) FROM trials")[1][0][0]
     shares = [float(share) for share in re.findall(r"(\d+\.\d\d) %", said)]

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from merge_runner_analysis.tables.model import Row
 from merge_runner_analysis.wording import (
     DIFFERS,
     LANGUAGE_MODEL,
@@ -17,6 +18,7 @@ from merge_runner_analysis.wording import (
     SHOWN,
     TOO_FEW,
     apart,
+    by_group,
     crash_text,
     crashes,
     difference_sentence,
@@ -30,7 +32,8 @@ from merge_runner_analysis.wording import (
 PEOPLE = {"headway": "675 of 704", "velocity": "158 of 173", "collisions": "28 of 990"}
 # What says that a driver differs from people, and in which direction.
 DIRECTION = re.compile(
-    r"\b(more|less|fewer|larger|smaller|otherwise)\b|does not (drive|yield|decide|add)|moves"
+    r"\b(more|less|fewer|larger|smaller|otherwise)\b|does not (yield|decide|add)|moves|"
+    "differs? from people:"
 )
 
 
@@ -72,26 +75,25 @@ WILD = driver(86, collisions="unlike", gap="unlike", collided=24)
         ),
         (
             {"wild": WILD},
-            "wild does not drive like people: it crashed in 24 of 110 trials, people in 28 of 990.",
+            "wild differs from people: it crashed in 24 of 110 trials, people in 28 of 990.",
             "",
         ),
         ({"o3": driver()}, "No difference from people is shown for o3.", ""),
         (
             {"o3": driver(headway="weaker", gap="unlike")},
-            "o3 does not drive like people: with it the one ahead went first in 75 of 78 trials, "
-            "with people in 675 of 704.",
+            "o3 differs from people: with it the one ahead went first in 75 of 78 trials, with "
+            "people in 675 of 704.",
             "",
         ),
         (
             {"o3": driver(gap="unlike", undecided=33)},
-            "o3 does not drive like people: it left a gap of 1.00 [0.50, 1.50] m, people of 2.00 "
-            "m.",
-            "o3 crashed in 33 of 143 trials by the paper's rule; by people's rule 0 surely did, "
-            "33 cannot be told; people in 28 of 990.",
+            "o3 differs from people: it left a gap of 1.00 [0.50, 1.50] m, people of 2.00 m.",
+            "o3 crashed in 33 of 143 trials by the paper's rule, in 0 to 33 by people's rule; "
+            "people in 28 of 990.",
         ),
         (
             {"o3": driver(), "wild": WILD},
-            "wild does not drive like people: it crashed in 24 of 110 trials, people in 28 of 990.",
+            "wild differs from people: it crashed in 24 of 110 trials, people in 28 of 990.",
             "No difference from people is shown for o3.",
         ),
     ],
@@ -107,35 +109,40 @@ def of_kind(kind, **states):
 
 UNJUDGED = {"": {"kind": LANGUAGE_MODEL, "note": "not judged: why"}}
 OPEN_GAP, SHOWN_HEADWAY = of_kind("mock", gap=OPEN), of_kind(PROGRAM, headway=SHOWN)
-ONLY = "drove here; they tell nothing about a language model."
+NONE = "No language model drove here."
 
 
 @pytest.mark.parametrize(
     ("drivers", "says"),
     [
         ([UNJUDGED, OPEN_GAP], ["No language model is judged here.", ""]),
-        ([OPEN_GAP], [f"Only scripted stand-ins {ONLY}", ""]),
+        ([OPEN_GAP], [NONE, ""]),
         (
             [OPEN_GAP, SHOWN_HEADWAY],
             [
-                "Like people, of 2 drivers: 1 in “The one ahead goes first”; cannot be told yet: "
-                "“Crashes”, “Side by side, the slower goes first”, “Gap at the merge point”.",
-                f"Only programs and scripted stand-ins {ONLY}",
+                "1 of 2 drivers let the one ahead go first, as people do. No verdict is possible "
+                "on crashes, who goes first side by side and the gap.",
+                NONE,
             ],
         ),
         (
             [of_kind(PROGRAM, headway="unlike"), of_kind(PROGRAM, collisions="unlike")],
             [
-                "Like people, of 2 drivers: none in “Crashes”, none in “The one ahead goes "
-                "first”; cannot be told yet: “Side by side, the slower goes first”, “Gap at the "
-                "merge point”.",
-                f"Only programs {ONLY}",
+                "None of 2 drivers crash as often as people; none of 2 let the one ahead go "
+                "first, as people do. No verdict is possible on who goes first side by side and "
+                "the gap.",
+                NONE,
             ],
         ),
         (
             [OPEN_GAP, {"headway": row("headway", n=19, kind="mock")}],
-            ["Whether 2 drivers are like people cannot be told yet.",
-             f"Only scripted stand-ins {ONLY}"],
+            ["Whether 2 drivers are like people cannot be told.", NONE],
+        ),
+        (
+            [of_kind(PROGRAM, gap=OPEN) | {"collisions": row("collisions", n=11, counted=counted)}
+             for counted in ("11 of 11", "2 of 10", "1 of 11", "0 of 9")],
+            ["Whether 4 drivers are like people cannot be told.",
+             f"Crashes range from 0 of 9 trials (d3) to 11 of 11 trials (d0). {NONE}"],
         ),
     ],
 )  # fmt: skip
@@ -164,10 +171,11 @@ def test_two_drivers_are_told_apart_with_names_and_numbers():
 
 
 def test_a_crash_is_explained_by_the_rules_that_were_played():
-    assert crash_text(["rectangle"]) == (
-        "the vehicles' outlines overlap (people's rule, checked at each time step)"
+    assert crash_text([("rectangle", [0.05, 0.2])]) == (
+        "the vehicles' outlines overlap, checked every 0.05 or 0.2 s (people's rule)"
     )
-    assert " or, by the scenario of the trial, " in crash_text([*RULES_MEAN])
+    both = crash_text([(rule, [0.2]) for rule in RULES_MEAN])
+    assert " or, by the scenario of the trial, " in both
     assert PLAYED_RULES.keys() == RULES_MEAN.keys()
 
 
@@ -195,7 +203,7 @@ def test_of_few_outcomes_a_headline_says_the_counts_alone(of, counts):
 @pytest.mark.parametrize("of", [(20, 0), (16, 4), (0, 20)])
 def test_who_collides_has_an_outcome_too(of):
     claim, _ = headline({"gpt": driver(of[0], collided=of[1], collisions="unlike")})
-    assert claim.startswith("gpt does not drive like people: it crashed in")
+    assert claim.startswith("gpt differs from people: it crashed in")
 
 
 def test_crashes_that_another_rule_decides_are_said_by_both():
@@ -203,24 +211,30 @@ def test_crashes_that_another_rule_decides_are_said_by_both():
     assert crashes(of) == "crashed in 2 of 10 trials; people in 5 of 90"
     cut_off = of | {"undecided": 4, "counted": "6 of 14", "counted_by": PLAYED_RULES["euclid2d"]}
     assert crashes(cut_off) == (
-        "crashed in 6 of 14 trials by the paper's rule; by people's rule 2 surely did, 4 cannot "
-        "be told; people in 5 of 90"
+        "crashed in 6 of 14 trials by the paper's rule, in 2 to 6 by people's rule; people in 5 of "
+        "90"
     )
 
 
-@pytest.mark.parametrize(("n", "says"), [(19, "fewer than 20 trials"), (20, "unlike people's")])
-def test_no_verdict_is_shown_of_too_few_trials(n, says):
-    of = row("headway", "unlike", n=n)
-    assert verdict_word(of) == says
+@pytest.mark.parametrize(
+    ("n", "says"),
+    [(19, "fewer than 20 trials"), (20, "too few without a crash"), (28, "smaller than people's")],
+)
+def test_a_cell_has_no_verdict_where_the_headline_has_none(n, says):
+    values = driver(n, collided=55 - n, gap="unlike")
+    rows = [Row(name, ("gpt/baseline",), values[name]) for name in ("collisions", "gap")]
+    of = by_group(rows)["gpt/baseline"]
+    assert verdict_word(of["gap"]) == says
+    assert headline({"gpt": values})[0].startswith(TOO_FEW) is (n < 28)
 
 
 def test_several_drivers_are_told_together():
     few = {"gpt": driver(7, undecided=15), "o4": driver(2)}
     assert headline(few)[0] == f"{TOO_FEW}: gpt 7 of 22 and o4 2 of 2."
     both = {"a": WILD, "b": WILD}
-    crashed = "like people: a crashed in 24 of 110 trials, people in 28 of 990."
-    assert headline(both)[0] == f"No language model here drives {crashed}"
-    assert headline({**both, **few})[0] == f"a and b do not drive {crashed}"
+    crashed = "from people: a crashed in 24 of 110 trials, people in 28 of 990."
+    assert headline(both)[0] == f"All language models here differ {crashed}"
+    assert headline({**both, **few})[0] == f"a and b differ {crashed}"
 
 
 @pytest.mark.parametrize(
@@ -229,8 +243,8 @@ def test_several_drivers_are_told_together():
         (driver(95, collided=15), "crashed in 15 of 110 trials; people in 28 of 990"),
         (
             driver(7, collided=3, undecided=12),
-            "crashed in 15 of 22 trials by the paper's rule; by people's rule 3 surely did, 12 "
-            "cannot be told; people in 28 of 990",
+            "crashed in 15 of 22 trials by the paper's rule, in 3 to 15 by people's rule; people "
+            "in 28 of 990",
         ),
         (
             driver(109, collided=1, collisions="unlike"),
@@ -265,7 +279,7 @@ def test_an_interval_beside_a_margin_names_its_level_where_that_is_not_95_percen
             "Crashed in 0 of 110 trials; people in 28 of 990. The one ahead goes first, as with "
             "people (the one ahead in 75 of 78 trials, people in 675 of 704). The faster one "
             "yields, as with people (side by side, the slower one in 16 of 19 trials, people in "
-            "158 of 173). Cannot tell yet: crashes; mean gap.",
+            "158 of 173). Cannot tell: crashes; mean gap.",
         ),
         (
             driver(headway="weaker"),

@@ -1,5 +1,7 @@
 """What the names on a page mean."""
 
+import json
+
 import pytest
 
 from merge_runner.drivers.registry import PROGRAMS, Program
@@ -33,7 +35,11 @@ def test_a_program_says_what_it_does_as_far_as_it_is_loaded():
     assert (
         program_text("fast", "constant") == "a program, otherwise set than usual: keeps its speed"
     )
-    assert program_text("hesitant") == "a driver of this study's own plug-in"
+    assert program_text("hesitant") == "a program, defined in this study"
+    text = 'PROGRAMS.register("hesitant", Program(Hesitant, "brakes a little"))'
+    assert program_text(
+        "hesitant", plugins=[json.dumps({"a.py": "", "plugin.py": text}), None]
+    ) == ("a program: brakes a little")
     assert program_text("strong", "hesitant") == "hesitant otherwise set"
     with collecting(Catalogue()) as own:
         PROGRAMS.register("hesitant", Program(Hesitant, ""))
@@ -51,7 +57,7 @@ def test_programs_are_those_of_the_specs():
 def test_the_parts_of_names_are_explained_once():
     drivers = ["bold at localhost:8123/set1", "bold at localhost:8123+idm [12ab34cd]", "emulator"]
     meanings = names_mean([{"program": "idm", "based_on": None}], drivers)
-    assert [*meanings] == ["+", "/set1", "[12ab34cd]", "at localhost:8123", "emulator", "idm"]
+    assert [*meanings] == ["/set1", "[12ab34cd]", "at localhost:8123", "emulator", "idm"]
 
 
 @pytest.mark.parametrize(
@@ -69,12 +75,11 @@ def test_a_server_is_named_only_where_it_tells_two_drivers_apart(names, shown):
     ("names", "says"),
     [
         ([], ""),
-        (["o3", "idm"], "Each driver here meets a copy of itself."),
-        (["o3+idm"], "A name with + has both drivers of a pair."),
+        (["o3", "idm"], "Each driver here met a copy of itself."),
+        (["o3+idm"], "A+B: driver A met driver B."),
         (
             ["o3", "o3+idm"],
-            "A name with + has both drivers of a pair. A driver named alone meets a copy of "
-            "itself.",
+            "A+B: driver A met driver B. A driver named alone met a copy of itself.",
         ),
     ],
 )

@@ -42,11 +42,11 @@ def copied(factor):
 
 
 HURRY = (
-    "Hurry changes who goes first: in the same situations, the driver under study goes first in "
-    "63.00 % with hurry=yes and in 50.00 % with hurry=no."
+    "Hurry changes who goes first: in the same situations and without a crash, the driver under "
+    "study goes first in 63.00 % with hurry=yes and in 50.00 % with hurry=no."
 )
 SAME = "The difference is +13.00 points [6.00, 20.00], corrected "
-SEEN = "A change of 10.00 points or more would be shown by four of five such studies."
+SEEN = "The study had 80 % power for an effect of 10.00 points."
 
 
 @pytest.mark.parametrize(
@@ -104,12 +104,11 @@ SEEN = "A change of 10.00 points or more would be shown by four of five such stu
             "No change of who goes first is shown by hurry and persona.",
             "Hurry=yes is not shown to change it: +13.00 points [6.00, 20.00], corrected p = "
             "0.200. Persona=yes is not shown to change it: +1.00 points [−6.00, 8.00], corrected p "
-            "= 0.300. A change of 10.00 points by hurry, 10.00 points by persona or "
-            "more would be shown by four of five such studies.",
+            f"= 0.300. {SEEN.rstrip('.')} (hurry), 10.00 (persona).",
         ),
         (
             [effect(n=12)],
-            "Too few trials finished to say whether hurry changes who goes first: 12 a level.",
+            "Too few trials to say whether hurry changes who goes first: 12 a level.",
             "",
         ),
     ],
@@ -169,7 +168,7 @@ def test_a_planted_effect_is_said_of_a_rehearsal_with_its_size(drivers, is_said)
 @pytest.mark.parametrize("who", [EGO, LEFT])
 def test_the_driver_that_goes_first_is_named_and_explained(who):
     made = answer([effect()], levels_of("hurry"), who[1])
-    assert f"situations, {who[0]} goes first in" in made.claim
+    assert f"without a crash, {who[0]} goes first in" in made.claim
     assert made.who == f"G{who[1][1:]}"
 
 
@@ -207,7 +206,8 @@ def test_levels_that_are_not_tested_are_not_drawn():
     assert [line.head for line in chart.lines] == ["hurry", ""]
     assert (
         made.counted
-        == "200 trials without a crash, 6 with one; 14 that repeat another one are left out"
+        == "200 trials without a crash, 6 with one; 14 that repeat another one (persona=yes "
+        "changes nothing) are left out"
     )
 
 
@@ -215,7 +215,7 @@ def test_an_interaction_names_the_levels_of_both_factors():
     crossed = {"level": "taxi × yes", "reference": "none × no"}
     made = answer([effect(), effect("persona × hurry", 0.4, **crossed)], levels_of("hurry"))
     main, interaction = made.changes
-    assert main.detail == "yes, primary test"
+    assert main.detail == "yes"
     assert interaction.detail == "effect of persona=taxi with hurry=yes, less that with hurry=no"
     assert (interaction.reference, interaction.level) == (None, None)
 

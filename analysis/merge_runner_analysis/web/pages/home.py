@@ -10,7 +10,14 @@ from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.effect_rows import MIDDLE
 from merge_runner_analysis.web.judged import Driver, by_condition, by_kind, humans_of, judged, noted
 from merge_runner_analysis.web.names import PLAYED, names_mean, opponents_text, short_names
-from merge_runner_analysis.web.people import could_see, likeness_of, people_of
+from merge_runner_analysis.web.people import (
+    UNPOSED,
+    could_see,
+    counted,
+    likeness_of,
+    people_of,
+    verdict_rules,
+)
 from merge_runner_analysis.web.question import Answer, answer_of
 from merge_runner_analysis.web.runs import standing_of
 from merge_runner_analysis.web.scope import Bar, Scope, descriptions_of, scope_of, unmarked
@@ -57,14 +64,25 @@ def _beside_people(
         or {"": {"kind": driver.kind}}
         for driver in drivers
     }
+    people = people_of(conditions, human)
+    unposed = {name: note for name, note in UNPOSED.items() if name not in people}
+    gap = human["cells"].get("gap")
+    is_undecided = any(of.cells["collisions"].values.get("undecided") for of in drivers if of.cells)
+    # Of crashes that are undecided the table has the bounds.
+    headings = {n: text for n, text in HEADINGS.items() if n != "collisions" or not is_undecided}
     return {
         "headline": headline(verdicts),
         "likeness": [
-            (driver, likeness_of(driver)) for kind in by_kind(drivers).values() for driver in kind
+            (driver, likeness_of(driver), counted(driver))
+            for kind in by_kind(drivers).values()
+            for driver in kind
         ],
+        "verdict_rules": verdict_rules(drivers, gap.values if gap else {}),
+        "is_undecided": is_undecided,
+        "notes": noted(drivers, headings, unposed),
         "likeness_headings": HEADINGS,
-        "people": people_of(conditions, human),
-        "could_see": could_see(drivers),
+        "people": people,
+        "could_see": could_see(drivers, short),
     }
 
 
@@ -111,7 +129,6 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         middle=MIDDLE,
         linked=True,
         titles=dict(bar.prompts),
-        pair=names[:2],
-        notes=noted(shown, HEADINGS),
+        pair=names if len(names) == 2 and not apart else (),
         conditions=conditions,
     )

@@ -161,7 +161,10 @@ def test_a_difference_of_groups_is_the_interaction_of_a_penalised_model_of_both(
     terms = who_first_firth(own, less=rest).terms.values()
     assert [term.b for term in terms] == pytest.approx(model.coef_[2:], rel=1e-3, abs=1e-3)
     assert [term.p for term in terms] == pytest.approx(model.lrt_pvalues_[2:5], rel=1e-3)
-    no_fit(who_first_firth(own, less=rest.iloc[:2]), "2 finished trials with a first merger, too")
+    no_fit(
+        who_first_firth(own, less=rest.iloc[:2]),
+        "2 trials in which one went first without a crash, too",
+    )
 
 
 def test_separation_is_found_where_firthmodels_finds_it():
@@ -261,7 +264,7 @@ def test_a_single_trial_that_decides_a_coefficient_has_no_hc3_errors():
 def test_the_gap_needs_more_trials_than_coefficients(robust):
     cells = [(4.0, 0.8), (-4.0, 0.8), (0.0, 0.0), (4.0, 0.0), (0.0, 0.8)]
     trials = of_gaps(1, lambda h, dv, e: 4 + e, cells)
-    no_fit(gap_ols(trials[:4], robust=robust), "4 finished trials with a gap")
+    no_fit(gap_ols(trials[:4], robust=robust), "4 trials with a gap")
     assert gap_ols(trials).freedom == 1
 
 
@@ -276,13 +279,13 @@ EVERY_FIT = pytest.mark.parametrize(
 def test_too_little_data_are_said(fit):
     collided = frame([(h, dv, "collided", None, None) for h, dv in CELLS])
     for trials in (collided, collided[:0]):
-        no_fit(fit(trials), "no finished trial with a ")
+        no_fit(fit(trials), "no trial ")
         assert fit(trials).n == 0
-    no_fit(fit(frame([(4.0, 0.8, "finished", "left", 3.0)])), "1 finished trial with a ")
+    no_fit(fit(frame([(4.0, 0.8, "finished", "left", 3.0)])), "1 trial ")
     one_cell = [(4.0, 0.8, "finished", ("left", "right")[k % 2], 4.0 + k) for k in range(20)]
     no_fit(
-        fit(frame(one_cell)), "too few or in too few conditions to tell what headway and speed do"
+        fit(frame(one_cell)), "too few or in too few situations to tell what headway and speed do"
     )
     if fit in (who_first_logit, who_first_firth):  # as many trials as coefficients
         few = OVERLAPPING.iloc[[0, 1, 5]].assign(merged_first=["left", "right", "left"])
-        no_fit(fit(few), "3 finished trials with a first merger")
+        no_fit(fit(few), "3 trials in which one went first")
