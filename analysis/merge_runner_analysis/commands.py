@@ -205,7 +205,8 @@ def power(
     expected = asyncio.run(unsent(plan, Options(db=db, cache=cache), say=say, whole=True))
     cost_usd = 0.0 if expected.free else expected.cost_usd
     played = Study(db).models if db.exists() else []
-    rows = list(chances(plan, cost_usd, played, sims))
+    with _status_line("simulating") as say_now:
+        rows = list(chances(plan, cost_usd, played, sims, say_now))
     if as_json:
         facts = {"study": plan.name, "trials": plan.trials, "cost_usd": cost_usd}
         print_out(json.dumps({**facts, "chances": [row.values for row in rows]}))
@@ -287,10 +288,17 @@ def report(
 
 @contextmanager
 def _while_computed(study: Study, what: str) -> Iterator[Callable[[str], None]]:
-    """Say what takes a while; a terminal also shows in a line what is done just now."""
+    """Announce a long computation, and show its progress in a terminal."""
     say(
         f"computing the {what} of {len(study.frames.trials)} trials; a thousand take about a minute"
     )
+    with _status_line(what) as say_now:
+        yield say_now
+
+
+@contextmanager
+def _status_line(what: str) -> Iterator[Callable[[str], None]]:
+    """Show a line of progress in a terminal; the body passes its new texts."""
     if not sys.stderr.isatty():
         yield lambda _: None
         return

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
 from typing import NamedTuple
@@ -370,17 +370,23 @@ def power(case: Case | Contrast, multiple: float, simulations: int) -> dict[str,
 
 
 def chances(
-    plan: Plan, cost_usd: float | None, groups: Sequence[Group], simulations: int
+    plan: Plan,
+    cost_usd: float | None,
+    groups: Sequence[Group],
+    simulations: int,
+    say_now: Callable[[str], object] = str,
 ) -> Iterator[Row]:
-    """Simulate a plan that costs so much; ``groups`` are played ones. Raises UsageError.
+    """Simulate a plan with this cost; ``groups`` are played ones. Raises UsageError.
 
-    Each level but a reference has a row in the primary measure. Drivers by themselves have rows
-    where no factor varies, or levels change their response to the situation.
+    Each level but a reference has a row in the primary measure. Drivers have rows without a
+    reference if no factor varies, or if levels change their response to the situation. ``say_now``
+    gets a line of progress before each simulation.
     """
     labels: dict[Case | Contrast, list[tuple[str, str]]] = {}  # equal ones share rows
     for label, against, case in _cases(plan, groups):
         labels.setdefault(case, []).append((label, against))
-    for case, names in labels.items():
+    for number, (case, names) in enumerate(labels.items(), 1):
+        say_now(f"simulating {number} of {len(labels)}: {names[0][0]}")
         at = {m: power(case, m, simulations) for m in MULTIPLES}
         levels, against = (", ".join(dict.fromkeys(column)) for column in zip(*names, strict=True))
         for question, (table, effect, unit, by) in case.effects().items():

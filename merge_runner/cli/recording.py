@@ -16,7 +16,7 @@ from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
 from merge_runner.text_safety import say
 
-SWEEP = "The sweep_id of a run; may be repeated. Default: the newest run."
+SWEEP = "The sweep_id of a run; may be repeated. Default: the newest with its replies in the cache."
 RecordingFile = Annotated[Path, typer.Argument(metavar="FILE", help="A recording (.parquet).")]
 
 recording_app = Program(
@@ -45,16 +45,18 @@ def recording_export(
 
     if sweeps and study is not None:
         raise UsageError(cli.NOT_BOTH)
-    rows, keys = recorded_sweeps(db, sweeps or cli.runs_of_study(study, db) or ())
-    sweep_ids = " and ".join(row["sweep_id"] for row in rows)
-    if not keys:
-        others = " or ".join(f"--sweep {sweep_id}" for sweep_id in sweeps_with_calls(db))
-        raise UsageError(
-            f"the sweep {sweep_ids} made no call: there is nothing to record. "
-            + (f"Name one that did: {others}" if others else f"None in {db} did: programs drove")
-        )
-    provenance = provenance_of(rows)
+    named = sweeps or cli.runs_of_study(study, db) or ()
     with closing(ResponseCache(cache, read_only=True)) as opened:
+        rows, keys = recorded_sweeps(db, named, opened.has_all)
+        sweep_ids = " and ".join(row["sweep_id"] for row in rows)
+        if not keys:
+            others = " or ".join(f"--sweep {sweep_id}" for sweep_id in sweeps_with_calls(db))
+            name_one = f"Name one that did: {others}"
+            raise UsageError(
+                f"the sweep {sweep_ids} made no call: there is nothing to record. "
+                + (name_one if others else f"None in {db} did: programs drove")
+            )
+        provenance = provenance_of(rows)
         calls = export_recording(file, opened, keys, provenance)
     say(f"{calls} calls of {sweep_ids} are in {file}")
     digest, trials = results_digest(db, [row["sweep_id"] for row in rows])

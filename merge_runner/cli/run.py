@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import shlex
 import sys
+from copy import copy
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from functools import partial, wraps
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
@@ -50,6 +52,9 @@ MAX_COST = "Never spend more than this, over all runs of the sweep."
 STRICT = "Stop when another model answers."
 DASK = "Play on a Dask cluster: local:N, a scheduler's address, or its file."
 BATCH = "Send requests in the provider's batches: cheaper, but it takes hours."
+# Parameters of sweep that replay accepts and does not list.
+NO_EFFECT_IN_REPLAY = {"max_cost_usd", "batch", "in_flight", "rpm", "tpm", "dask", "strict_model"}
+NO_EFFECT_IN_REPLAY |= {"keep_going", "replay", "yes"}
 RECORDING = "Also replay from this file, without importing it; may be repeated."
 
 
@@ -203,6 +208,15 @@ def _refuse_a_part(recording: str, *, chosen: bool, replay: bool) -> None:
         )
 
 
+def _as_in_replay(parameter: inspect.Parameter) -> inspect.Parameter:
+    if parameter.name not in NO_EFFECT_IN_REPLAY:
+        return parameter
+    kind, info = get_args(parameter.annotation)
+    info = copy(info)
+    info.hidden = True
+    return parameter.replace(annotation=Annotated[kind, info])
+
+
 @wraps(sweep, assigned=["__annotations__"])
 def replay(**options: Any) -> None:  # noqa: ANN401 # those of sweep
     """Run a study again from recorded replies alone: no key, no network.
@@ -210,6 +224,10 @@ def replay(**options: Any) -> None:  # noqa: ANN401 # those of sweep
     Example: merge-runner replay theirs.parquet
     """
     sweep(**{**options, "replay": True})
+
+
+_parameters = inspect.signature(sweep, eval_str=True).parameters.values()
+replay.__signature__ = inspect.Signature([*map(_as_in_replay, _parameters)])  # type: ignore[attr-defined] # read by typer
 
 
 def _say_shutdowns(plan: Plan, options: Options) -> None:

@@ -13,7 +13,7 @@ import contextlib
 import hashlib
 import os
 import sqlite3
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing
 from dataclasses import dataclass
 from functools import cached_property
@@ -208,6 +208,10 @@ class CallStore(CacheFile):
         Raises RecordingError where it is damaged or forged.
         """
         return self.recording[0].get(key) or self._entry(key, request)
+
+    def has_all(self, keys: Iterable[str]) -> bool:
+        """Return whether the calls with these keys are stored here, damaged ones included."""
+        return all(self.rows(_GET, key) for key in keys)
 
     def in_recording(self, key: str) -> bool:
         """Return whether the recording holds an entry of a call key."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -36,17 +36,26 @@ SELECT sweep_id FROM sweeps SEMI JOIN (
 """
 
 
-def recorded_sweeps(path: Path, sweep_ids: Sequence[str]) -> tuple[list[dict[str, Any]], list[str]]:
-    """Return the rows of these sweeps, or of the newest, and the keys of their calls.
+def recorded_sweeps(
+    path: Path, sweep_ids: Sequence[str], cached: Callable[[Iterable[str]], bool] = bool
+) -> tuple[list[dict[str, Any]], list[str]]:
+    """Return the rows of these sweeps and the keys of their calls.
 
-    Raises UsageError.
+    Without ids it is the newest sweep whose calls are all ``cached``, or else the newest. Raises
+    UsageError.
     """
     with read_database(path) as connection:
         sweeps = {row["sweep_id"]: row for row in by_name(connection.execute(ALL_SWEEPS))}
-        ids = list(dict.fromkeys(sweep_ids)) or [*sweeps][-1:] or [""]
+
+        def calls_of(*ids: str) -> list[str]:
+            return [key for *_, key in connection.execute(CALLS_OF, [ids]).fetchall()]
+
+        ids = list(dict.fromkeys(sweep_ids))
+        if not ids:
+            newest = [*reversed(sweeps)] or [""]
+            ids = [next((name for name in newest if cached(calls_of(name))), newest[0])]
         rows = [require(sweeps, "sweep", sweep_id, f"in {path}") for sweep_id in ids]
-        keys = connection.execute(CALLS_OF, [ids]).fetchall()
-    return rows, [key for *_, key in keys]
+        return rows, calls_of(*ids)
 
 
 def sweeps_with_calls(path: Path) -> list[str]:

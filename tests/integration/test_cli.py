@@ -12,6 +12,7 @@ import struct
 import subprocess
 import termios
 from contextlib import suppress
+from itertools import chain
 from queue import Queue
 
 import pytest
@@ -72,6 +73,9 @@ def test_the_menu_and_the_options_of_a_sweep_are_in_groups():
     assert len(options) > 5
     assert "Options" not in options or options["Options"] == ["-h,"]
     assert {"--max-cost", "--dry-run", "--rpm"} <= {*options["Money and pace"]}
+    replay = groups_of(CliRunner().invoke(complete_app(), ["replay", "-h"]).output)
+    assert {*replay["Money and pace"]} == {"--dry-run", "--show-prompts"}
+    assert {*chain(*options.values())} > {*chain(*replay.values())}
 
 
 def test_every_command_has_an_example_that_it_can_read():

@@ -85,7 +85,9 @@ def _commands() -> Iterator[str]:
 def _help(ctx: typer.Context, title: str) -> str:
     text = "\n".join(line.rstrip() for line in ctx.command.get_help(ctx).splitlines())
     if title == "replay":
-        text = text.partition("\n\nOptions:")[0] + "\n\nOptions: those of sweep."
+        text = (
+            text.partition("\n\nOptions:")[0] + "\n\nOptions: those of sweep that concern a replay."
+        )
     return f"\n## {title}\n\n```text\n{text}\n```\n"
 
 

@@ -33,7 +33,7 @@ class Listed(NamedTuple):
 
 
 TABLES = {
-    "verdicts": Listed("What drivers show beside the humans"),
+    "verdicts": Listed("Drivers compared with humans, measure by measure"),
     "who-first": Listed("Logistic regression of which driver merged first (1: left)", "Table III"),
     "gap": Listed(
         "Linear regression of the gap at the merge point (m, net of the vehicle length)",
@@ -48,14 +48,14 @@ TABLES = {
         "Table VI",
     ),
     "ablation-quantitative": Listed("Quantitative measures across prompt ablations", "Table VII"),
-    "effects": Listed(
-        "What each factor changes: its levels against the reference, in every measure"
-    ),
-    "levels": Listed("What drivers do at each level of each factor, and in their crossings"),
+    "effects": Listed("Effects of factors: each level against the reference, in every measure"),
+    "levels": Listed("Means and rates at each level of each factor, and at combinations of levels"),
     "contrasts": Listed("Differences between prompts"),
-    "factors": Listed("Each factor's levels: every metric, and the difference from the reference"),
+    "factors": Listed(
+        "Every metric at each level of each factor, and the difference from the reference"
+    ),
     "criticality": Listed("When conflicts are resolved, and how close the vehicles come"),
-    "attempts": Listed("What became of the calls"),
+    "attempts": Listed("Outcomes of calls: attempts, failures and invalid replies"),
     "first-action": Listed(
         "Net acceleration (m/s²) at the first decision, by own relative velocity"
     ),

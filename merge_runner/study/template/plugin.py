@@ -5,7 +5,7 @@ from merge_runner_analysis.metrics import Metric, register
 
 
 class HesitantDriver:
-    """Brakes a little before the merge point, and keeps its speed behind it."""
+    """Brakes gently up to the merge point, then keeps its speed."""
 
     revision = 1
 
@@ -17,7 +17,7 @@ class HesitantDriver:
         return self.context.held(0.0 if observation.distance_to_merge_m is None else -0.1)
 
 
-PROGRAMS.register("hesitant", Program(HesitantDriver, "brakes a little before the merge point"))
+PROGRAMS.register("hesitant", Program(HesitantDriver, "brakes gently up to the merge point"))
 register(
     Metric(
         name="lowest_speed_mps",

@@ -211,7 +211,13 @@ async def test_exported_sweeps_go_round_through_files_and_are_played_as_far_as_t
     assert nothing.code == 1
     assert "is not in the cache none: its run replayed a recording, which holds it" in nothing.err
     part = ("--conditions", "N_0_0", "--db", "part.duckdb", "--reps")
-    assert (await merge_runner(*replay, "new", *part, 1)).code == 0
+    cached = await merge_runner(*replay, "new", *part, 1)
+    assert (await merge_runner(*replay, "none", *named, *part[2:4])).code == 0
+    newest = await merge_runner("recording", "export", "x.parquet", *part[2:4], "--cache", "new")
+    assert (newest.code, f" calls of {cached.summary['sweep_id']} are in" in newest.err) == (
+        0,
+        True,
+    )
     asked = await merge_runner(*replay, "none", *named, *part, 2)
     assert (asked.code, asked.summary["trials"]["planned"]) == (4, 2), "what is asked is played"
     unknown = await merge_runner("recording", "export", "x.parquet", "--sweep", "nobody", code=2)

@@ -150,7 +150,9 @@ def test_rows_are_those_of_the_table_of_effects_whatever_is_planted(file, prepar
     played = Study(tmp_path / "r.duckdb", Selection(file=str(study)))
     tested = [one for one in effects(played) if one.primary]
     plan = make_plan(str(study))
-    found = [row.values for row in chances(plan, 0.0, played.models, 20)]
+    said = []
+    found = [row.values for row in chances(plan, 0.0, played.models, 20, said.append)]
+    assert said == [f"simulating {n} of 3: {row['arms']}" for n, row in enumerate(found, 1)]
     named = {(f"{e.factor}={e.level.name}", f"{e.factor}={e.reference.name}"): e for e in tested}
     assert {(row["arms"], row["against"]) for row in found} == named.keys()
     assert len(named) == 3
