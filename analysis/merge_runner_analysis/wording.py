@@ -58,8 +58,8 @@ VERDICT_RULES = (
     "regression (Firth) over all trials without a crash, not by the counts shown",
     "Fewer, more, smaller, larger, unlike: a difference is shown, with p below .05, corrected "
     "(Holm) for the driver's {tests}tests",
-    f"No verdict: fewer than {ENOUGH} trials, or fewer than half of those that ended",
-    "Cannot tell: neither likeness nor a difference is shown",
+    f"Cannot tell: neither is shown. No verdict: fewer than {ENOUGH} trials, or fewer than half of "
+    "those that ended",
 )
 FITTED_RULE = (
     "Like people in the gap by headway: more headway, more gap, with p below .05 in a linear "
@@ -387,18 +387,13 @@ SEEN_FIRST = ("collisions", "headway", "velocity", "gap", "gap-headway", "gap-ve
 def by_group(rows: Iterable[Any]) -> dict[str, dict[str, Values]]:
     """Return the values of a table's rows by the id of their driver and prompt, and by measure.
 
-    ``row``, ``note`` and how many trials ``ended`` are added. A group that is not judged has
-    one entry, without a measure.
+    ``row`` and ``note`` are added. A group that is not judged has one entry, without a measure.
     """
-    groups: dict[str, dict[str, dict[str, Any]]] = {}
+    groups: dict[str, dict[str, Values]] = {}
     for row in rows:
         values = {**row.values, "note": row.note, "row": row.id}
         groups.setdefault(row.groups[0], {})[row.values.get("measure") or ""] = values
-    for verdicts in groups.values():
-        ended = _ended(verdicts["collisions"]) if "collisions" in verdicts else 0
-        for values in verdicts.values():
-            values["ended"] = ended
-    return {name: {**verdicts} for name, verdicts in groups.items()}
+    return groups
 
 
 def sentences(rows: Iterable[Any]) -> list[str]:

@@ -131,9 +131,13 @@ def _driver_rows(study: Study, group: Group) -> Iterator[Row]:
         return
     rule = ScenarioConfig.model_validate(spec.get("scenario", {})).collision_rule
     copies = _copies(study, group)
-    for comparison in compared(study, distinct(study, group)):
+    comparisons = compared(study, distinct(study, group))
+    crashes = next(of.driver for of in comparisons if of.measure.rests_on == BOXES.column)
+    for comparison in comparisons:
         row = _compared(group, driver, comparison, PLAYED_RULES[rule])
-        yield replace(row, copies=copies)
+        # For the words of the state, which need half of the trials; it is no column.
+        ended = crashes.n + (crashes.undecided or 0)
+        yield replace(row, values={**row.values, "ended": ended}, copies=copies)
 
 
 @remembered

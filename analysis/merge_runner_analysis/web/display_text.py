@@ -8,10 +8,13 @@ import unicodedata
 from contextlib import suppress
 from decimal import Decimal
 
+from markupsafe import Markup, escape
+
 from merge_runner.text_safety import in_spreadsheet
 from merge_runner_analysis.wording import MINUS
 
 NEGATIVE = re.compile(r"(?<![\w-])-(?=\d)")
+_NAME = re.compile(r"[\w.+=]+(?:-[\w.+=]+)+")
 SHOWN = 20_000
 BEGINNING = 800
 # All that may not show.
@@ -26,6 +29,11 @@ _BLANK.update(range(0x180B, 0x1810), range(0xFE00, 0xFE10), range(0xE0100, 0xE01
 def with_minus(text: str) -> str:
     """Return a text with true minus signs before negative numbers; hyphens stay, also in names."""
     return NEGATIVE.sub(MINUS, text)
+
+
+def with_whole_names(text: str) -> Markup:
+    """Return a text as HTML in which no line breaks at the hyphen of a name."""
+    return Markup(_NAME.sub(r'<span class="nw">\g<0></span>', str(escape(visible(text)))))  # noqa: S704 # escaped
 
 
 def visible(text: str) -> str:

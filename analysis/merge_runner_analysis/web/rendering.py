@@ -13,7 +13,7 @@ import jinja2
 from jinja2.bccache import Bucket
 from markupsafe import Markup
 
-from merge_runner_analysis.web.display_text import visible, with_minus
+from merge_runner_analysis.web.display_text import visible, with_minus, with_whole_names
 from merge_runner_analysis.web.glossary import used_terms
 from merge_runner_analysis.web.marks import SHAPES
 from merge_runner_analysis.web.phrases import plain
@@ -89,6 +89,7 @@ def environment(
         minus=lambda text: with_minus(str(text)),
         plain=plain,
         capitalised=capital,
+        whole_names=with_whole_names,
         used_terms=used_terms,
     )
     verdicts = {SHAPES[state]: words for state, words in VERDICTS.items()}
