@@ -171,11 +171,12 @@ class Why(Enum):
     NO_FIRST = "no trial in which one went first without a crash"
     NO_GAP = "no trial with a gap"
     FEW_FIRST = (
-        "{} trial{s} in which one went first without a crash, too few or in too few situations to "
-        "tell what headway and speed do"
+        "{} trial{s} in which one went first without a crash: too few, or in too few situations, "
+        "to estimate effects of headway and speed"
     )
     FEW_GAPS = (
-        "{} trial{s} with a gap, too few or in too few situations to tell what headway and speed do"
+        "{} trial{s} with a gap: too few, or in too few situations, to estimate effects of headway "
+        "and speed"
     )
     SAME_FIRST = "who merged first is the same in all {} trials: nothing to explain"
     SEPARATION = "separation: no finite estimate of {}; see Firth's fit"

@@ -91,6 +91,7 @@ class Program:
     def values(self) -> dict[str, Parameter]:
         """All parameters: those of the chosen set, overridden by the given ones."""
         chosen = self.sets[str(self.parameters[SET])] if self.sets else {}
+        # First for the order of the names, last for precedence.
         return {**self.parameters, **chosen, **self.parameters}
 
     @property

@@ -37,7 +37,7 @@ REASONS = {
     "llama.cpp: --reasoning-format none), or let the model think, as `chat_template_kwargs = "
     "{{ enable_thinking = true }}` among `parameters` of {place} does",
 }
-# A transient fault may look like these: only several in a row mean the configuration.
+# A transient fault may look like these: only several of them mean the configuration.
 UNSURE = frozenset({"other_error", "text", "unreadable_reply", "proxy_refused"})
 # A repeated part of a path, as in /v1/v1/messages.
 _TWICE = re.compile(r"(/\w.*)\1(/|$)")

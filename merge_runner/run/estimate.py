@@ -85,14 +85,13 @@ def _mean(answers: AnswerCounts) -> Usage | None:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A live run's drivers, trials, calls, tokens, USD (None: a price is unknown) and minutes.
+    """Estimate of a live run: drivers, trials, calls, tokens, USD (None: unknown price), minutes.
 
-    They are ``measured`` where tokens are those of earlier answers. Sent as normal
-    requests, calls cost ``singly_usd``; in batches they cost less, and take so many ``rounds`` in
-    place of minutes.
-    ``usd_by_model`` has the models of the registry. Of ``planned`` trials some are ``stored``.
-    ``left_usd`` is left under the cap; None: there is no cap. ``output_caps`` are the
-    most tokens that a reply of each model may have.
+    It is ``measured`` if the tokens per call are those of earlier replies. ``singly_usd`` is the
+    cost of normal requests; batches cost less, and take ``rounds`` in place of minutes.
+    ``usd_by_model`` has the models of the registry. ``planned`` counts all trials, also the
+    ``stored`` ones. ``left_usd`` is left under the cap; None: there is no cap. ``output_caps`` has
+    the maximum tokens of a reply by model.
     """
 
     driver: str
@@ -213,10 +212,10 @@ def _price_factor(entry: ModelEntry, batch: bool) -> float:
 
 
 def _limited_s(options: Options, entry: ModelEntry, usage: Usage, latency_s: float) -> float:
-    """Return the shortest time in s from call to call that the rate limits allow.
+    """Return the shortest time in s between two calls that the rate limits allow.
 
-    Within a minute's window it counts with its output cap until its reply is in, and with its
-    actual tokens from then on.
+    In the minute's window a call counts with its output cap until its reply arrives, and then with
+    its actual tokens.
     """
     rpm, tpm = options.rates(entry)
     waiting = min(latency_s / 60, 1.0)
