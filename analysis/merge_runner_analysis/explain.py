@@ -94,7 +94,7 @@ def sql_command(study: Study) -> str:
 def sources_of(
     study: Study, table: Table, row: Row, column: Column | None = None
 ) -> tuple[Source, ...]:
-    """Return the trials of each group behind a row, and those of them that a share of it counts."""
+    """Return the trials of each group behind a row, and those that a share counts."""
     if column is not None and column.name.startswith("ceiling"):
         resampled = "data sets resampled from the published counts and regression, not trials"
         return (Source(HUMAN, resampled),)

@@ -16,8 +16,8 @@ REASONS = {
     "the base URL, or set SSL_CERT_FILE to the certificates of whoever signed it",
     "not_allowed": "the endpoint does not accept the key; set {key} to a valid one",
     "unknown_model": "the endpoint has no model {id!r}; see `merge-runner models`, or {base_url}",
-    "path_twice": "the base URL must not end with what the path begins with (such as /v1), or it "
-    "stands there twice: {base_url}",
+    "path_twice": "the base URL ends as the path begins (such as with /v1), so that this part is "
+    "there twice: take it out of {base_url}",
     "proxy_refused": "the proxy (HTTPS_PROXY, HTTP_PROXY or ALL_PROXY) lets nothing through, and "
     "nothing was sent: give its URL a user name and a password if it asks for them (407), have it "
     "allow the host, or name the host in NO_PROXY",

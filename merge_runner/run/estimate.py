@@ -32,7 +32,7 @@ NONE_KNOWN: Mapping[str, float] = {}
 
 
 def earlier_answers(plan: Plan, cache: ResponseCache) -> dict[str, Usage | None]:
-    """Return, by model, the mean tokens of its answers to requests like those of a plan.
+    """Return the mean tokens of each model's answers to requests of the plan's templates.
 
     None: its endpoint has answered other requests only. A model whose endpoint has never answered
     is left out. Answers of mock models, and those that report no tokens, do not count.
@@ -124,9 +124,9 @@ def estimate(
 ) -> Estimate:
     """Return the estimate for the ``trials`` that a live run of a plan has yet to ask for.
 
-    ``calls`` are roughly those that each model has yet to answer, by arm. ``facts`` are the mean
-    tokens of each model's earlier answers to similar requests at its endpoint, and ``latencies_s``
-    their median latencies, in place of those of the registry.
+    ``calls`` has by arm the approximate number of calls that each model has yet to answer.
+    ``facts`` are the mean tokens of each model's earlier answers to similar requests at its
+    endpoint, and ``latencies_s`` their median latencies, in place of those of the registry.
     """
     number = read = written = 0
     usd = singly_usd = 0.0
@@ -232,7 +232,7 @@ def typical_prompt(plan: Plan, arm: Arm) -> str:
 def prompts_of(plan: Plan, arm: Arm) -> dict[str, str]:
     """Return, by prompt, the text that language models of an arm read in the middle of an approach.
 
-    The numbers are those of the left driver in the plan's first condition.
+    The texts have the numbers of the left driver in the plan's first condition.
     """
     scenario = arm.scenario
     world = World(scenario, plan.parts.conditions[plan.conditions[0]], TRACK)
