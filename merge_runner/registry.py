@@ -104,7 +104,7 @@ class Registry(Mapping[str, T]):
 
     @property
     def _all(self) -> ChainMap[str, T]:
-        """Installed things, then those of the study in use."""
+        """Installed things and those of the study in use; ``register`` prevents equal names."""
         load_plugins()
         if not _installing.get():
             self.complete()

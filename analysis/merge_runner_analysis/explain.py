@@ -16,7 +16,7 @@ from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.provenance import call_counts
 from merge_runner_analysis.published import HUMAN, citation
 from merge_runner_analysis.stats.levels import distinct
-from merge_runner_analysis.stats.verdicts import went_so
+from merge_runner_analysis.stats.verdicts import hits
 from merge_runner_analysis.study import Study
 from merge_runner_analysis.tables.formats import shown_value
 from merge_runner_analysis.tables.model import COUNTED, ENDED, FINISHED, STORED, Column, Row, Table
@@ -94,7 +94,7 @@ def sql_command(study: Study) -> str:
 def sources_of(
     study: Study, table: Table, row: Row, column: Column | None = None
 ) -> tuple[Source, ...]:
-    """Return the trials of each group behind a row, and those of them that a share of it counts."""
+    """Return the trials of each group behind a row, and those that a share counts."""
     if column is not None and column.name.startswith("ceiling"):
         resampled = "data sets resampled from the published counts and regression, not trials"
         return (Source(HUMAN, resampled),)
@@ -117,7 +117,7 @@ def sources_of(
 
 
 def _counted(group: Group, measure: str) -> Source:
-    went = went_so(group, measure)
+    went = hits(group, measure)
     names = group.trials.loc[went.index, "trial_id"]
     trials, numerator = tuple(names), tuple(names[went])
     text = f"{len(trials)} of {len(group.trials)} trials; the value counts {len(numerator)} of them"

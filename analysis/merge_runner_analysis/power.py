@@ -130,7 +130,7 @@ class Truth:
         return _chance(trials["logit"], trials["noise"])
 
     def plus(self, effect: Effect, conditions: Sequence[str]) -> Truth:
-        """Return the truth with an effect; one on who goes first is on the mean over these."""
+        """Return the truth with an effect; ``goes_first`` shifts the mean over conditions."""
         added = {name: value for name, value in effect if name != "goes_first"}
         more = replace(self, **{name: getattr(self, name) + value for name, value in added.items()})
         if not effect.goes_first:
@@ -166,7 +166,7 @@ def human() -> Truth:
 
 
 def played(group: Group) -> Truth | None:
-    """Return a driver as its trials went; None where these are too few for all coefficients."""
+    """Return a driver's behaviour in its trials; None if they are too few for all coefficients."""
     b = [term.b for fit in (fits(group).firth, fits(group).ols) for term in fit.terms.values()]
     if len(b) < COEFFICIENTS:
         return None
@@ -209,7 +209,7 @@ def _drawn(trials: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
 def simulate(
     truth: Truth, conditions: Sequence[str], repetitions: int, rng: np.random.Generator
 ) -> pd.DataFrame:
-    """Return so many trials of each condition, with the columns of ``load_trials``."""
+    """Return ``repetitions`` trials of each condition, with the columns of ``load_trials``."""
     trials = _drawn(_trials_of(truth, conditions, repetitions), rng)
     return trials.assign(
         status=np.where(trials["collided"], "collided", "finished"),
@@ -218,7 +218,7 @@ def simulate(
 
 
 def significant(trials: pd.DataFrame, other: pd.DataFrame | None) -> dict[str, bool]:
-    """Return by question what a driver's trials show at p < .05, alone or beside the humans."""
+    """Return by question whether a driver's trials show it at p < .05, alone or against humans."""
     if other is None:
         gap = regressions.gap_ols(trials, robust=True)
         judged = judge(regressions.who_first_firth(trials), gap, robust=True)
@@ -231,7 +231,7 @@ def significant(trials: pd.DataFrame, other: pd.DataFrame | None) -> dict[str, b
 
 
 class Assumed(NamedTuple):
-    """An effect that there is to find: its table, its size with the unit, and who says so."""
+    """An assumed effect: its table, its size with the unit, and its source."""
 
     table: str
     effect: float
@@ -241,7 +241,7 @@ class Assumed(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A driver of this truth and size: by itself, or beside the humans."""
+    """A driver with an assumed behaviour and number of trials, tested alone or against humans."""
 
     driver: Truth
     conditions: tuple[str, ...]
@@ -259,7 +259,7 @@ class Case:
         return self.repetitions * len(self.conditions)
 
     def effects(self) -> dict[str, Assumed]:
-        """Return by question the effect that there is to find; that of I4 is small."""
+        """Return by question the assumed effect; I4 assumes a small one."""
         sizes = {}
         for question, (table, number, unit) in QUESTIONS.items():
             if (question in TESTED) is not bool(self.against):
@@ -268,7 +268,7 @@ class Case:
         return {question: size for question, size in sizes.items() if size.effect}
 
     def detected(self, multiple: float, rng: np.random.Generator) -> dict[str, bool]:
-        """Return by question what one simulated study of so many times this size shows."""
+        """Return by question whether one simulated study shows it, at a multiple of the size."""
         trials = simulate(self.driver, self.conditions, round(multiple * self.repetitions), rng)
         return significant(trials, human_sample() if self.against else None)
 
@@ -285,7 +285,7 @@ class Played:
     truth: Truth
 
     def trials(self, multiple: float, *, sides: bool) -> pd.DataFrame:
-        """Return so many times its trials by cell, with an ``image`` if read from both sides."""
+        """Return a multiple of its trials by cell; with an ``image`` they count for both sides."""
         trials = _trials_of(self.truth, self.conditions, round(multiple * self.repetitions))
         names, images = trials["condition"], pd.Series(None, trials.index, dtype=object)
         if sides and self.equal:
@@ -301,7 +301,7 @@ def _level(level: tuple[Played, ...], multiple: float, *, sides: bool) -> pd.Dat
 
 @dataclass(frozen=True, slots=True)
 class Contrast:
-    """A level against its reference in one of ENDPOINTS, by what is ``assumed``."""
+    """A level against its reference in one of ENDPOINTS; ``assumed`` is its effect's source."""
 
     level: tuple[Played, ...]
     reference: tuple[Played, ...]
@@ -326,7 +326,7 @@ class Contrast:
 
     @property
     def size(self) -> float:
-        """The difference that there is to find, in the unit of the measure, as its test weighs."""
+        """The assumed difference in the unit of the measure, with the weights of its test."""
         column, means = ENDPOINTS[self.measure].column, []
         for trials in self._levels(1):
             expected = trials.assign(left_first=_chance(trials["logit"], trials["noise"]))
@@ -337,12 +337,12 @@ class Contrast:
         return unit * float((level - reference).dropna() @ weights / weights.sum())
 
     def effects(self) -> dict[str, Assumed]:
-        """Return the effect that there is to find."""
+        """Return the assumed effect."""
         unit = ENDPOINTS[self.measure].unit
         return {self.measure: Assumed(EFFECTS, self.size, unit, self.assumed)}
 
     def detected(self, multiple: float, rng: np.random.Generator) -> dict[str, bool]:
-        """Return whether one simulated study of so many times this size shows a difference."""
+        """Return whether one simulated study, ``multiple`` times this size, shows a difference."""
         column = ENDPOINTS[self.measure].column
         level, reference = (
             _by_cell(_drawn(trials, rng), column) for trials in self._levels(multiple)
@@ -362,7 +362,7 @@ def _by_cell(trials: pd.DataFrame, column: str) -> pd.DataFrame:
 
 
 def power(case: Case | Contrast, multiple: float, simulations: int) -> dict[str, float]:
-    """Return by question the share of simulated studies of so many times this size that find it."""
+    """Return by question the share of simulated studies that find it, at a multiple of the size."""
     rng, counts = np.random.default_rng(SEED), Counter[str]()
     for _ in range(simulations):
         counts.update(name for name, shown in case.detected(multiple, rng).items() if shown)
@@ -467,7 +467,7 @@ def _assumed(
     factor: str,
     pairs: Sequence[tuple[str, list[Arm], list[Arm]]],
 ) -> Iterator[Contrast]:
-    """Yield the contrast of these cells and arms by each way in which trials may go."""
+    """Yield a contrast of these cells and arms for each assumed behaviour."""
     one_sided = any(arm.focal and not arm.is_mixed for arm in plan.arms)
     levels = [[(cell, arm) for cell, *both in pairs for arm in both[place]] for place in range(2)]
     ways = min((len(truths[arm.label]) for level in levels for _, arm in level), default=0)
@@ -482,7 +482,7 @@ def _assumed(
 
 
 def _with_assumption(plan: Plan, factor: str, contrast: Contrast) -> Contrast:
-    """Return a contrast with who says how its level differs, as far as nothing does by default."""
+    """Return a contrast with the source of its effect, or else with the default effect."""
     effect = plan.study.file.effect.get(factor, Effect())
     if contrast.truth == PLANTED:
         return replace(contrast, assumed=PLANTED)
@@ -539,7 +539,7 @@ def _place(plan: Plan, factor: str, level: str) -> int:
 
 
 def _rehearses(plan: Plan) -> bool:
-    """Return whether parameters alone plant effects: no words do, nor an [effect]."""
+    """Return whether the emulator's parameters plant effects, and no text and no [effect] does."""
     file = plan.study.file
     words = (word for levels in file.texts.values() for word in levels.values())
     if file.effect or any(word.emulator != PlantedWords() for word in words):
@@ -548,7 +548,7 @@ def _rehearses(plan: Plan) -> bool:
 
 
 def _truths(plan: Plan, arm: Arm, groups: Sequence[Group]) -> list[Truth]:
-    """Return how an arm goes: as humans and as played with named effects, or as planted."""
+    """Return an arm's assumed behaviours: humans and as played, with [effect], or as planted."""
     ego = arm.entries.get(arm.names[0])
     if ego and _rehearses(plan):
         fields = planted_fields(ego.parameters)

@@ -89,7 +89,7 @@ class Study:
         return trials[trials["condition"] == condition] if condition else trials
 
     def _groups(self, trials: pd.DataFrame) -> list[Group]:
-        """Return the groups of these trials that were played for the study, if one was chosen."""
+        """Return the groups of these trials, of the chosen study only, if one is chosen."""
         frames = self.frames
         if self.file:
             trials = trials[frames.studies.holds(self.file, trials)]
@@ -160,14 +160,14 @@ class Study:
 
     @property
     def complete(self) -> bool:
-        """True if no human trace is missing, so that whole trials can be drawn from them."""
+        """True if all human traces are imported."""
         return self._human_traces >= HUMAN_TRIALS / len(HUMAN_CONDITIONS)
 
     @cached_property
     def conditions(self) -> dict[str, tuple[float, float]]:
-        """Name to projected headway in m and relative velocity in m/s, of those that were played.
+        """Projected headway in m and relative velocity in m/s, by name of a played condition.
 
-        Those of the humans come first; where no model played, all of these.
+        The humans' conditions come first; if no model played, they are all.
         """
         played = {
             row.condition: (row.projected_headway_m, row.relative_velocity_mps)
@@ -204,7 +204,7 @@ def _keys(trials: pd.DataFrame) -> pd.MultiIndex:
 
 @remembered
 def in_one_study(study: Study, *groups: Group) -> bool:
-    """Return whether one study was played with all trials of these groups of drivers."""
+    """Return whether all trials of these groups belong to one study."""
     known = study.frames.studies
     return len(known.orders) < 2 or any(
         all(known.holds(name, group.trials).all() for group in groups) for name in known.orders

@@ -1,6 +1,7 @@
 """The trials of a database with their metrics, and with whether they collided, by two rules.
 
-A trial that ended in a collision which the other rule does not see is undecided by that rule.
+A trial that ended by one rule of collisions, before the other rule saw one, is undecided by the
+other.
 """
 
 from __future__ import annotations
@@ -112,7 +113,7 @@ def _near(tasks: Mapping[str, ScenarioConfig]) -> str:
 
 
 def _overlap(config: ScenarioConfig, samples: Sequence[Sample]) -> bool:
-    """Return whether boxes overlap at any sample, or at 20 Hz between those of a step."""
+    """Return whether boxes overlap at any sample, or at 20 Hz between samples of a step."""
     size = (config.vehicle_length_m, config.vehicle_width_m)
     looks = [(left_m, right_m) for _, _, left_m, _, right_m, _ in samples]
     for before, now in pairwise(samples):

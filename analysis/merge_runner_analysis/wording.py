@@ -165,17 +165,18 @@ Values = Mapping[str, Any]
 
 
 class Why(Enum):
-    """Why a number is missing, or what is to be known of it, with places for its values."""
+    """Remarks on numbers, such as why one is missing, with placeholders for values."""
 
     # Fits; ``s`` makes a plural of the first value.
     NO_FIRST = "no trial in which one went first without a crash"
     NO_GAP = "no trial with a gap"
     FEW_FIRST = (
-        "{} trial{s} in which one went first without a crash, too few or in too few situations to "
-        "tell what headway and speed do"
+        "{} trial{s} in which one went first without a crash: too few, or in too few situations, "
+        "to estimate effects of headway and speed"
     )
     FEW_GAPS = (
-        "{} trial{s} with a gap, too few or in too few situations to tell what headway and speed do"
+        "{} trial{s} with a gap: too few, or in too few situations, to estimate effects of headway "
+        "and speed"
     )
     SAME_FIRST = "who merged first is the same in all {} trials: nothing to explain"
     SEPARATION = "separation: no finite estimate of {}; see Firth's fit"
@@ -237,7 +238,7 @@ class Fact(NamedTuple):
 
 
 def note_of(*remarks: object) -> str:
-    """Return the note of these remarks, without those that are empty."""
+    """Return a note of all remarks that are not empty."""
     return "; ".join(map(str, filter(None, remarks)))
 
 
@@ -252,14 +253,15 @@ INDICATORS = {
 
 @dataclass(frozen=True, slots=True)
 class Measure:
-    """One thing that a driver is compared with the humans by.
+    """A measure by which a driver is compared with the humans.
 
     ``trait`` names what humans do, ``label`` and ``unit`` head a column, ``rests_on`` is the column
     in which its trials have a value, or "finished", and ``rule`` says how its state is set.
-    ``difference`` is that of a headline, with the fields ``it`` (its name), ``driver`` and
-    ``people``: counts of trials, or values with their intervals. ``says`` has by state the driver's
-    part of a sentence, with ``of``, ``humans`` and ``more`` or less. ``ends`` are those of its
-    axis. ``margin``: so far from 0, where the humans are, it still is alike.
+    ``difference`` is a template of the headline, with the fields ``it`` (the driver's name),
+    ``driver`` and ``people``: counts of trials, or values with their intervals. ``says`` has by
+    state the driver's part of a sentence, with ``of``, ``humans`` and ``more`` or less. ``ends``
+    are the limits of its axis. A driver is alike if it differs from the humans by less than
+    ``margin``.
     """
 
     name: str
@@ -580,8 +582,8 @@ def differs(values: Values) -> bool:
 def headline(drivers: Mapping[str, Mapping[str, Values]]) -> tuple[str, str]:
     """Return how drivers compare with people: the claim, and what else is seen at once.
 
-    It is of the language models that are judged or, without one, of all ``drivers``, by name. Those
-    with too few outcomes have their counts alone.
+    It is of the language models that are judged or, without one, of all ``drivers``, by name.
+    Drivers with too few outcomes get only counts.
     """
     models = _models(drivers)
     if not models:
@@ -676,7 +678,7 @@ def _differing(verdicts: Mapping[str, Values]) -> list[Values]:
 
 
 def _most(values: Values, verdicts: Mapping[str, Values]) -> bool:
-    """Return whether a measure rests on trials enough, and on half of those that ended at least."""
+    """Return whether a measure has enough trials, and at least half of those that ended."""
     return _suffice(values["n"] or 0, _ended(verdicts["collisions"]))
 
 

@@ -71,16 +71,17 @@ class Driver(Protocol):
         ...
 
     async def decide(self, observation: Observation, number: int) -> Decision:
-        """Return the decision at the ``number``-th instant of its pace, without waiting.
+        """Return the decision at a decision step, without awaiting anything.
 
-        Instants count from 0, the start of control. With the control start ``own_exit`` that is
-        the earlier exit, and the first number of the driver that exits later is above 0.
+        ``number`` is the decision step, from 0 at the start of control. With the control start
+        ``own_exit`` that is the earlier exit, and the driver that exits later begins above 0. The
+        runner steps the coroutine once, without an event loop.
         """
         ...
 
 
 class MakeDriver(Protocol):
-    """Factory of the drivers of a side: a program, or a language model."""
+    """Factory of the drivers of a side."""
 
     def make(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> Driver:
         """Return a new driver for one side of a trial."""

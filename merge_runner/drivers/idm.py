@@ -39,7 +39,7 @@ TIE_S = 1e-6
 
 @dataclass(slots=True)
 class IdmDriver:
-    """Driver that follows the projected earlier arrival at the merge point, as if it drove ahead.
+    """Driver that follows the other if that is projected to reach the merge point first.
 
     On a tie the side with the higher seed goes first, so that exactly one of two yields. The
     desired speed is ``desired_speed_factor`` times the speed at the first decision.
@@ -97,7 +97,7 @@ PROGRAMS.register(
     "idm",
     Program(
         IdmDriver,
-        "follows the projected earlier arrival by the intelligent driver model",
+        "follows the driver projected to arrive first, by the intelligent driver model",
         {"set": "highway-env", "desired_speed_factor": 1.0},
         20.0,
         settable=True,

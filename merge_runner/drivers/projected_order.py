@@ -16,7 +16,7 @@ TIE_S = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class ProjectedOrderDriver:
-    """Driver that yields to the projected earlier arrival; on a tie the right one yields.
+    """Driver that yields if the other is projected to arrive first; on a tie the right one yields.
 
     The yielding vehicle brakes evenly, at most 1.5 m/s^2, for a net gap of 3.85 m when the other
     reaches the merge point, and then follows at that gap.
@@ -59,7 +59,7 @@ PROGRAMS.register(
     "projected-order",
     Program(
         ProjectedOrderDriver,
-        "the projected earlier arrival keeps its speed, the later yields",
+        "the driver projected to arrive first keeps its speed, the other yields",
         {"target_gap_m": TARGET_GAP_M, "hardest_braking_mps2": HARDEST_BRAKING_MPS2},
     ),
 )

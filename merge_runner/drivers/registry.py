@@ -91,6 +91,7 @@ class Program:
     def values(self) -> dict[str, Parameter]:
         """All parameters: those of the chosen set, overridden by the given ones."""
         chosen = self.sets[str(self.parameters[SET])] if self.sets else {}
+        # First for the order of the names, last for precedence.
         return {**self.parameters, **chosen, **self.parameters}
 
     @property
@@ -143,7 +144,7 @@ class Program:
         return self if self.data is None else replace(self, data=self.data.read(connection))
 
     def context(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> DriverContext:
-        """Return the context of that driver."""
+        """Return the driver's context."""
         pace = program_pace(scenario, self.rate_hz)
         return make_context(scenario, spec, side, pace, self.values, self.data)
 

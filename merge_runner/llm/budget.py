@@ -1,15 +1,16 @@
 """Admission control under a cap: trials are admitted and attempts reserved in their order.
 
 A trial is admitted only if its expected cost, and what the running trials are still expected to
-cost, fit under the cap. So money finishes trials instead of beginning more. Expectations err, so
-an attempt leaves room only for older trials: the oldest trial is suspended only where the money
-left does not pay for a single attempt. A call that several trials share is paid by the oldest
-running one, so that a running trial never waits for the admission of another. A probe comes before
-all others and leaves no room: older trials may wait for its reply.
+cost, fit under the cap. So money finishes trials instead of beginning more. The oldest running
+trial may use all that is left; a younger one must leave what the older ones are still expected to
+cost. So, if expectations were too low, the youngest are suspended first. A call that several trials
+share is paid by the oldest running one, so that a running trial never waits for the admission of
+another. A probe comes before all others and leaves no room: older trials may wait for its reply.
 
 The worst case of an attempt is reserved in this process while it waits for its turn, and in the
 ledger right before it is sent. A server may ignore the output cap. So several attempts are in
-flight only while twice their worst cases fit, and one reply at most, the last, can pass the cap.
+flight only while twice their worst cases fit. Only the last reply can then exceed the cap, unless
+one costs more than twice the most expensive known before.
 """
 
 from __future__ import annotations
@@ -152,12 +153,12 @@ class MoneyQueue:
 
 
 class Budget:
-    """Spending under the cap of a ledger; without one nothing is refused, and all of it recorded.
+    """Spending under the cap of a ledger; without a cap it is only recorded.
 
     A trial is named by its order in the sweep; ``trial_usd`` returns its expected cost.
-    ``in_flight`` counts reservations, ``queued_usd`` is reserved in this process alone.
-    ``running`` has, by admitted trial, what is kept for it: the rest of its expected cost in USD,
-    below 0 where it has cost more.
+    ``in_flight`` counts reservations, ``queued_usd`` is reserved in this process alone. ``running``
+    has the USD kept for each admitted trial: the rest of its expected cost, below 0 if it has cost
+    more.
     """
 
     def __init__(self, ledger: Ledger, trial_usd: Callable[[int], float] = lambda _: 0.0) -> None:
@@ -192,7 +193,7 @@ class Budget:
             self.queue.reorder(min(trials))
 
     def readmit(self, trial: int) -> None:
-        """Admit a trial at once: an earlier run has asked for it."""
+        """Admit a trial at once, as an earlier run has sent its request."""
         if self.ledger.cap is not None and trial not in self._left:
             self.running.setdefault(trial, self.trial_usd(trial))
             self.queue.reorder(trial)

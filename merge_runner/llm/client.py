@@ -111,7 +111,7 @@ class LlmClient:
             if call.trials:
                 self.budget.queue.reorder()
             elif call.wait is not None and not call.wait.charged:
-                call.give_up()  # or it would take money for a trial that is left
+                call.give_up()  # or it would take money for no trial
         # The attempts are counted once, for the first trial that asked.
         return replace(reply, earlier=len(reply.attempts)) if is_shared else reply
 
@@ -147,7 +147,7 @@ class LlmClient:
             await self._quarantine(call)
         if self.batch is not None and call.pending_batch:
             self.batch.resume(call)
-        elif not self.endpoint.verified:  # no call waits for a probe that may take hours
+        elif not self.endpoint.verified:  # never with --batch, where a probe may take hours
             async with self.probe.turn(call):
                 return await self._attempts(call)
         return await self._attempts(call)

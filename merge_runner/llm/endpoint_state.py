@@ -19,7 +19,7 @@ from merge_runner.records import CallFailed
 NOBODY_S = 5.0
 # For formats that know empty answers as a transient fault of their service.
 MAX_EMPTY_RETRIES = 2
-# So many refusals by an endpoint that has answered before mean a wrong configuration.
+# Number of refusals that mean a wrong configuration, of an endpoint that has answered before.
 MAX_REFUSALS = 3
 # Part of the name of Gemini's daily quotas, whose delay is meaningless.
 GEMINI_DAY = "PerDay"
@@ -29,8 +29,9 @@ GEMINI_DAY = "PerDay"
 class EndpointState:
     """A model at its endpoint, whose ``identity`` enters the keys of calls.
 
-    It is ``verified`` by the first valid reply of a run, and ``has_answered`` in this run or an
-    earlier one. ``refusals`` counts refused requests before any other error would end the run.
+    It is ``verified`` by the first reply that is accepted in a run (with --batch from the start),
+    and ``has_answered`` in this run or an earlier one. ``refusals`` counts attempts whose error
+    points at the configuration; MAX_REFUSALS of them end the run.
     """
 
     name: str

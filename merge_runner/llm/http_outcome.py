@@ -51,7 +51,7 @@ STATUSES = {
     # Not implemented, another HTTP version, a network that wants a login.
     **dict.fromkeys((501, 505, 511), "bad_request"),
 }
-# Status of a named error within a 200 that has no number; the first match counts.
+# Status for an error that a response with status 200 names; the first match counts.
 WITHIN = {
     **dict.fromkeys(("rate_limit_exceeded", "rate_limit_error", "base_resp 1002"), 429),
     "RESOURCE_EXHAUSTED": 429,

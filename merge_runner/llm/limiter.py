@@ -1,10 +1,10 @@
 """Rate limits, requests and tokens a minute; one dispatcher serves the oldest trial first.
 
 asyncio-throttle counts the requests. It polls for every waiter and keeps no order among them, so
-only the dispatcher calls it, and only when it has room: a turn that was taken early, and delayed by
-a pause, would be counted at the wrong time. Tokens are counted in a sliding window of a minute: an
-estimate at dispatch, the actual usage afterwards. Each process counts for itself: where several use
-one key, the server refuses the excess, which is retried.
+only the dispatcher calls it, and only when it has room. If it were called early and the turn then
+delayed by a pause, the request would be counted at the wrong time. Tokens are counted in a sliding
+window of a minute: an estimate at dispatch, the actual usage afterwards. Each process counts for
+itself: where several use one key, the server refuses the excess, which is retried.
 """
 
 from __future__ import annotations

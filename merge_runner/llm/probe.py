@@ -19,7 +19,7 @@ LONG_WAIT_S = 5.0
 
 @dataclass(slots=True)
 class Probe:
-    """Lock that serialises the calls to an endpoint until the first valid reply.
+    """Lock that serialises the calls to an endpoint until the first accepted reply.
 
     So a wrong key, URL or parameter costs one call.
     """

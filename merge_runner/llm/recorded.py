@@ -42,9 +42,9 @@ class RecordedCalls(Protocol):
 
 @dataclass(slots=True)
 class RecordedReplies:
-    """Replies in ``calls`` of the model ``name`` of a plan at an endpoint.
+    """Stored replies of a plan's model ``name`` at an endpoint, by the keys of ``calls``.
 
-    The ``meter`` counts those that a trial uses.
+    The ``meter`` counts the replies that a trial uses.
     """
 
     name: str
@@ -81,7 +81,7 @@ class RecordedReplies:
         return older
 
     def has_asked(self, prompt: str, slot: Slot) -> bool:
-        """Return whether a reply is recorded; damaged or invalid counts."""
+        """Return whether a reply is recorded, also a damaged or invalid one."""
         try:
             request = self.request(prompt, slot)
             return self.calls.get(request.key, request) is not None
@@ -102,7 +102,7 @@ class RecordedReplies:
         )
 
     def read(self, recorded: CachedCall, earlier: int) -> ChatReply:
-        """Read a recorded reply by the present rules, as an audit does: earlier ones may differ."""
+        """Read a recorded reply by the present rules, as an audit does, not by those of its run."""
         attempts, last = recorded.attempts, recorded.attempts[-1]
         payload = reply_object(last.reply or "{}") if last.http_status == 200 else {}
         reading = read_reply(self.wire, payload)

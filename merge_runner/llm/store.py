@@ -156,7 +156,7 @@ class CacheFile:
         self.closing.close()
         self._writer.close()
         self.locks.close()
-        self.reading.close()  # first, since the last one to write ends the journal
+        self.reading.close()  # before the writer, which then ends the journal
         if self.texts is not None:
             close_texts(self.texts)
 

@@ -297,10 +297,9 @@ COMMENT ON VIEW trial_drivers IS 'One row per trial: its driver. Two different d
     'text factors and opponent follow.';
 COMMENT ON COLUMN trial_drivers.driver IS 'model, with its endpoint if that is not the '
     'provider''s own, as in o3 at localhost:8080';
-COMMENT ON COLUMN trial_drivers.ego IS 'side of the driver that is named first: the focal one; '
-    'else, of two different ones, that which its study does not call the opponent, else a '
-    'language model before a program, else the first in the alphabet; of two equal ones and of '
-    'humans, the left one';
+COMMENT ON COLUMN trial_drivers.ego IS 'side of the ego: trials.focal if it is not NULL; else, of '
+    'two different drivers, the one that is not the study''s opponent, else the language model, '
+    'else the first in the alphabet; of two equal drivers, and of humans, the left one';
 
 CREATE VIEW trial_levels AS
 WITH own AS (SELECT * EXCLUDE words FROM trial_factors)

@@ -32,7 +32,7 @@ NONE_KNOWN: Mapping[str, float] = {}
 
 
 def earlier_answers(plan: Plan, cache: ResponseCache) -> dict[str, Usage | None]:
-    """Return, by model, the mean tokens of its answers to requests like those of a plan.
+    """Return the mean tokens of each model's answers to requests of the plan's templates.
 
     None: its endpoint has answered other requests only. A model whose endpoint has never answered
     is left out. Answers of mock models, and those that report no tokens, do not count.
@@ -85,14 +85,13 @@ def _mean(answers: AnswerCounts) -> Usage | None:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A live run's drivers, trials, calls, tokens, USD (None: a price is unknown) and minutes.
+    """Estimate of a live run: drivers, trials, calls, tokens, USD (None: unknown price), minutes.
 
-    They are ``measured`` where tokens are those of earlier answers. Sent as normal
-    requests, calls cost ``singly_usd``; in batches they cost less, and take so many ``rounds`` in
-    place of minutes.
-    ``usd_by_model`` has the models of the registry. Of ``planned`` trials some are ``stored``.
-    ``left_usd`` is left under the cap; None: there is no cap. ``output_caps`` are the
-    most tokens that a reply of each model may have.
+    It is ``measured`` if the tokens per call are those of earlier replies. ``singly_usd`` is the
+    cost of normal requests; batches cost less, and take ``rounds`` in place of minutes.
+    ``usd_by_model`` has the models of the registry. ``planned`` counts all trials, also the
+    ``stored`` ones. ``left_usd`` is left under the cap; None: there is no cap. ``output_caps`` has
+    the maximum tokens of a reply by model.
     """
 
     driver: str
@@ -125,9 +124,9 @@ def estimate(
 ) -> Estimate:
     """Return the estimate for the ``trials`` that a live run of a plan has yet to ask for.
 
-    ``calls`` are roughly those that each model has yet to answer, by arm. ``facts`` are the mean
-    tokens of each model's earlier answers to similar requests at its endpoint, and ``latencies_s``
-    their median latencies, in place of those of the registry.
+    ``calls`` has by arm the approximate number of calls that each model has yet to answer.
+    ``facts`` are the mean tokens of each model's earlier answers to similar requests at its
+    endpoint, and ``latencies_s`` their median latencies, in place of those of the registry.
     """
     number = read = written = 0
     usd = singly_usd = 0.0
@@ -213,10 +212,10 @@ def _price_factor(entry: ModelEntry, batch: bool) -> float:
 
 
 def _limited_s(options: Options, entry: ModelEntry, usage: Usage, latency_s: float) -> float:
-    """Return the shortest time in s from call to call that the rate limits allow.
+    """Return the shortest time in s between two calls that the rate limits allow.
 
-    Within a minute's window it counts with its output cap until its reply is in, and with its
-    actual tokens from then on.
+    In the minute's window a call counts with its output cap until its reply arrives, and then with
+    its actual tokens.
     """
     rpm, tpm = options.rates(entry)
     waiting = min(latency_s / 60, 1.0)
@@ -233,7 +232,7 @@ def typical_prompt(plan: Plan, arm: Arm) -> str:
 def prompts_of(plan: Plan, arm: Arm) -> dict[str, str]:
     """Return, by prompt, the text that language models of an arm read in the middle of an approach.
 
-    The numbers are those of the left driver in the plan's first condition.
+    The texts have the numbers of the left driver in the plan's first condition.
     """
     scenario = arm.scenario
     world = World(scenario, plan.parts.conditions[plan.conditions[0]], TRACK)

@@ -80,8 +80,8 @@ def estimate_lines(expected: Estimate) -> Iterator[str]:
             yield f"Nothing left to play: all {expected.planned} trials are stored."
         return
     yield f"driver  {expected.driver}"
-    yield f"trials  {expected.trials} that have not ended yet"
-    yield f"calls   about {expected.calls} that are not recorded yet"
+    yield f"trials  {expected.trials} to play"
+    yield f"calls   about {expected.calls} not recorded yet"
     yield f"tokens  {tokens}"
     yield from _output_caps(expected)
     if not expected.rounds:

@@ -62,7 +62,7 @@ class LocalRunner:
         return len(set().union(*(client.budget.waiting for client in self.clients.values())))
 
     def _is_idle(self) -> bool:
-        """Return whether all trials wait for answers to others, so that none goes on by itself."""
+        """Return whether every running trial waits for a reply, so that no trial can go on."""
         asking = +self._asking  # without the trials that ask nothing now
         return self.running == len(asking) and asking.total() == self.calls.blocked_askers
 

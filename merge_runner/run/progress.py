@@ -142,7 +142,7 @@ class Progress:
         return elapsed_s / part - elapsed_s if part else None
 
     def _of(self, model: str, by_arm: Counter[str]) -> int:
-        """Return the number of these trials that a model takes part in."""
+        """Return the number of trials in which a model takes part."""
         registered = self.plan.registered
         return sum(
             by_arm[arm.label]

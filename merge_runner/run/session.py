@@ -109,8 +109,9 @@ def _cap(
 ) -> Cap | None:
     """Return the cap of a run, by --max-cost or by its study's budget; None: there is none.
 
-    Where something ``is_open`` to be run, it also covers the ledgers of sweeps that share it, and
-    other ledgers of this study: from before its file had a budget, or since it has none.
+    If something ``is_open`` to be run, it also covers the ledgers of sweeps under the same cap. A
+    study with a budget has one ledger by its name, without a budget one for each set of models:
+    both kinds count, or a changed file would start from 0.
     """
     ledger, study = plan.ledger, plan.study.name
     usd, source = options.max_cost_usd, "--max-cost"

@@ -299,8 +299,8 @@ class StoredReplies:
 def _attempt(number: int, row: Mapping[str, Any], form: WireFormat) -> Attempt:
     """Read the reply of a row anew.
 
-    A failed attempt is taken as it is stored: its outcome depends on headers, which are not. The
-    mark of a mock model may have been a header too, so that a stored ``scripted`` is believed.
+    A failed attempt keeps its stored outcome, which depends on headers that are not stored. For the
+    same reason the stored ``scripted`` is kept.
     """
     body = row["reply"]
     with suppress(TypeError, ValueError, RecursionError):

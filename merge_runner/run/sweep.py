@@ -49,10 +49,10 @@ async def play(
 ) -> dict[str, Any]:
     """Play the trials of a plan that are not stored yet; return ``summary.as_dict``.
 
-    A replay uses the recording that ships with the program if no other is named and the cache has
-    no replies of the models; unless it is ``whole``, it plays only the trials of its recordings.
-    ``agree`` gets an estimate before money is spent, and raises to prevent that. ``stopping`` gives
-    the events that stop the run; a cancelled task saves paid replies first. Raises UsageError.
+    A replay without named recordings uses the one that ships with the program, if the cache has no
+    replies of the models. Unless ``whole``, it plays only the trials in its recordings. ``agree``
+    gets an estimate before money is spent, and raises to prevent that. ``stopping`` gives the
+    events that stop the run; a cancelled task saves paid replies first. Raises UsageError.
     """
     if options.replay:
         shipped = SHIPPED_RECORDINGS / f"{plan.model}-{plan.study.name}.parquet"

@@ -63,7 +63,7 @@ MANY_TRACES = 100
 
 
 def figure2(study: Study, chosen: list[Group]) -> Figure:
-    """Return left speeds (A, B), who was first (C), gap (D) and speed deviation (E) of groups."""
+    """Return Figure 2: left speeds (A, B), who was first (C), gap (D), speed deviation (E)."""
     groups = [_played(study, group) for group in chosen]
     velocities = sorted({velocity for _, velocity in study.conditions.values()})
     styles = {velocity: style(number) for number, velocity in enumerate(velocities)}

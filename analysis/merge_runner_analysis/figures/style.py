@@ -46,7 +46,7 @@ def style(number: int) -> Style:
 
 
 def wrapped(text: str, width: int) -> str:
-    """Return a name in lines of so many characters, broken at blanks or punctuation if any."""
+    """Return a name in lines of limited length, broken at blanks or punctuation if any."""
     lines = re.findall(rf".{{1,{width}}}(?:(?<=[ +/-])|(?= )|$)|.{{1,{width}}}", text)
     return "\n".join(line.strip() for line in lines)
 

@@ -96,7 +96,7 @@ def _file(path: Path, name: str) -> File:
 
 
 def _member(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> File:
-    """Return a file of a zip; raises UsageError for a path out of it: such a zip is an attack."""
+    """Return a file of a zip; raises UsageError for a path out of its folder, an attack."""
     inside = PureWindowsPath(member.orig_filename)
     if inside.anchor or ".." in inside.parts:
         raise UsageError(

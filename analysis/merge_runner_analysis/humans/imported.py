@@ -27,7 +27,7 @@ def human_trials(db: Path) -> pd.DataFrame:
 
 
 def of_published_pairs(trials: pd.DataFrame) -> pd.DataFrame:
-    """Return the trials of the nine published pairs; all, where there is none of these."""
+    """Return the trials of the nine published pairs, or all trials if none is of these pairs."""
     is_published = trials["pair"].isin(PAIRS.values())
     return trials[is_published] if is_published.any() else trials
 

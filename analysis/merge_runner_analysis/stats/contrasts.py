@@ -60,9 +60,9 @@ class Cells:
         return float(self.shares @ (self.a / self.n - self.b / self.m))
 
     def variance(self, apart: float) -> float:
-        """Return that of the difference if the rates of every cell are so far apart.
+        """Return the variance of the difference if the rates differ by ``apart`` in every cell.
 
-        It is of the likeliest such rates, unbiased (Miettinen and Nurminen 1985).
+        It is unbiased, at the likeliest rates with this difference (Miettinen and Nurminen 1985).
         """
         n, m = self.n, self.m
         p, q = _likeliest(self.a, n, self.b, m, apart)
@@ -103,7 +103,7 @@ class Cells:
 def _likeliest(
     a: NDArray[np.int_], n: NDArray[np.int_], b: NDArray[np.int_], m: NDArray[np.int_], apart: float
 ) -> tuple[Array, Array]:
-    """Return the likeliest rates that are so far apart (Miettinen and Nurminen 1985)."""
+    """Return the likeliest rates that differ by ``apart`` (Miettinen and Nurminen 1985)."""
     every, hits = n + m, a + b
     square = (n + 2 * m) * apart - every - hits
     linear = (m * apart - every - 2 * b) * apart + hits
@@ -177,7 +177,7 @@ def difference_of_contrasts(cells: Cells, others: Cells) -> Estimate:
 def detectable_rate(n: int, m: int, rate: float) -> float | None:
     """Return the minimum detectable effect of Fisher's test of n and m trials at a true ``rate``.
 
-    It is that of the direction in which less is enough; None where no rate has the power.
+    It is the smaller of both directions; None if no rate has the power.
     """
     chances = rejected(n, m) @ stats.binom.pmf(np.arange(m + 1), m, rate)
 
@@ -240,7 +240,7 @@ def contrast_means(first: Trials, second: Trials, measure: str) -> Estimate | No
 
 
 def means_within(first: Trials, second: Trials, measure: str) -> tuple[float, float]:
-    """Return both means, of the conditions that both have, which weigh as in their difference."""
+    """Return both means over shared conditions, with the weights of their difference."""
     cells, belongs, values, _ = _within_shared(first, second, measure)
     n, m = np.bincount(cells, belongs), np.bincount(cells, 1 - belongs)
     shares = n * m / (n + m)

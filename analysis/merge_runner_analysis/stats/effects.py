@@ -35,11 +35,11 @@ PRIMARY = "goes_first"  # in a study's file, and where none is named
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """A level against the reference of its factor, in one measure, in the unit of that.
+    """A level against the reference of its factor in one measure, in the measure's unit.
 
-    ``at_level`` and ``at_reference`` are within the shared cells, without the ``left_out`` trials;
-    of an interaction they have no value, and ``across`` are the levels at the other factor's
-    reference. ``p_corrected`` is by Holm in the family that ``primary`` tells.
+    ``at_level`` and ``at_reference`` are estimates within the shared cells, without the
+    ``left_out`` trials. In an interaction they have no value, and ``across`` has both levels at the
+    other factor's reference. ``p_corrected`` is Holm's over all effects with the same ``primary``.
     """
 
     level: Level
@@ -87,8 +87,8 @@ class Effect:
 def effects(study: Study, by: str = "") -> list[Effect]:
     """Return the effects of every factor and their interactions, or those at each level of ``by``.
 
-    Their p are corrected by Holm in two families: the main effects of factors other than ``model``
-    on the primary measure, and all others. Raises UsageError for an unknown factor.
+    Holm corrects p in two families: main effects on the primary measure (of ``model`` only if
+    ``asks_of_models``), and all others. Raises UsageError for an unknown factor.
     """
     if not by:
         main = [
@@ -199,7 +199,8 @@ def _of_levels(study: Study, levels: Sequence[Level]) -> Iterator[Effect]:
 def _interactions(study: Study, by: str = "") -> Iterator[Effect]:
     """Compare effects between the levels of another factor, or of ``by``, and its first.
 
-    Both differences are those of the factor listed first, so that either order gives one number.
+    Both differences are effects of the factor that is listed first, so that either order gives one
+    number.
     """
     factors = levels_of(study.models, study.order)
     varying = [name for name, levels in factors.items() if len(levels) > 1]
@@ -225,7 +226,7 @@ def _interactions(study: Study, by: str = "") -> Iterator[Effect]:
 def _effect(
     study: Study, metric: Metric, levels: Sequence[Level], *, swapped: bool = False
 ) -> Effect:
-    """Compare two levels; of four, the difference of the first two with that of the others."""
+    """Compare two levels; of four, the first two's difference with that of the others."""
     frames = trials_by_cell(study, tuple(level.pooled for level in levels), metric)
     left_out = {copy for level in levels for copy in level.copies}
     for level, frame in zip(levels, frames, strict=False):
@@ -256,14 +257,14 @@ def _effect(
 
 
 def _counted(frame: Columns, metric: Metric) -> Estimate:
-    """Count the trials, and those in which it is so; not of those read from both sides."""
+    """Count the trials, and the hits of a rate unless trials count for both sides."""
     from_both = "varies" in frame and not frame["varies"].all()
     k = int(frame["value"].sum()) if metric.rate and not from_both else None
     return Estimate(n=len(np.unique(frame["row"])), k=k)
 
 
 def _compared(study: Study, level: Columns, reference: Columns, metric: Metric) -> Comparison:
-    """Return both values and their difference, None where that is not known.
+    """Return both values and their difference; None if the difference is not known.
 
     Several views show the same comparison, which is made once.
     """
@@ -292,7 +293,7 @@ def _compare(level: Columns, reference: Columns, metric: Metric) -> Comparison:
 
 
 def _interaction(frames: Sequence[Columns], metric: Metric) -> Estimate | None:
-    """Return the difference of the first two less that of the others; None if one is not known."""
+    """Return the first two's difference less the others'; None if one is not known."""
     level, reference, twin, base = frames
     if metric.rate:
         cells = contrasts.shared_cells(level, reference, "value")
@@ -306,7 +307,7 @@ def _interaction(frames: Sequence[Columns], metric: Metric) -> Estimate | None:
 
 
 def _with_corrected(study: Study, effects: list[Effect]) -> list[Effect]:
-    """Correct p in both families; where nothing varies and nothing differs, p is no part of one."""
+    """Correct p in both families; effects without variance and difference are in neither."""
     of_model = {MODEL, DRIVER} if asks_of_models(study) else set()
     is_primary = [
         effect.metric is primary(study)

@@ -1,7 +1,7 @@
-"""First actions: their response to the own relative velocity, and what headway is worth in words.
+"""First actions: their slope on the own relative velocity, and the exchange rate of headway.
 
-It is a vehicle's net acceleration over its first controlled step; errors are clustered by trial or
-human pair.
+A first action is a vehicle's net acceleration over its first controlled step. Errors are clustered
+by trial or human pair.
 """
 
 from __future__ import annotations
@@ -51,14 +51,14 @@ SAME_MPS2 = 1e-9
 
 
 class Seat(NamedTuple):
-    """A driver of a group: of a mixed pair one on a ``side``, the ego on the left, else both."""
+    """A driver of a group: in a mixed pair the one on a ``side`` (the ego is left), else both."""
 
     group: Group
     side: str = ""
 
     @property
     def name(self) -> str:
-        """The group's label, or that of one of a mixed pair: its program is no mock model."""
+        """The group's label, or the name of one driver of a mixed pair."""
         group, side = self
         if not side:
             return group.label
@@ -92,7 +92,7 @@ def first_actions(study: Study, seat: Seat) -> pd.DataFrame:
 
 
 def repeats_itself(study: Study, seat: Seat) -> bool:
-    """Return whether one of a mixed pair declares no chance, and repeats its first actions."""
+    """Return whether one driver of a mixed pair is deterministic and repeats its first actions."""
     rows = _stored(study, seat)
     sat = np.where(rows["ego"] == seat.side, *SIDES)
     known = set(zip(rows["spec_hash"], sat, strict=True))
@@ -135,7 +135,7 @@ def _least_squares(rows: pd.DataFrame, design: Array) -> Estimate | None:
 
 
 def exchange_rate(rows: pd.DataFrame) -> Estimate | None:
-    """Return how many m of headway are worth 1 m/s in the word M, by two slopes."""
+    """Return the metres of headway that are worth 1 m/s in a logit of answering M."""
     spoken = rows[rows["tactical"].notna()]
     points = spoken[["headway_m", "velocity_mps"]].to_numpy(float)
     return _ratio(points, spoken["tactical"] == "M", spoken["cluster"])
@@ -143,7 +143,7 @@ def exchange_rate(rows: pd.DataFrame) -> Estimate | None:
 
 @cache
 def human_exchange_rate() -> Estimate | None:
-    """Return the same of who merged first in the published human trials: 3.304 / 1.111."""
+    """Return the exchange rate of published humans, by who merged first: 3.304 / 1.111."""
     design, left = who_first_data(human_outcomes())
     return _ratio(design[:, 1:], left, np.arange(len(left)))
 
@@ -168,7 +168,7 @@ def fieller(
 ) -> tuple[float, float] | None:
     """Return the interval of minus velocity / headway, two slopes with this covariance.
 
-    It is that of Fieller (1954); None where the slope on headway may be 0: no ratio is too large.
+    By Fieller (1954); None if the slope on headway may be 0, as then no ratio is too large.
     """
     t = float(stats.t.ppf((1 + LEVEL) / 2, freedom)) ** 2
     squared = headway**2 - t * float(covariance[0, 0])

@@ -61,7 +61,7 @@ def _lower(at_most: Callable[[float], float], part: float) -> float:
 
 
 def _at_most(first: tuple[float, float], second: tuple[float, float]) -> Callable[[float], float]:
-    """Return the chance that a lowest rate exceeds a highest one by at most so much.
+    """Return the chance that a lowest rate exceeds a highest one by at most a difference.
 
     They are the beta distributions of Clopper and Pearson (1934).
     """

@@ -100,7 +100,7 @@ def copied_of_shared(study: Study, *levels: Level) -> tuple[int, int]:
 
 @remembered
 def levels_by_factor(study: Study, by: str = "", at: str = "", least: int = 2) -> list[list[Level]]:
-    """Return factors with at ``least`` so many levels, the reference first."""
+    """Return the levels of factors with at ``least`` this number of them, the reference first."""
     chosen = [group for group in study.models if not by or _level_of(group, by) == at]
     kinds = [[g for g in chosen if g.scripted == scripted] for scripted in (False, True)]
     apart = any(g.scripted for g in study.models) and not all(g.scripted for g in study.models)
@@ -139,7 +139,7 @@ def _with_cells(groups: Sequence[Group], apart_from: set[str]) -> Group:
 
 
 def crossing(study: Study, factors: Sequence[str], levels: Mapping[str, str]) -> list[Level]:
-    """Return the trials at levels of several factors; mock models have another level."""
+    """Return the trials at levels of several factors; mock models get a separate level."""
     chosen = [g for g in study.models if all(_level_of(g, f) == at for f, at in levels.items())]
     crossed = []
     for scripted in sorted({group.scripted for group in chosen}):
@@ -169,7 +169,7 @@ def _distinct(study: Study, levels: list[Level]) -> list[Level]:
 
 
 def _with_copies(study: Study, group: Group) -> Iterator[Iterable[Cell]]:
-    """Yield cells with copies of each other; a mock model's few equal trials are chance."""
+    """Yield cells with copies of each other; single equal trials of a mock model are chance."""
     if not group.scripted:
         yield from (cells for _, cells in group.trials.groupby(["condition", "way"])["cell"])
         return
@@ -191,7 +191,8 @@ def distinct(study: Study, group: Group) -> Group:
 def _without_copies(level: Level, first: Callable[[tuple[str, ...]], tuple[str, ...]]) -> Level:
     """Return the level with each trial once.
 
-    Copies with their ego on both sides were read by nobody: such a trial is of two with one prompt.
+    If copies differ in the side of their ego, no driver read what the ego gets. The kept trial then
+    has no ``focal`` side.
     """
     every = level.pooled.trials
     every = every.assign(cell=pd.Series([first(cell) for cell in every["cell"]], dtype=object))
@@ -201,7 +202,7 @@ def _without_copies(level: Level, first: Callable[[tuple[str, ...]], tuple[str, 
 
 
 def _once(every: pd.DataFrame, *, scripted: bool) -> pd.DataFrame:
-    """Return the trials without copies; a mock model's are copies at equal other levels alone."""
+    """Return the trials without copies; a mock model's are copies only at equal other levels."""
     others = pd.Series([" ".join(others) for _, *others in every["cell"]], every.index)
     way = every["way"] + (" " + others if scripted else "")
     for _, rows in every.groupby(others):

@@ -176,7 +176,7 @@ class Fit:
         return low, high
 
     def _bound(self, term: int, lost: float, width: float) -> float:
-        """Return the first value to one side whose profile loses so much log-likelihood.
+        """Return the first value to one side at which the profile loses this log-likelihood.
 
         A profile followed by steps may miss a higher maximum: it is looked for at the bound. Raises
         ValueError where none is found.

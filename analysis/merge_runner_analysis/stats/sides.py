@@ -27,7 +27,7 @@ def one_sided(study: Study) -> bool:
 
 @remembered
 def level_estimate(study: Study, level: Level, metric: Metric) -> Estimate:
-    """Return a metric of all trials of a level; those read from both sides have no variance."""
+    """Return a metric of a level's trials; those that count for both sides have no variance."""
     group = level.pooled
     trials = group.trials
     same = trials[metric.column].notna() & _have_same_prompts(trials)
@@ -45,7 +45,7 @@ def level_estimate(study: Study, level: Level, metric: Metric) -> Estimate:
 
 
 def cells_seen(study: Study, level: Level) -> set[Cell]:
-    """Return the cells of its trials that ended, from both sides if they are read from both."""
+    """Return the cells of a level's ended trials, with the mirrored cells of equal drivers."""
     trials = level.pooled.ended
     seen = {*trials["cell"]}
     if one_sided(study):
@@ -73,7 +73,7 @@ def from_both_sides(study: Study, frame: pd.DataFrame, trials: pd.DataFrame) -> 
 
 
 def read_twice(frame: pd.DataFrame, images: pd.Series) -> pd.DataFrame:
-    """Return trials by cell, and once more the opposite of those with an image."""
+    """Return trials by cell; one with an image also counts there, with the opposite outcome."""
     again = images.notna()
     right = frame.assign(condition=images, value=1 - frame["value"])[again]
     return pd.concat([frame.assign(varies=~again), right.assign(varies=False)])

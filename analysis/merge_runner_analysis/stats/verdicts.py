@@ -1,14 +1,16 @@
-"""Drivers beside the humans: estimate, interval and test of each measure from one model.
+"""Comparison of drivers with humans: estimate, interval and test of each measure.
 
-- Who goes first: Firth's penalised logit; of a difference one model of both (see ``regressions``).
-- Collisions: Fisher's exact test within conditions, with the melded interval that agrees with it. -
-The mean gap: Student's t over trials, of humans over their nine pairs; Welch's test. - The slope of
-the gap on headway: least squares with HC3 errors, the humans' as published or by pairs. I4: the
-largest difference of predicted gaps that relative velocity alone makes. - I5: how far accelerations
-are held, in human standard deviations (see ``likeness``).
+- Who goes first: Firth's penalised logit; its difference from one model of both.
+- Collisions: Fisher's exact test within conditions, with the melded interval that agrees with it.
+- Mean gap: Student's t over trials, of humans over their nine pairs; Welch's test.
+- Slope of the gap on headway (I3): least squares with HC3 errors; the humans' as published or by
+  pairs.
+- I4: the largest difference of predicted gaps between conditions that differ only in relative
+  velocity.
+- I5: how far accelerations are held, in human standard deviations (see ``likeness``).
 
-The p of a driver's measures are corrected together by Holm (1979). The interval that a state rests
-on has the level at which Holm tested it, so that both agree.
+Holm (1979) corrects the p of all measures of a driver together. The interval of a measure has the
+level at which Holm tested it, so that both agree.
 """
 
 from __future__ import annotations
@@ -70,7 +72,7 @@ class Both:
 
 
 class Counted(NamedTuple):
-    """Number of ``n`` trials that went as a measure has it, and the humans' in these conditions."""
+    """Number ``k`` of ``n`` trials with a measure's outcome, and humans' in these conditions."""
 
     k: int
     n: int
@@ -80,10 +82,10 @@ class Counted(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Statistic:
-    """Estimators of a measure for a driver and for humans, and its test: by default Welch's.
+    """Estimators of a measure for a driver and for humans, and its test (default: Welch's).
 
-    It is of the difference, or of a value against a margin; an ``indicator``'s test shows the
-    trait.
+    The test is of the difference, or of the driver's value against a margin. If an ``indicator``
+    holds by its robust test, the trait is shown.
     """
 
     driver: Callable[[Both], Estimate]
@@ -94,7 +96,7 @@ class Statistic:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """A driver beside the humans in one measure, and its raw counts.
+    """Comparison of a driver with the humans in one measure, with raw counts.
 
     ``tested`` is the difference, or the driver's value where the measure has a margin, at the level
     of its test; it is empty without one.
@@ -115,7 +117,7 @@ def compared(study: Study, group: Group) -> tuple[Comparison, ...]:
     alike = comparable(group)
     both = Both(alike, study.human, _likeness(study, alike))
     tests = tests_of(both)
-    states = decided(both, tests)
+    states = states_of(both, tests)
     counts = counted(both)
     comparisons = []
     for name, measure in MEASURES.items():
@@ -140,26 +142,26 @@ def of_humans(study: Study) -> dict[str, Estimate]:
 
 
 def counted(both: Both) -> dict[str, Counted]:
-    """Return raw counts by measure, of those with trials that could go so."""
+    """Return raw counts by measure, for measures with trials that can have the outcome."""
     played = both.human.outcomes["condition"].isin(both.group.ended["condition"])
     counts = {}
-    for name, of_humans in _humans_went_so(both.human).items():
-        went, humans = went_so(both.group, name), of_humans[played[of_humans.index]]
+    for name, of_humans in _human_hits(both.human).items():
+        went, humans = hits(both.group, name), of_humans[played[of_humans.index]]
         if len(went):
             counts[name] = Counted(int(went.sum()), len(went), int(humans.sum()), len(humans))
     return counts
 
 
 @remembered
-def _humans_went_so(human: Group) -> dict[str, pd.Series]:
+def _human_hits(human: Group) -> dict[str, pd.Series]:
     first = {name: _went_first(human.outcomes, name) for name in ("headway", "velocity")}
     return {"collisions": measures.values(human, BOXES).astype(bool), **first}
 
 
-def went_so(group: Group, measure: str) -> pd.Series:
-    """Return whether each trial went as a measure counts it, of those that could.
+def hits(group: Group, measure: str) -> pd.Series:
+    """Return by trial whether it has a measure's outcome, without trials that cannot have it.
 
-    Collisions are by the humans' rule, or by that which was played if theirs leaves some undecided.
+    Collisions are judged by the humans' rule, or by the played rule if some are undecided.
     """
     alike = comparable(group)
     if measure == "collisions":
@@ -169,7 +171,7 @@ def went_so(group: Group, measure: str) -> pd.Series:
 
 
 def _went_first(outcomes: pd.DataFrame, measure: str) -> pd.Series:
-    """Return whether the one ahead, or side by side the slower one, went first."""
+    """Return by trial whether the vehicle ahead (side by side: the slower one) went first."""
     headway, velocity = (np.sign(outcomes[name]) for name in CONDITION)
     expected = headway if measure == "headway" else -velocity.where(headway == 0, 0)
     first = outcomes["merged_first"].map({"left": 1, "right": -1})
@@ -177,14 +179,14 @@ def _went_first(outcomes: pd.DataFrame, measure: str) -> pd.Series:
 
 
 def comparable(group: Group) -> Group:
-    """Return the trials in conditions that humans drove: others would pass for a difference."""
+    """Return the group without conditions that no human drove, where nothing can be compared."""
     if group.trials["condition"].isin(HUMAN_CONDITIONS).all():
         return group
     return group.part(lambda trials: trials["condition"].isin(HUMAN_CONDITIONS))
 
 
 def tests_of(both: Both) -> dict[str, Estimate]:
-    """Return a driver's tests with their levels and p corrected over all, as far as they can be."""
+    """Return a driver's possible tests by measure, with corrected p and levels of intervals."""
     tests = {}
     for name, statistic in STATISTICS.items():
         default = partial(intervals.difference, *both.estimates[name])
@@ -199,7 +201,7 @@ def tests_of(both: Both) -> dict[str, Estimate]:
     return tests
 
 
-def decided(both: Both, tests: Mapping[str, Estimate]) -> dict[str, str]:
+def states_of(both: Both, tests: Mapping[str, Estimate]) -> dict[str, str]:
     """Return the state of each measure that is tested, by ``Measure.rule``."""
     traits = {name for name, judgement in both.judgements.items() if judgement.passed}
     states = {}
@@ -231,7 +233,7 @@ def holm_levels(p: Mapping[str, float], p_holm: Mapping[str, float]) -> dict[str
 
 
 def _who_first(both: Both, term: str) -> Estimate | None:
-    """Return the difference of a slope, of one model of both in which every term may differ."""
+    """Return the difference of a slope, from one model of both with all interactions."""
     difference = _less_humans(both.group, both.human)
     alone = fits(both.group).firth, fits(both.human).firth
     if any(term not in fit.terms for fit in (*alone, difference)):
@@ -310,7 +312,7 @@ def _gap(group: Group) -> Estimate:
 
 
 def human_gap(human: Group, group: Group) -> Estimate:
-    """Return the humans' mean gap in the conditions of a group's trials with one, as these weigh.
+    """Return the humans' mean gap, weighted by condition as the group's trials that have a gap.
 
     The published mean is moved by the published regression; its error is the spread of the pairs'
     random intercepts, which are shrunken, so that it is rather too small.

@@ -55,7 +55,7 @@ def metric_table(name: str, groups: list[Group], place: str, *notes: str) -> Tab
 
 
 def measured(group: Group, metrics: list[Metric]) -> tuple[dict[str, Estimate], list[object]]:
-    """Return a group's estimates by metric, and remarks on those that are published or missing."""
+    """Return a group's estimates by metric, and remarks on published or missing ones."""
     estimates: dict[str, Estimate] = {}
     remarks: list[object] = [measures.outcomes_note(group)]
     reasons: dict[str, list[str]] = {}

@@ -98,8 +98,8 @@ def _first_rows(study: Study, group: Group) -> Iterator[Row]:
         remarks = [] if len(rows) else [NO_ACTION]
         if first.repeats_itself(study, seat):
             remarks.append(
-                f"{seat.name} declares no chance, and does the same first in all repetitions of a "
-                "situation: each situation counts once"
+                f"{seat.name} is deterministic, and its first action is the same in all "
+                "repetitions of a condition: each condition counts once"
             )
         if len(rows) and rate and rate.low is None:
             remarks.append(

@@ -152,7 +152,7 @@ def names_of(table: Table) -> list[str]:
 
 
 def value_names(column: Column) -> tuple[str, ...]:
-    """Return the names of the values of a column: those of an interval are two."""
+    """Return the names of a column's values; an interval has two."""
     if column.kind == "interval":
         return f"{column.name}_low", f"{column.name}_high"
     return (column.name,)
@@ -238,7 +238,7 @@ def notes_of(table: Table) -> list[str]:
 
 
 def shown_rows(table: Table) -> list[Row]:
-    """Return the rows of a table but those that are untested: of these the notes say why."""
+    """Return the rows of a table without untested ones, which the notes explain."""
     return [row for row in table.rows if not row.untested]
 
 

@@ -55,7 +55,7 @@ def sections() -> dict[str, list[tuple[str, Markup]]]:
 
 
 def used_terms(html: str) -> list[tuple[str, Markup]]:
-    """Return the words of a page that need a meaning, each with that of its term."""
+    """Return the words of a page that are terms, with their meanings."""
     text = re.sub("<[^>]*>", " ", html).lower()
     meanings = {word: meaning for words in sections().values() for word, meaning in words}
     return [(words, meanings[term]) for words, term, used in USED if re.search(used, text)]

@@ -45,7 +45,7 @@ def short_names(names: Sequence[str]) -> dict[str, str]:
 
 
 def opponents_text(names: Iterable[str]) -> str:
-    """Return whom the drivers of these names meet."""
+    """Return the opponents of the drivers with these names."""
     is_pair = {"+" in name for name in names}
     if is_pair == {False}:
         return "Each driver here met a copy of itself."

@@ -209,7 +209,7 @@ def _apart(study: Study) -> Comparison | None:
 
 
 def _once(tables: Iterable[Mapping[str, Any]]) -> dict[str, list[str]]:
-    """Return the notes of each table by its name, without those of a table before it."""
+    """Return notes by table, without notes that an earlier table has."""
     earlier: dict[str, None] = {}
     notes = {}
     for table in tables:

@@ -176,7 +176,7 @@ def expected(trials, **more):
 
 
 def test_a_dry_run_says_how_many_trials_are_left():
-    assert [*estimate_lines(expected(3))][:2] == ["driver  o3", "trials  3 that have not ended yet"]
+    assert [*estimate_lines(expected(3))][:2] == ["driver  o3", "trials  3 to play"]
     assert [*estimate_lines(expected(0, planned=110, stored=110))] == [
         "Nothing left to play: all 110 trials are stored."
     ]

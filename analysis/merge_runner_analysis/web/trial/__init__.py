@@ -1,1 +1,1 @@
-"""One trial: how it is read, why it went so, and what its page draws."""
+"""One trial: reading, cause of its outcome, and the data of its page."""

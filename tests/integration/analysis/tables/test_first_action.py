@@ -122,8 +122,8 @@ def test_a_driver_without_chance_in_a_mixed_pair_counts_once_in_each_situation(t
     left, right = (rows[f"alike+zero/baseline/{side}"] for side in ("left", "right"))
     assert (left.values["n"], right.values["n"]) == (44, 11)
     assert right.values["mean_equal"] == pytest.approx(0.25)
-    (note,) = {row.note for row in rows.values() if "declares no chance" in row.note}
-    assert note.startswith("zero of alike+zero declares no chance, and does the same")
+    (note,) = {row.note for row in rows.values() if "deterministic" in row.note}
+    assert note.startswith("zero of alike+zero is deterministic, and its first action")
 
 
 # Who was only asked

@@ -163,7 +163,7 @@ def test_a_difference_of_groups_is_the_interaction_of_a_penalised_model_of_both(
     assert [term.p for term in terms] == pytest.approx(model.lrt_pvalues_[2:5], rel=1e-3)
     no_fit(
         who_first_firth(own, less=rest.iloc[:2]),
-        "2 trials in which one went first without a crash, too",
+        "2 trials in which one went first without a crash: too",
     )
 
 
@@ -284,7 +284,8 @@ def test_too_little_data_are_said(fit):
     no_fit(fit(frame([(4.0, 0.8, "finished", "left", 3.0)])), "1 trial ")
     one_cell = [(4.0, 0.8, "finished", ("left", "right")[k % 2], 4.0 + k) for k in range(20)]
     no_fit(
-        fit(frame(one_cell)), "too few or in too few situations to tell what headway and speed do"
+        fit(frame(one_cell)),
+        "too few, or in too few situations, to estimate effects of headway and speed",
     )
     if fit in (who_first_logit, who_first_firth):  # as many trials as coefficients
         few = OVERLAPPING.iloc[[0, 1, 5]].assign(merged_first=["left", "right", "left"])

@@ -73,7 +73,7 @@ def humans(tmp_path_factory):
 @np.errstate(divide="ignore")
 def states(groups: Iterator[Group], humans: Group) -> list[dict[str, str]]:
     every = (verdicts.Both(group, humans) for group in groups)
-    return [verdicts.decided(both, verdicts.tests_of(both)) for both in every]
+    return [verdicts.states_of(both, verdicts.tests_of(both)) for both in every]
 
 
 @pytest.mark.parametrize("pairs", [True, False])
