@@ -1,4 +1,4 @@
-"""Probe request: the first call of a run to an endpoint is made alone."""
+"""Probe request: the first normal call of a run to an endpoint is made alone."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LONG_WAIT_S = 5.0
 
 @dataclass(slots=True)
 class Probe:
-    """Lock that serialises the calls to an endpoint until the first valid reply.
+    """Lock that serialises the calls to an endpoint until the first accepted reply.
 
     So a wrong key, URL or parameter costs one call.
     """

@@ -40,7 +40,7 @@ class FirstDecisions:
 
     @asynccontextmanager
     async def turn(self, models: Collection[str]) -> AsyncIterator[None]:
-        """Wait until all models of a trial have decided validly, or no other trial asks them."""
+        """With ``one_by_one``, wait until no other trial asks a model without a valid decision."""
         self._check()
         alone = {*models} if self._one_by_one else set()
         while alone & self._asked - self.valid:

@@ -50,7 +50,7 @@ async def play(
     """Play the trials of a plan that are not stored yet; return ``summary.as_dict``.
 
     A replay uses the recording that ships with the program if no other is named and the cache has
-    no replies of the models; unless it is ``whole``, it plays only the trials of its recordings.
+    no replies of the models. Not ``whole``: it plays only the trials that its recordings hold.
     ``agree`` gets an estimate before money is spent, and raises to prevent that. ``stopping`` gives
     the events that stop the run; a cancelled task saves paid replies first. Raises UsageError.
     """
