@@ -190,7 +190,7 @@ def _reply(spec: TrialSpec, side: Side, number: int, outcomes: tuple[str, ...]) 
         )
         for index, outcome in enumerate(outcomes, 1)
     )
-    return ChatReply("", outcomes[-1], request, attempts, earlier=0)
+    return ChatReply("", outcomes[-1], request, attempts, cached_attempts=0)
 
 
 def _human(rng: np.random.Generator, name: str, rep: int) -> TrialRecord:

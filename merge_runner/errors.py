@@ -70,7 +70,7 @@ class CacheFailed(SweepStopped):
 
 
 class TrialSuspended(MergeRunnerError):
-    """The next call could exceed ``--max-cost``; the trial's replies so far are kept."""
+    """The next call could exceed the cap; the trial's replies so far are kept."""
 
     exit_code = 3
 

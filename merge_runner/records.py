@@ -177,7 +177,8 @@ class ChatRequest:
 class CallFailed(MergeRunnerError):
     """A call ended without a reply.
 
-    The first ``earlier`` of its ``attempts`` were made by earlier runs.
+    The first ``cached_attempts`` of its ``attempts`` were made by earlier runs, or for another
+    trial.
     """
 
     def __init__(
@@ -185,10 +186,11 @@ class CallFailed(MergeRunnerError):
         message: str,
         request: ChatRequest,
         attempts: tuple[Attempt, ...] = (),
-        earlier: int = 0,
+        cached_attempts: int = 0,
     ) -> None:
         super().__init__(message)
-        self.request, self.attempts, self.earlier = request, attempts, earlier
+        self.request, self.attempts = request, attempts
+        self.cached_attempts = cached_attempts
 
 
 class ReplayMiss(CallFailed):
@@ -201,19 +203,19 @@ class ReplayMiss(CallFailed):
 class ChatReply:
     """Reply to a call: text, outcome and all attempts, the answered one last.
 
-    The first ``earlier`` attempts were made before this run, or for another trial of it.
+    The first ``cached_attempts`` were made before this run, or for another trial of it.
     """
 
     text: str
     outcome: str
     request: ChatRequest
     attempts: tuple[Attempt, ...]
-    earlier: int
+    cached_attempts: int
 
     @property
     def cached(self) -> bool:
         """True if all attempts are from earlier runs or other trials."""
-        return self.earlier == len(self.attempts)
+        return self.cached_attempts == len(self.attempts)
 
 
 @dataclass(frozen=True, slots=True)

@@ -90,7 +90,7 @@ class Trial:
                     side,
                     failures[side].request,
                     failures[side].attempts,
-                    failures[side].earlier,
+                    failures[side].cached_attempts,
                     missed=isinstance(failures[side], ReplayMiss),
                 )
                 for side in failed

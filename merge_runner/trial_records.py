@@ -82,7 +82,7 @@ class DecisionRow:
 
 @dataclass(frozen=True, slots=True)
 class FailedCall:
-    """Call without a reply; the first ``earlier`` of its attempts were made by earlier runs.
+    """Call without a reply, with the attempts of its ``CallFailed``.
 
     ``missed`` means that a replay had no recorded reply and made no attempt.
     """
@@ -91,7 +91,7 @@ class FailedCall:
     side: Side
     request: ChatRequest
     attempts: tuple[Attempt, ...]
-    earlier: int = 0
+    cached_attempts: int = 0
     missed: bool = False
 
 

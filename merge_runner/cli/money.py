@@ -30,6 +30,7 @@ def ledger(
     """
     from merge_runner.llm.cache import ResponseCache
     from merge_runner.llm.cache_file import require
+    from merge_runner.llm.durable import LIVE
     from merge_runner.llm.ledger import APART, Ledger, reasons, scopes
     from merge_runner.run.summary import as_table
 
@@ -51,7 +52,7 @@ def ledger(
             for ledger in ledgers
         ]
         # Without a live run only batches are in flight, and the next run asks for them.
-        if opened.locks.take_all():
+        if not (cache / LIVE).exists() or opened.locks.take_all():
             for reason in (reason for row in rows for reason in row["reasons"]):
                 if reason["outcome"] == "in flight":
                     reason["outcome"] = "in flight when its process ended"
@@ -71,7 +72,7 @@ def _release(cache: ResponseCache, name: str, *, yes: bool) -> None:
     spending = ledger.read()
     agree(
         f"{spending.reserved_usd:.4f} USD are reserved for {spending.open_attempts} "
-        f"attempts at {name}. If the provider did charge for them, --max-cost may be "
+        f"attempts at {name}. If the provider did charge for them, a cap may be "
         "passed by as much",
         "Release it?",
         otherwise="nothing was released",

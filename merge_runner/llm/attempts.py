@@ -21,10 +21,10 @@ class Meter:
     """Counts of calls, attempts and cost.
 
     ``calls_cached`` were answered without a request: ``calls_shared`` by a call of this run for
-    another trial, ``calls_recorded`` by a recording that the user named. ``mock_replies`` counts
-    replies of a mock model that answered under the model's name, ``underpriced`` replies that cost
-    more than the registry knows, by service tier. ``damaged`` are the keys of recorded replies in
-    quarantine, ``notes`` lines for the user.
+    another trial, ``calls_recorded`` by a recording that the user named, others by the cache.
+    ``mock_replies`` counts replies that a mock model gave for this one, ``underpriced`` replies
+    that cost more than the registry knows, by service tier. ``damaged`` are the keys of recorded
+    replies in quarantine, ``notes`` lines for the user.
     """
 
     calls_live: int = 0

@@ -2,15 +2,15 @@
 
 A trial is admitted only if its expected cost, and what the running trials are still expected to
 cost, fit under the cap. So money finishes trials instead of beginning more. The oldest running
-trial may use all that is left; a younger one must leave what the older ones are still expected to
-cost. So, if expectations were too low, the youngest are suspended first. A call that several trials
-share is paid by the oldest running one, so that a running trial never waits for the admission of
-another. A probe comes before all others and leaves no room: older trials may wait for its reply.
+trial may use all that is left. A younger one leaves what older ones are still expected to cost. So,
+if expectations were too low, the youngest are suspended first. A call that several trials share is
+paid by the oldest running one, so that a running trial never waits for the admission of another. A
+probe comes before all others and may use all that is left: older trials may wait for its reply.
 
 The worst case of an attempt is reserved in this process while it waits for its turn, and in the
 ledger right before it is sent. A server may ignore the output cap. So several attempts are in
-flight only while twice their worst cases fit. Only the last reply can then exceed the cap, unless
-one costs more than twice the most expensive known before.
+flight only while twice their worst cases fit. Then only the last reply can exceed the cap, unless
+one costs more than twice the most expensive reply known when it was sent.
 """
 
 from __future__ import annotations
@@ -93,9 +93,9 @@ class Reservation:
         self.budget.queue.wake()
 
     def _take(self, usd: float) -> None:
-        """Take from what is kept for the trial, if it still runs."""
-        if self.trial in self.budget.running:
-            self.budget.running[self.trial] -= usd
+        """Take from the expected cost of the trial, if it still runs."""
+        if self.trial in self.budget.expected_usd:
+            self.budget.expected_usd[self.trial] -= usd
 
 
 @dataclass(slots=True, eq=False)
@@ -109,7 +109,7 @@ class Waiter:
 
 
 class MoneyQueue:
-    """Priority queue: probes, calls of ``running`` trials, trials that wait for admission.
+    """Priority queue: probes, calls of running trials, trials that wait for admission.
 
     A call of a running trial has the place of the oldest one, whatever it waits for.
     """
@@ -146,18 +146,18 @@ class MoneyQueue:
                     async with asyncio.timeout(READ_EVERY_S):
                         await waiter.changed.wait()
                 except TimeoutError:
-                    await asyncio.to_thread(self._ledger.read)
+                    await self._ledger.store.write(self._ledger.refresh)
         finally:
             self.waiters.remove(waiter)
             self.wake()
 
 
 class Budget:
-    """Spending under the cap of a ledger; without a cap it is only recorded.
+    """Spending under a ledger's cap; without a cap it is only recorded.
 
     A trial is named by its order in the sweep; ``trial_usd`` returns its expected cost.
-    ``in_flight`` counts reservations, ``queued_usd`` is reserved in this process alone. ``running``
-    has the USD kept for each admitted trial: the rest of its expected cost, below 0 if it has cost
+    ``in_flight`` counts reservations, ``queued_usd`` is reserved in this process alone.
+    ``expected_usd`` has, by running trial, the rest of its expected cost, below 0 where it has cost
     more.
     """
 
@@ -166,11 +166,11 @@ class Budget:
         self.trial_usd = trial_usd
         self.in_flight = 0
         self.queued_usd = 0.0
-        self.running: dict[int, float] = {}
+        self.expected_usd: dict[int, float] = {}
         self._largest_usd = 0.0
         self._spent_before = ledger.spending.committed_usd > 0
-        self._left: set[int] = set()
-        self.queue = MoneyQueue(ledger, self.running)
+        self._ended: set[int] = set()
+        self.queue = MoneyQueue(ledger, self.expected_usd)
 
     @property
     def waiting(self) -> set[int]:
@@ -178,7 +178,7 @@ class Budget:
         return {trial for waiter in self.queue.waiters for trial in waiter.trials}
 
     def _is_running(self, trials: Sequence[int]) -> bool:
-        return not self.running.keys().isdisjoint(trials)
+        return not self.expected_usd.keys().isdisjoint(trials)
 
     async def admit(self, trials: Sequence[int]) -> None:
         """Wait until one of the trials that share a call runs, or the oldest of them may begin.
@@ -193,15 +193,15 @@ class Budget:
             self.queue.reorder(min(trials))
 
     def readmit(self, trial: int) -> None:
-        """Admit a trial at once, as an earlier run has sent its request."""
-        if self.ledger.cap is not None and trial not in self._left:
-            self.running.setdefault(trial, self.trial_usd(trial))
+        """Admit a trial at once whose call an earlier run has sent."""
+        if self.ledger.cap is not None and trial not in self._ended:
+            self.expected_usd.setdefault(trial, self.trial_usd(trial))
             self.queue.reorder(trial)
 
     def leave(self, trial: int) -> None:
         """Free the money of a trial that has ended or is suspended."""
-        self._left.add(trial)
-        if self.running.pop(trial, None) is not None:
+        self._ended.add(trial)
+        if self.expected_usd.pop(trial, None) is not None:
             self.queue.reorder(trial)
 
     async def reserve(
@@ -221,18 +221,18 @@ class Budget:
 
     def _may_begin(self, trial: int) -> bool:
         """Admit a trial if its expected cost fits beside those running; raise TrialSuspended."""
-        if trial in self._left:
+        if trial in self._ended:
             raise TrialSuspended("its trial is suspended")
         needed_usd = self.trial_usd(trial)
         left_usd = self._left_usd(needed_usd)
-        if left_usd < needed_usd and not self.running and not self.in_flight:
+        if left_usd < needed_usd and not self.expected_usd and not self.in_flight:
             # The first trial begins all the same: it may cost less, and each attempt must still
             # fit.
             if self._spent_before or self._largest_usd:
                 raise self._suspended(f"a whole trial may cost {needed_usd:.2f} USD")
-        elif left_usd < needed_usd + self._kept_usd():
+        elif left_usd < needed_usd + self._still_expected_usd():
             return False
-        self.running[trial] = needed_usd
+        self.expected_usd[trial] = needed_usd
         return True
 
     def _may_reserve(self, trials: Sequence[int], label: CallLabel, is_probe: bool) -> bool:
@@ -241,7 +241,7 @@ class Budget:
         left_usd = self._left_usd(worst_usd)
         if left_usd < worst_usd and not self.in_flight:
             raise self._suspended(f"the next call may cost {worst_usd:.4f} USD")
-        older_usd = 0.0 if is_probe else self._kept_usd(before=self._payer(trials))
+        older_usd = 0.0 if is_probe else self._still_expected_usd(before=self._payer(trials))
         # Only the first expensive reply shows that a server ignores the output cap, when the others
         # are sent already: all in flight may cost twice as much.
         twice_usd = (self.in_flight + 1) * max(worst_usd, self._largest_usd)
@@ -249,7 +249,7 @@ class Budget:
 
     def _payer(self, trials: Sequence[int]) -> int:
         """Return the oldest running trial of those that share a call, else the oldest."""
-        return min(self.running.keys() & trials or trials)
+        return min(self.expected_usd.keys() & trials or trials)
 
     def _worst_usd(self, label: CallLabel) -> float:
         """Return the worst case, scaled by this driver's largest observed cost overrun."""
@@ -266,13 +266,13 @@ class Budget:
             ledger.read()
         return cap.usd - ledger.committed_usd - self.queued_usd + TOLERANCE_USD
 
-    def _kept_usd(self, before: float = math.inf) -> float:
-        """Return the USD that are kept for the running trials ``before`` another."""
-        kept_usd = 0.0
-        for trial, usd in self.running.items():
+    def _still_expected_usd(self, before: float = math.inf) -> float:
+        """Return the USD that running trials ``before`` another are still expected to cost."""
+        older_usd = 0.0
+        for trial, usd in self.expected_usd.items():
             if usd > 0 and trial < before:
-                kept_usd += usd
-        return kept_usd
+                older_usd += usd
+        return older_usd
 
     def _suspended(self, what: str) -> TrialSuspended:
         spending, cap = self.ledger.spending, self.ledger.cap
@@ -287,5 +287,5 @@ class Budget:
             f"({spending.spent_usd:.4f} spent, {reserved_usd:.4f} reserved for "
             f"{spending.open_attempts} attempts whose cost is not known{elsewhere}: "
             "`merge-runner ledger`); "
-            f"{self._kept_usd():.4f} more are kept for the trials that have begun"
+            f"{self._still_expected_usd():.4f} more are kept for the trials that have begun"
         )

@@ -69,7 +69,7 @@ class ResponseCache(CallStore):
         return added, seen - added
 
     def keep_attempts(self, key: str, attempts: Attempts, execute: Execute) -> None:
-        """Store the attempts of a call that has no answer yet; an operation."""
+        """Store the attempts of a call that has no answer yet. Runs in a transaction."""
         self.replace(UNANSWERED + key, ATTEMPTS.dump_json(attempts).decode(), execute)
 
     def _unanswered(self, key: str) -> Attempts:
@@ -117,7 +117,7 @@ class ResponseCache(CallStore):
         return int(self.rows(_NUMBER)[0][0])
 
     def quarantine(self, key: str, execute: Execute) -> list[str]:
-        """Quarantine a damaged entry or list of attempts, unchanged; an operation.
+        """Quarantine a damaged entry or list of attempts, unchanged. Runs in a transaction.
 
         Returns the names of what was damaged.
         """

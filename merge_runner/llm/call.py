@@ -34,7 +34,7 @@ class Call:
 
     ``label`` names it and bounds the cost of an attempt, ``worst`` bounds its tokens. ``left_s``
     remains for its attempts and the waits between them; waits for the rate limiter do not count.
-    ``attempts`` has all attempts, the first ``earlier`` of them by earlier runs. ``wait`` is None
+    ``attempts`` has all attempts, the first ``earlier_attempts`` by earlier runs. ``wait`` is None
     while it is in flight or being saved. ``task`` makes the call, ``trials`` wait for it, by their
     order; ``order`` is the lowest. Other calls wait for a probe. ``bypass_batch`` is set after a
     batch without a result for it; ``pending_batch`` is the batch of an earlier run in which it
@@ -48,7 +48,7 @@ class Call:
     left_s: float
     damaged: bool = False
     attempts: list[Attempt] = field(default_factory=list)
-    earlier: int = 0
+    earlier_attempts: int = 0
     wait: Wait | None = None
     trials: list[int] = field(default_factory=list)
     is_probe: bool = False
@@ -65,7 +65,7 @@ class Call:
     @property
     def own_attempts(self) -> list[Attempt]:
         """Attempts of this run."""
-        return self.attempts[self.earlier :]
+        return self.attempts[self.earlier_attempts :]
 
     @property
     def empty(self) -> int:
@@ -116,8 +116,8 @@ class Calls:
         call.wait = wait
 
     def given_up(self, call: Call) -> CallFailed:
-        """Return the error of a call that is given up: no asker is left, or the run stops."""
-        why = "the sweep was stopped" if self.stopping else "its trial was left"
+        """Return the error of a call that no running trial waits for, or that the run stops."""
+        why = "the sweep was stopped" if self.stopping else "its trial has ended"
         return CallFailed(why, call.request)
 
     async def drain(self) -> None:

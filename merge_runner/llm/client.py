@@ -27,13 +27,13 @@ from merge_runner.llm.probe import LONG_WAIT_S, Probe
 from merge_runner.llm.recorded import RecordedReplies
 from merge_runner.llm.sender import DirectSender
 from merge_runner.llm.store import Attempts, CachedCall
-from merge_runner.records import Attempt, ChatReply, ChatRequest, Slot
+from merge_runner.records import Attempt, CallFailed, ChatReply, ChatRequest, Slot
 
 if TYPE_CHECKING:
     from merge_runner.llm.batch.rounds import BatchSender
 
 NO_ROOM = "calls: the cap leaves money for few trials at a time"
-NO_MONEY = "for calls in flight to be paid, under --max-cost"
+NO_MONEY = "for calls in flight to be paid, under the cap"
 
 
 @dataclass(slots=True)
@@ -106,21 +106,26 @@ class LlmClient:
         try:
             # Shielded: the call may be paid for already when its trial is cancelled.
             reply = await asyncio.shield(call.task)
+        except CallFailed as failed:
+            if not is_shared:
+                raise
+            attempts = failed.attempts
+            raise CallFailed(str(failed), request, attempts, len(attempts)) from failed
         finally:
             call.trials.remove(order)
             if call.trials:
                 self.budget.queue.reorder()
             elif call.wait is not None and not call.wait.charged:
-                call.give_up()  # or it would take money for no trial
+                call.give_up()  # or it would take money for a trial that has ended
         # The attempts are counted once, for the first trial that asked.
-        return replace(reply, earlier=len(reply.attempts)) if is_shared else reply
+        return replace(reply, cached_attempts=len(reply.attempts)) if is_shared else reply
 
-    def _start(self, request: ChatRequest, order: int, earlier: Attempts | None) -> Call:
+    def _start(self, request: ChatRequest, order: int, recorded: Attempts | None) -> Call:
         entry = self.endpoint.entry
         worst, usd = worst_case(entry, request.body)
         label = CallLabel(self.endpoint.driver, str(request.slot), usd)
-        call = Call(request, order, label, worst, entry.deadline_s, damaged=earlier is None)
-        call.attempts, call.earlier = [*(earlier or ())], len(earlier or ())
+        call = Call(request, order, label, worst, entry.deadline_s, damaged=recorded is None)
+        call.attempts, call.earlier_attempts = [*(recorded or ())], len(recorded or ())
         call.task = asyncio.create_task(self._call(call))
         self.calls.under_way[request.key] = call
 
@@ -134,12 +139,12 @@ class LlmClient:
         return call
 
     async def _call(self, call: Call) -> ChatReply:
-        """Admit the trial of a call, and make attempts; the first call of a run is a probe."""
+        """Admit a call's trial and make attempts; the first normal call of a run is a probe."""
         if self.batch is not None:
             call.pending_batch = self.batch.rounds.pending.get(call.request.key)
         if call.pending_batch:
             self.budget.readmit(call.order)
-        if call.order not in self.budget.running:
+        if call.order not in self.budget.expected_usd:
             self.calls.wait(call, Wait(NO_ROOM, blocked=True))
             await self.budget.admit(call.trials)
             call.wait = None
@@ -147,7 +152,7 @@ class LlmClient:
             await self._quarantine(call)
         if self.batch is not None and call.pending_batch:
             self.batch.resume(call)
-        elif not self.endpoint.verified:  # never with --batch, where a probe may take hours
+        elif not self.endpoint.verified:  # never in a run of batches, or calls would wait for hours
             async with self.probe.turn(call):
                 return await self._attempts(call)
         return await self._attempts(call)
@@ -160,8 +165,8 @@ class LlmClient:
                 f"{self.endpoint.driver}: {call.label.slot}: what is recorded is damaged; it is "
                 f"quarantined as 'damaged {name}' in the cache, and asked again"
             )
-        _, earlier = self.cache.look_up(key)
-        call.attempts, call.earlier = [*earlier], len(earlier)
+        _, recorded = self.cache.look_up(key)
+        call.attempts, call.earlier_attempts = [*recorded], len(recorded)
 
     async def _attempts(self, call: Call) -> ChatReply:
         """Make attempts, with backoff, until one brings an answer."""
@@ -240,6 +245,6 @@ class LlmClient:
         kept = await reservation.book(attempt, partial(self.cache.keep, answered))
         self.calls.answered.add(key)
         if kept is not answered:  # an import has stored another reply first, which is used
-            return self.recorded.read(kept, call.earlier)
+            return self.recorded.read(kept, call.earlier_attempts)
         text = outcome.reading.text
-        return ChatReply(text, attempt.outcome, call.request, attempts, call.earlier)
+        return ChatReply(text, attempt.outcome, call.request, attempts, call.earlier_attempts)

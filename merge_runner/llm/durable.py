@@ -29,7 +29,7 @@ ResultT = TypeVar("ResultT")
 Rows = list[tuple[Any, ...]]
 # Executes a statement in the transaction of an operation.
 Execute = Callable[..., sqlite3.Cursor]
-# A step of a durable transaction; docstrings of such functions name them "an operation".
+# A step of a durable transaction; docstrings of such functions say "Runs in a transaction".
 Operation = Callable[[Execute], Any]
 
 
@@ -50,10 +50,14 @@ def connect(file: Path, mode: str = "ro") -> sqlite3.Connection:
 
     Run one query at a time: threads share prepared statements, and one could read another's row.
     """
-    uri = f"{file.absolute().as_uri()}?mode={mode}"
-    return sqlite3.connect(
+    # A reader that may not write would leave the empty journal that SQLite makes.
+    is_closed = not any(Path(f"{file}-{journal}").exists() for journal in ("wal", "journal"))
+    uri = f"{file.absolute().as_uri()}?mode={'rw' if is_closed else mode}"
+    opened = sqlite3.connect(
         uri, uri=True, timeout=BUSY_S, isolation_level=None, check_same_thread=False
     )
+    opened.execute(f"PRAGMA query_only = {mode == 'ro'}")
+    return opened
 
 
 class GroupWriter:

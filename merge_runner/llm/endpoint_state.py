@@ -11,7 +11,7 @@ from merge_runner.llm.delays import TryAgain, utc_after
 from merge_runner.llm.formats.wire import WireFormat
 from merge_runner.llm.http_outcome import AttemptOutcome
 from merge_runner.llm.prices import underpriced_tiers
-from merge_runner.llm.refusals import UNSURE, if_nobody, reason_of, why_refused
+from merge_runner.llm.rejections import UNSURE, if_nobody, reason_of, why_rejected
 from merge_runner.providers import ModelEntry
 from merge_runner.records import CallFailed
 
@@ -19,8 +19,8 @@ from merge_runner.records import CallFailed
 NOBODY_S = 5.0
 # For formats that know empty answers as a transient fault of their service.
 MAX_EMPTY_RETRIES = 2
-# Number of refusals that mean a wrong configuration, of an endpoint that has answered before.
-MAX_REFUSALS = 3
+# So many rejections by an endpoint that has answered before mean a wrong configuration.
+MAX_REJECTIONS = 3
 # Part of the name of Gemini's daily quotas, whose delay is meaningless.
 GEMINI_DAY = "PerDay"
 
@@ -29,9 +29,9 @@ GEMINI_DAY = "PerDay"
 class EndpointState:
     """A model at its endpoint, whose ``identity`` enters the keys of calls.
 
-    It is ``verified`` by the first reply that is accepted in a run (with --batch from the start),
-    and ``has_answered`` in this run or an earlier one. ``refusals`` counts attempts whose error
-    points at the configuration; MAX_REFUSALS of them end the run.
+    It is ``verified`` by the first accepted reply of a run, and ``has_answered`` in this run or an
+    earlier one. ``rejections`` counts attempts whose error points at the configuration;
+    MAX_REJECTIONS of them end the run.
     """
 
     name: str
@@ -40,7 +40,7 @@ class EndpointState:
     wire: WireFormat
     verified: bool = True
     has_answered: bool = False
-    refusals: int = 0
+    rejections: int = 0
     driver: str = field(init=False)
     underpriced_tiers: set[str] = field(init=False)
 
@@ -51,13 +51,13 @@ class EndpointState:
     def error_of(self, call: Call, outcome: AttemptOutcome) -> MergeRunnerError | None:
         """Return the error that follows from a call's last attempt, None if it is an answer."""
         driver, message = self.driver, outcome.message or outcome.name
-        if outcome.action == "refused" or not self.verified:
+        if outcome.action == "rejected" or not self.verified:
             reason = reason_of(outcome, self.identity + call.request.path)
-            self.refusals += reason is not None
+            self.rejections += reason is not None
             # An endpoint that has answered before may refuse this prompt alone.
-            sure = not (self.has_answered or reason in UNSURE) or self.refusals >= MAX_REFUSALS
-            if reason is not None and (sure or outcome.action == "refused"):
-                why = why_refused(reason, self.entry, outcome)
+            sure = not (self.has_answered or reason in UNSURE) or self.rejections >= MAX_REJECTIONS
+            if reason is not None and (sure or outcome.action == "rejected"):
+                why = why_rejected(reason, self.entry, outcome)
                 return EndpointRefused(f"{driver}: {why}")
         # A server may just be starting: it is waited for, but only for seconds.
         is_late = self.entry.deadline_s - call.left_s >= NOBODY_S
@@ -108,4 +108,4 @@ class EndpointState:
     def failed(self, call: Call, why: str) -> CallFailed:
         """Return the error of a call that ends without an answer."""
         why = f"{self.name}: {why} ({call.last_failure}), {len(call.own_attempts)} attempts"
-        return CallFailed(why, call.request, tuple(call.attempts), call.earlier)
+        return CallFailed(why, call.request, tuple(call.attempts), call.earlier_attempts)

@@ -184,7 +184,7 @@ class HttpTransport:
             host = httpx.URL(self._endpoint.base_url).netloc.decode()
             why = f"HTTP {cause.status}: {self._mask(cause.message)}"
             message = f"the proxy does not connect to {host} ({why})"
-            action: Action = "refused" if cause.status in PROXY_REFUSES else "retry"
+            action: Action = "rejected" if cause.status in PROXY_REFUSES else "retry"
             return TransportFailure(
                 "proxy_refused", message, sent=False, action=action, reason="proxy_refused"
             )
@@ -192,7 +192,7 @@ class HttpTransport:
             words = self._mask(" ".join(cause.message.split()))[:LONGEST]
             return self._unreadable(f"a header is too long: {words}")
         if isinstance(cause, aiohttp.ClientConnectorCertificateError):
-            return TransportFailure("bad_certificate", reason, sent=False, action="refused")
+            return TransportFailure("bad_certificate", reason, sent=False, action="rejected")
         if isinstance(cause, aiohttp.ClientConnectorError):
             by_proxy = isinstance(cause, aiohttp.ClientProxyConnectionError)
             message = f"{self._endpoint.base_url} cannot be reached ({reason})"

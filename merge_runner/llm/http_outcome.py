@@ -26,7 +26,7 @@ from merge_runner.llm.formats.wire import (
 )
 from merge_runner.providers import PROVIDERS
 
-Action = Literal["accept", "retry", "fail", "quota", "refused"]
+Action = Literal["accept", "retry", "fail", "quota", "rejected"]
 EXCERPT = 200
 # Azure bills a prompt that it has checked, even where it then refuses it.
 CHARGED_ERRORS = frozenset({"content_filter", "context_length_exceeded"})
@@ -51,7 +51,7 @@ STATUSES = {
     # Not implemented, another HTTP version, a network that wants a login.
     **dict.fromkeys((501, 505, 511), "bad_request"),
 }
-# Status for an error that a response with status 200 names; the first match counts.
+# Statuses of named errors without a number in a reply of status 200; the first match counts.
 WITHIN = {
     **dict.fromkeys(("rate_limit_exceeded", "rate_limit_error", "base_resp 1002"), 429),
     "RESOURCE_EXHAUSTED": 429,
@@ -68,9 +68,9 @@ WITHIN = {
 ACTIONS: dict[str, Action] = {
     "refusal": "accept",
     "quota_exhausted": "quota",
-    "not_allowed": "refused",
-    "unknown_model": "refused",
-    "proxy_refused": "refused",
+    "not_allowed": "rejected",
+    "unknown_model": "rejected",
+    "proxy_refused": "rejected",
     **dict.fromkeys(("rate_limited", "request_timeout", "conflict"), "retry"),
     **dict.fromkeys(("server_error", "overloaded", "server_timeout"), "retry"),
 }
@@ -113,7 +113,7 @@ class RawReply:
 
     @property
     def kind(self) -> str:
-        """Kind of a body that is no answer: a name of ``refusals.REASONS``, or ``text``."""
+        """Kind of a body that is no answer: a name of ``rejections.REASONS``, or ``text``."""
         if self.payload is not None:
             return "other_format"
         if self._is("content-type", "text/event-stream") or _EVENTS.match(self.body):
@@ -162,8 +162,8 @@ class AttemptOutcome:
 
     ``accept`` it as the answer, ``retry`` after ``delay_s`` (``pause``: all calls of the key wait),
     ``fail`` this call, or stop the sweep because the ``quota`` is exhausted or the endpoint has
-    ``refused`` the key or the model. Without a ``raw`` reply the attempt may have been ``charged``
-    all the same; then ``reason`` is that of ``refusals.reason_of``, if it is known.
+    ``rejected`` the key or the model. Without a ``raw`` reply the attempt may have been ``charged``
+    all the same; then ``reason`` is that of ``rejections.reason_of``, if it is known.
     """
 
     action: Action

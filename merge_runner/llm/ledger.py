@@ -154,7 +154,8 @@ class Ledger:
         self.coordinator = coordinator
         self.spending = Spending()
         self.committed_usd = 0.0
-        self._in_transaction_usd = 0.0  # the writer thread's; read() may replace committed_usd
+        # Sum in the writer thread: read() may replace committed_usd meanwhile.
+        self._in_transaction_usd = 0.0
         self._others = json.dumps([name for name in cap.scopes if name != scope] if cap else [])
         # A replay spends nothing and needs no record: a damaged one is an error only in a live run.
         with contextlib.suppress(UsageError, CacheFailed, RecordingError):
@@ -194,6 +195,11 @@ class Ledger:
         committed_usd: float = spent_usd + reserved_usd + elsewhere_usd
         return committed_usd
 
+    def refresh(self, execute: Execute) -> None:
+        """Sum beside writes, where read() could see the state before one. Runs in a transaction."""
+        self._sum_once(execute)
+        self.committed_usd = self._in_transaction_usd
+
     def _sum_once(self, execute: Execute) -> None:
         """Sum before the first change of this ledger in a transaction."""
         if self.store.summed is not self:
@@ -203,7 +209,7 @@ class Ledger:
     def reserve(
         self, key: str, number: int, usd: float, label: CallLabel, execute: Execute
     ) -> bool:
-        """Reserve the worst case of an attempt; False if it exceeds the cap; an operation."""
+        """Reserve an attempt's worst case; False if it exceeds the cap. Runs in a transaction."""
         self._sum_once(execute)
         if self.cap is not None and (self._in_transaction_usd + usd > self.cap.usd + TOLERANCE_USD):
             self.committed_usd = self._in_transaction_usd
@@ -216,7 +222,7 @@ class Ledger:
         return True
 
     def book(self, key: str, attempt: Attempt, driver: str, execute: Execute) -> None:
-        """Book the cost of an attempt; an operation.
+        """Book the cost of an attempt. Runs in a transaction.
 
         Its reservation stays where the cost is unknown.
         """
@@ -230,7 +236,7 @@ class Ledger:
     def pay(
         self, key: str, number: int, usd: float, driver: str, execute: Execute
     ) -> tuple[str, float, float]:
-        """Replace the reservation of an attempt by its cost; an operation.
+        """Replace the reservation of an attempt by its cost. Runs in a transaction.
 
         Returns the driver, the cost, and by how much it exceeds the worst case.
         """
@@ -261,7 +267,7 @@ class Ledger:
     def share(self, name: str, spent: Rows, opened: Rows, execute: Execute) -> None:
         """Replace the reservation of a cluster's task by its costs and open reservations.
 
-        An operation.
+        Runs in a transaction.
         """
         execute("DELETE FROM open WHERE scope = ? AND call = ?", (self.scope, name))
         for row in spent:

@@ -1,10 +1,10 @@
 """Rate limits, requests and tokens a minute; one dispatcher serves the oldest trial first.
 
 asyncio-throttle counts the requests. It polls for every waiter and keeps no order among them, so
-only the dispatcher calls it, and only when it has room. If it were called early and the turn then
-delayed by a pause, the request would be counted at the wrong time. Tokens are counted in a sliding
-window of a minute: an estimate at dispatch, the actual usage afterwards. Each process counts for
-itself: where several use one key, the server refuses the excess, which is retried.
+only the dispatcher calls it, and only when it has room: a turn that is taken before a pause would
+be counted at the wrong time. Tokens are counted in a sliding window of a minute: an estimate at
+dispatch, the actual usage afterwards. Each process counts for itself: where several use one key,
+the server refuses the excess, which is retried.
 """
 
 from __future__ import annotations
@@ -132,14 +132,15 @@ class Limiter:
                     async with asyncio.timeout(wait):
                         await self._changed.wait()
                 continue
+            heapq.heappop(self._waiting)  # before a wait in which an older trial's may arrive
             for throttle in self._throttles:
                 await throttle.acquire()  # type: ignore[no-untyped-call] # ships no types
-            heapq.heappop(self._waiting)
             if self._tpm is not None:
                 turn.dispatched_at = loop.time()
                 self._window.append(turn)
                 self._tokens_in_window += turn.tokens
-            turn.given.set_result(None)
+            if not turn.given.done():  # it may be cancelled meanwhile
+                turn.given.set_result(None)
 
     def _blocked_for(self, turn: _Turn, now: float) -> float:
         """Return the minimum wait in s of the head of the queue."""

@@ -1,4 +1,4 @@
-"""Probe request: the first call of a run to an endpoint is made alone."""
+"""Probe request: the first normal call of a run to an endpoint is made alone."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ class RecordedCalls(Protocol):
 
 @dataclass(slots=True)
 class RecordedReplies:
-    """Stored replies of a plan's model ``name`` at an endpoint, by the keys of ``calls``.
+    """Replies of a plan's model ``name`` at an endpoint, recorded in ``calls``.
 
     The ``meter`` counts the replies that a trial uses.
     """
@@ -101,7 +101,7 @@ class RecordedReplies:
             slot=slot,
         )
 
-    def read(self, recorded: CachedCall, earlier: int) -> ChatReply:
+    def read(self, recorded: CachedCall, cached_attempts: int) -> ChatReply:
         """Read a recorded reply by the present rules, as an audit does, not by those of its run."""
         attempts, last = recorded.attempts, recorded.attempts[-1]
         payload = reply_object(last.reply or "{}") if last.http_status == 200 else {}
@@ -109,7 +109,7 @@ class RecordedReplies:
         if payload and reading.outcome in ANSWERS:
             last = replace(last, outcome=reading.outcome, usage=reading.usage)
             attempts = (*attempts[:-1], last)
-        return ChatReply(reading.text, last.outcome, recorded.request, attempts, earlier)
+        return ChatReply(reading.text, last.outcome, recorded.request, attempts, cached_attempts)
 
     def count(self, reply: ChatReply, *, shared: bool = False) -> None:
         """Count a reply that a trial uses, and its model where another one was asked for.
@@ -117,7 +117,7 @@ class RecordedReplies:
         ``shared``: this run has sent its call for another trial.
         """
         last, meter = reply.attempts[-1], self.meter
-        cached = reply.earlier == len(reply.attempts)
+        cached = reply.cached_attempts == len(reply.attempts)
         meter.calls_cached += cached
         meter.calls_live += not cached
         meter.calls_shared += cached and shared

@@ -52,7 +52,7 @@ class DirectSender:
         correct = await self.limiter.acquire(estimate, order=call.order)
         if coordinator := reservation.budget.ledger.coordinator:
             # Nothing is sent or durable here yet, so this wait can be cancelled.
-            call.wait = Wait("for the coordinator, which shares --max-cost out")
+            call.wait = Wait("for the coordinator, which shares out the cap")
             worst = reservation.key, reservation.usd, reservation.label
             if not await coordinator.reserve(*worst):
                 raise TrialSuspended(USED_UP)

@@ -156,7 +156,7 @@ class CacheFile:
         self.closing.close()
         self._writer.close()
         self.locks.close()
-        self.reading.close()  # before the writer, which then ends the journal
+        self.reading.close()  # first: the last to close ends the journal, and must be able to write
         if self.texts is not None:
             close_texts(self.texts)
 
@@ -246,11 +246,11 @@ class CallStore(CacheFile):
         return text_of(*rows[0]) if rows else None
 
     def replace(self, name: str, text: str, _: Execute) -> None:
-        """Store a text under a name that is no call key, after a checksum; an operation."""
+        """Store a text after a checksum, not under a call key. Runs in a transaction."""
         self.texts.set(name, _behind_checksum(text))
 
     def remove(self, name: str, _: Execute) -> None:
-        """Delete the text under a name that is no call key; an operation."""
+        """Delete the text under a name that is no call key. Runs in a transaction."""
         self.texts.delete(name)
 
     def names(self, prefix: str) -> list[str]:
@@ -259,7 +259,7 @@ class CallStore(CacheFile):
         return [name.decode(errors="replace") for (name,) in rows]
 
     def keep(self, entry: CachedCall, execute: Execute) -> CachedCall:
-        """Store an entry unless there is one, and return the stored one; an operation.
+        """Store an entry unless there is one, and return the stored one. Runs in a transaction.
 
         A damaged one is quarantined.
         """
@@ -275,7 +275,7 @@ class CallStore(CacheFile):
         return entry
 
     def _quarantine_row(self, name: str, execute: Execute) -> None:
-        """Rename a damaged row and keep its content; an operation."""
+        """Rename a damaged row and keep its content. Runs in a transaction."""
         renamed = _DAMAGED + name
         if earlier := self.names(renamed):
             renamed += f" {len(earlier) + 1}"

@@ -65,7 +65,7 @@ def rows_of(record: TrialRecord) -> dict[str, list[Row]]:
         "states": [(*key, *row) for row in record.states],
         "decisions": list(_decision_rows(record)),
         "calls": [
-            call_row(key, call.request, attempt, cached=attempt.number <= call.earlier)
+            call_row(key, call.request, attempt, cached=attempt.number <= call.cached_attempts)
             for call in record.calls
             for attempt in call.attempts
         ],

@@ -37,7 +37,7 @@ SPARE_FILES = 64
 def live_clients(
     plan: Plan,
     options: Options,
-    earlier: Mapping[str, Usage | None],
+    usage: Mapping[str, Usage | None],
     cache: ResponseCache,
     ledger: Ledger,
     *,
@@ -50,7 +50,7 @@ def live_clients(
 ) -> dict[str, LlmClient]:
     """Return clients with connections, closed with ``stack``, and a share of the rate limits.
 
-    ``earlier`` is a result of ``earlier_answers``. ``rounds`` are those of this run, which get the
+    ``usage`` is a result of ``earlier_answers``. ``rounds`` are those of this run, which get the
     batch modes of its models. Variables in ``urls`` go before the environment. ``limiters`` by
     registered model go on from earlier clients, and get those that are made. Raises UsageError
     where a key is missing, or a cap could not be enforced.
@@ -70,7 +70,7 @@ def live_clients(
         rpm, tpm = (limit and max(1, int(limit * share)) for limit in rates)
         pause, place = pauses[plan.endpoints[name]], plan.entries[name].place
         limiters.setdefault(model, Limiter(rpm=rpm, tpm=tpm, pause=pause, place=place))
-    budget = Budget(ledger, trial_costs(plan, earlier, batch=options.batch))
+    budget = Budget(ledger, trial_costs(plan, usage, batch=options.batch))
     free = Budget(Ledger(cache, ""))
     clients = {}
     for name, entry in plan.entries.items():
@@ -78,7 +78,7 @@ def live_clients(
         wire = plan.parts.formats[entry.format]
         # A round is submitted at once: no call of it waits for a probe.
         verified = rounds is not None and rounds.submits
-        state = EndpointState(name, entry, plan.endpoints[name], wire, verified, name in earlier)
+        state = EndpointState(name, entry, plan.endpoints[name], wire, verified, name in usage)
         clients[name] = LlmClient(
             state,
             cache,
@@ -129,8 +129,8 @@ def _check_money(plan: Plan, ledger: Ledger) -> None:
         unknown = cost_usd(entry, Usage(input_tokens=1, output_tokens=1)) is None
         if ledger.cap is not None and unknown:
             raise UsageError(
-                f"the price of {name} is unknown, so --max-cost cannot hold: give it a `price` in "
-                + entry.place
+                f"the price of {name} is unknown, so {ledger.cap.source} cannot hold: give it a "
+                f"`price` in {entry.place}"
             )
     if not plan.is_free:
         ledger.read()

@@ -52,7 +52,7 @@ class RunSetup:
     run: str
     plan: Plan
     options: Options
-    earlier: Mapping[str, Usage | None]
+    usage: Mapping[str, Usage | None]
     first: FirstDecisions
     urls: Mapping[str, str]
 
@@ -241,7 +241,7 @@ async def _play(chunk: Chunk, state: WorkerRun, tell: Callable[..., object]) -> 
         try:
             calls = Calls()
             clients = live_clients(
-                setup.plan, setup.options, setup.earlier, replies, ledger, calls=calls, stack=stack,
+                setup.plan, setup.options, setup.usage, replies, ledger, calls=calls, stack=stack,
                 urls=setup.urls, share=chunk.share,
                 limiters=state.limiters.setdefault(chunk.share, {}),
             )  # fmt: skip

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -44,8 +44,8 @@ class LocalRunner:
     # The open questions of each trial that is running and has asked.
     _asking: Counter[int] = field(default_factory=Counter)
     _gate: asyncio.Semaphore = field(default_factory=partial(asyncio.Semaphore, A_FEW))
-    # Keyed by model and its number of answered calls, so that an answer starts a new count.
-    _failures_in_a_row: Counter[tuple[str, int]] = field(default_factory=Counter)
+    # Keys of failed calls by model and its number of answered calls: an answer starts a new set.
+    _failed: dict[tuple[str, int], set[str]] = field(default_factory=partial(defaultdict, set))
 
     def __post_init__(self) -> None:
         self.meters = {name: client.meter for name, client in self.clients.items()}
@@ -137,13 +137,13 @@ class LocalRunner:
     def _watch_for_outage(self, record: TrialRecord) -> None:
         """Stop when trials keep failing for one model that answers no call in between."""
         asked = self._trials.arms[record.spec.arm].asked
-        for name in {asked[failed.side] for failed in record.failed_calls}:
-            since = name, self.clients[name].meter.calls_live
-            self._failures_in_a_row[since] += 1
-            failed = self._failures_in_a_row[since]
-            if failed >= FAILURES_IN_A_ROW:
+        keys = {asked[call.side]: call.request.key for call in record.failed_calls}
+        for name, key in keys.items():  # trials may share a failed call: it counts once
+            failed = self._failed[name, self.clients[name].meter.calls_live]
+            failed.add(key)
+            if len(failed) >= FAILURES_IN_A_ROW:
                 raise ProviderDown(
-                    f"the last {failed} trials with {name} failed and no call was answered "
+                    f"the last {len(failed)} trials with {name} failed and no call was answered "
                     f"in between ({record.error}): the rest is not tried. When the service answers "
                     "again, run the same command to go on"
                 )

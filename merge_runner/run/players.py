@@ -28,7 +28,7 @@ async def open_player(
 ) -> Player:
     """Return the player of a live run, closed with ``stack``; raises UsageError."""
     plan, options, ledger = session.plan, session.options, session.ledger
-    earlier = earlier_answers(plan, session.cache)
+    usage = earlier_answers(plan, session.cache)
     first = FirstDecisions()
     if not options.keep_going:
         first = FirstDecisions(MOST_INVALID, one_by_one=rounds is None)
@@ -36,11 +36,11 @@ async def open_player(
     if options.dask is not None:
         client = await stack.enter_async_context(connected(options.dask))
         urls = base_urls(plan.entries)
-        setup = RunSetup(secrets.token_hex(), plan, options, earlier, first, urls)
+        setup = RunSetup(secrets.token_hex(), plan, options, usage, first, urls)
         return ClusterRunner(client, setup, session.cache, ledger)
     calls = Calls()
     clients = live_clients(
-        plan, options, earlier, session.cache, ledger, calls=calls, stack=stack, rounds=rounds
+        plan, options, usage, session.cache, ledger, calls=calls, stack=stack, rounds=rounds
     )
     if rounds is not None:
         stack.push_async_callback(rounds.close)

@@ -12,7 +12,7 @@ from merge_runner.errors import ProviderDown, UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.http_outcome import TransportFailure
 from merge_runner.llm.probe import LONG_WAIT_S
-from merge_runner.llm.refusals import if_nobody, set_base_url
+from merge_runner.llm.rejections import if_nobody, set_base_url
 from merge_runner.llm.templates import recorded_values
 from merge_runner.providers import PROVIDERS, UNNAMED, ModelEntry, model_id, resolve_endpoint
 from merge_runner.run.options import Options

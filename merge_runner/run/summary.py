@@ -27,7 +27,7 @@ def underpriced(tier: str) -> str:
     """Return the warning about replies whose service tier has no price in the registry."""
     return (
         f"replies are of the service tier {tier!r}, which is billed at about twice the price that "
-        "is counted, and --max-cost knows nothing of that: leave that tier out, or give the model "
+        "is counted, and the cap knows nothing of that: leave that tier out, or give the model "
         f"a price with tiers = {{ {tier} = 2.0 }}"
     )
 

@@ -129,7 +129,7 @@ def answered(drive: Drive, side: Side, number: int, decision: Decision) -> Decis
         plan=decision.plan if has_plan else None,
         failure=said.failure,
         fallback=not has_plan,
-        reply=ChatReply("", said.outcomes[-1], request, attempts, earlier=0),
+        reply=ChatReply("", said.outcomes[-1], request, attempts, cached_attempts=0),
     )
 
 

@@ -184,7 +184,7 @@ class Lifecycle:
                 f"{model}: no batch can be submitted ({exc}): nothing else is asked. When the "
                 "service answers again, run the same command"
             )
-        if exc.kind in ("quota", "refused"):
+        if exc.kind in ("quota", "rejected"):
             kind = QuotaExhausted if exc.kind == "quota" else EndpointRefused
             batch_id = batch.note.batch_id and f" batch {batch.note.batch_id}"
             batch.error = kind(

@@ -182,7 +182,7 @@ class BatchSender:
         if call.pending_batch is not None:
             end = call.pending_batch.note.lines[call.request.key]
             call.attempts = [a for a in call.attempts if a.number < end]
-            call.earlier = len(call.attempts)
+            call.earlier_attempts = len(call.attempts)
 
     async def send(self, call: Call, reservation: Reservation) -> Sent:
         """Wait for the outcome of a call in its batch or in the next round."""

@@ -29,7 +29,7 @@ TIMEOUT_S = 600.0
 MOST_BYTES = 1_000_000_000
 LONGEST_MESSAGE = 500
 ID = re.compile(r"(?!.*\.\.)[A-Za-z0-9_-][A-Za-z0-9_./-]{0,999}")
-FailureKind = Literal["again", "smaller", "quota", "refused", "lost"]
+FailureKind = Literal["again", "smaller", "quota", "rejected", "lost"]
 Gone = Mapping[int, FailureKind]
 # Meaning of a 404 and 410: a batch is gone; its results may not exist yet.
 NO_BATCH: Gone = {404: "lost", 410: "lost"}
@@ -173,8 +173,8 @@ class BatchService(ABC):
         For an existing batch ``gone`` has the meaning of statuses such as 404.
         """
         outcome = judge_error(error, self.wire)
-        kinds: dict[str, FailureKind] = {"retry": "again", "quota": "quota", "refused": "refused"}
-        kind = kinds.get(outcome.action, "again" if gone else "refused")
+        kinds: dict[str, FailureKind] = {"retry": "again", "quota": "quota", "rejected": "rejected"}
+        kind = kinds.get(outcome.action, "again" if gone else "rejected")
         enqueued = "token_limit_exceeded" in error.names or "enqueued" in error.message.lower()
         if not gone and (enqueued or error.status == 413):
             kind = "smaller"
@@ -197,7 +197,7 @@ class BatchService(ABC):
             )
         except TransportFailure as exc:
             # A reply that is refused for its content will be the same next time.
-            kinds: dict[str, FailureKind] = {"refused": "refused", "fail": "lost"}
+            kinds: dict[str, FailureKind] = {"rejected": "rejected", "fail": "lost"}
             kind = kinds.get(exc.action, "again")
             raise BatchFailed(kind, str(exc), sent=exc.sent) from exc
         if 200 <= raw.status < 300:

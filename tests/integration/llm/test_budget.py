@@ -3,12 +3,14 @@
 import asyncio
 import contextlib
 import math
+import time
 from functools import partial
 from types import SimpleNamespace
 
 import pytest
 
 from merge_runner.errors import CacheFailed, RecordingError, TrialSuspended, UsageError
+from merge_runner.llm import budget as admission
 from merge_runner.llm.attempts import Meter
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.ledger import CallLabel, Cap, Ledger, reasons
@@ -169,7 +171,7 @@ async def test_a_running_trial_never_waits_for_the_admission_of_another_that_sha
     await asyncio.wait_for(admitted, 5)
     assert not ahead.done()
     paid = await budget.reserve(shared, "key", asked(1.5))  # of the money that is kept for 1
-    assert (paid.trial, budget.running) == (1, {1: 0.5})
+    assert (paid.trial, budget.expected_usd) == (1, {1: 0.5})
     paid.close()
     budget.leave(1)
     await ahead
@@ -194,7 +196,7 @@ async def test_a_call_of_a_running_trial_has_its_place_whatever_it_waits_for(
     ledger, cap, running, calls, joined, go_on
 ):
     budget = budget_of(ledger, cap, each(10.0))
-    budget.running.update(dict.fromkeys(running, 10.0))
+    budget.expected_usd.update(dict.fromkeys(running, 10.0))
     budget._spent_before = True
     tasks = []
     for number, (wait, trials) in enumerate(calls):
@@ -232,6 +234,25 @@ def test_a_sum_read_meanwhile_changes_no_check_of_a_transaction(ledger, cache):
         return first, ledger.reserve("b", 1, 0.6, O3, execute)
 
     assert cache.run_now([twice]) == [(True, False)]
+
+
+async def test_what_waits_reads_no_sum_from_before_a_reservation(ledger, monkeypatch):
+    monkeypatch.setattr(admission, "READ_EVERY_S", 0.01)
+    budget, read = budget_of(ledger, 1.0), ledger.store.rows
+    paid = await set_aside(budget, 1, 0.5)
+
+    def late(*query):
+        rows = read(*query)
+        time.sleep(0.2)
+        return rows
+
+    monkeypatch.setattr(ledger.store, "rows", late)
+    waiting = asyncio.create_task(set_aside(budget, 2, 0.75))
+    await asyncio.sleep(0.05)
+    await paid.begin(1)
+    await asyncio.sleep(0.25)
+    assert ledger.committed_usd == 0.5
+    waiting.cancel()
 
 
 async def test_an_attempt_takes_the_place_of_the_oldest_running_trial_that_shares_it(ledger):

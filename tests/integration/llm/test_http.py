@@ -306,8 +306,8 @@ async def test_connections_are_kept_alive_while_a_model_thinks(recorder, monkeyp
 @pytest.mark.parametrize(
     ("answer_of_the_proxy", "outcome", "action", "words"),
     [
-        (b"HTTP/1.1 403 Forbidden\r\n\r\n", "proxy_refused", "refused", "HTTP 403: Forbidden"),
-        (b"HTTP/1.1 407 Needs X\r\n\r\n", "proxy_refused", "refused", "HTTP 407: Needs X"),
+        (b"HTTP/1.1 403 Forbidden\r\n\r\n", "proxy_refused", "rejected", "HTTP 403: Forbidden"),
+        (b"HTTP/1.1 407 Needs X\r\n\r\n", "proxy_refused", "rejected", "HTTP 407: Needs X"),
         (b"HTTP/1.1 503 No\r\n\r\n", "proxy_refused", "retry", "llm.invalid (HTTP 503: No)"),
         (b"", "connection_lost", "retry", "disconnected"),
     ],

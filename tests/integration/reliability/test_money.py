@@ -199,6 +199,12 @@ async def test_an_unknown_price_is_said_and_needs_yes(merge_runner, experiments)
         capped = await merge_runner(*sweep, "--yes", "--max-cost", 1, code=2, **env)
         assert "--max-cost cannot hold" in capped.err
         assert "give it a `price` in [mine] in experiments/models.toml" in capped.err
+        baseline = experiments / "baseline.toml"
+        study = baseline.read_text()
+        baseline.write_text(f"[budget]\ntotal_usd = 0.4\n{study}")
+        capped = await merge_runner(*sweep, "--yes", code=2, **env)
+        assert "so [budget] of baseline cannot hold" in capped.err
+        baseline.write_text(study)
         assert server.requests == 0
         run = await merge_runner(*sweep, "--yes", **env)
     assert run.code == 0, run.err
@@ -225,7 +231,9 @@ async def test_runs_of_two_models_under_one_cap_never_pass_it_and_both_end(
     assert calls["n"] <= server.requests
 
 
-async def test_what_is_set_aside_is_shown_with_its_reasons_and_released_by_name(merge_runner):
+async def test_what_is_set_aside_is_shown_with_its_reasons_and_released_by_name(
+    merge_runner, tmp_path
+):
     async def middle(request, handler):
         if server.requests in (3, 5):
             return web.Response(status=502, text="<html>502 Bad Gateway</html>")
@@ -233,7 +241,11 @@ async def test_what_is_set_aside_is_shown_with_its_reasons_and_released_by_name(
 
     async with watched(middle) as server:
         assert (await merge_runner(*ONE, **server.account)).code == 0
+    cache = tmp_path / "cache/responses"
+    (cache / "live.lock").unlink()
+    before = {path.name: path.read_bytes() for path in cache.iterdir()}
     told = await merge_runner("ledger")
+    assert {path.name: path.read_bytes() for path in cache.iterdir()} == before
     driver = f"o3 at {server.url.removeprefix('http://')}"
     assert re.match(
         r"sweep +spent_usd +reserved_usd +attempts of unknown cost\n"
@@ -245,7 +257,7 @@ async def test_what_is_set_aside_is_shown_with_its_reasons_and_released_by_name(
     (account_before,) = json.loads((await merge_runner("ledger", "--json")).out)
     assert account_before["open_attempts"] == account_before["reasons"][0]["attempts"] == 2
     asked = await merge_runner("ledger", "--release", "baseline/o3/set0", code=2)
-    assert "--max-cost may be passed by as much" in asked.err
+    assert "a cap may be passed by as much" in asked.err
     assert "add --yes" in asked.err
     unknown = await merge_runner("ledger", "--release", "other/o3/set0", "--yes")
     assert (unknown.code, "valid: baseline/o3/set0" in unknown.err) == (2, True)

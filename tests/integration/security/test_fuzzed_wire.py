@@ -50,7 +50,7 @@ def test_fuzz_of_headers_every_delay_is_one_that_can_be_waited_for(headers, payl
 @example(500, {}, '{"error": {"code": ' + "9" * 5000 + "}}", "openai-chat")
 def test_fuzz_of_replies_every_reply_has_an_outcome(status, headers, body, wire):
     raw = RawReply(status, headers, body)
-    assert judge(raw, FORMATS[wire]).action in {"accept", "retry", "fail", "quota", "refused"}
+    assert judge(raw, FORMATS[wire]).action in {"accept", "retry", "fail", "quota", "rejected"}
     for provider in ("openai", None):
         assert may_be_charged(raw, provider) in (True, False)
 

@@ -29,7 +29,7 @@ def valid(plan):
 
 
 def chat_reply(text, outcome="ok"):
-    return ChatReply(text=text, outcome=outcome, request=REQUEST, attempts=(), earlier=0)
+    return ChatReply(text=text, outcome=outcome, request=REQUEST, attempts=(), cached_attempts=0)
 
 
 def ask(*replies, seen=SEEN, variant="baseline", begins=0, **scenario):

@@ -68,6 +68,13 @@ async def test_two_who_ask_the_same_at_once_share_one_call(make):
     assert (meter.calls_live, meter.calls_cached, meter.calls_shared) == (1, 1, 1)
 
 
+async def test_attempts_of_a_shared_call_that_fails_count_once(make):
+    client = make(error(400))
+    asked = [client.ask("prompt", slot()) for _ in range(2)]
+    failed = await asyncio.gather(*asked, return_exceptions=True)
+    assert [(len(call.attempts), call.cached_attempts) for call in failed] == [(1, 0), (1, 1)]
+
+
 async def test_a_call_whose_wait_for_money_times_out_is_no_call_that_was_given_up(
     make, monkeypatch
 ):

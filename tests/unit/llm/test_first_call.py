@@ -15,7 +15,7 @@ from tests.support.virtual_time import now_s
 
 pytestmark = pytest.mark.usefixtures("virtual_time")
 WEB_PAGE = raw("\n<!DOCTYPE html><html>Welcome</html>")
-PROXY_407 = TransportFailure("proxy_refused", "the proxy says 407", sent=False, action="refused")
+PROXY_407 = TransportFailure("proxy_refused", "the proxy says 407", sent=False, action="rejected")
 REFUSED = TransportFailure("no_connection", "refused", sent=False)
 
 
@@ -64,7 +64,7 @@ async def test_what_passes_is_tried_again_by_one_call_alone(begin):
     assert first_three == sorted(set(first_three)), "one at a time"
 
 
-@pytest.mark.parametrize("case", cases("refusals", "at_once"))
+@pytest.mark.parametrize("case", cases("rejections", "at_once"))
 async def test_a_wrong_configuration_is_told_by_one_call(begin, case):
     client = begin(reply_of(case))
     tasks = ask_all(client)
@@ -76,7 +76,7 @@ async def test_a_wrong_configuration_is_told_by_one_call(begin, case):
     assert all(isinstance(result, BaseException) for result in results)
 
 
-@pytest.mark.parametrize("case", cases("refusals", "after_three"))
+@pytest.mark.parametrize("case", cases("rejections", "after_three"))
 async def test_what_may_pass_is_told_after_three_of_them_within_seconds(begin, case):
     client, reply = begin(reply_of(case)), reply_of(case)
     with pytest.raises(EndpointRefused, match=case["told"]):

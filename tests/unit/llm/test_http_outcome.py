@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from merge_runner.llm.delays import server_delay_s
 from merge_runner.llm.formats import FORMATS, Reading, WireFormat, WireRequest
 from merge_runner.llm.http_outcome import RawReply, judge, may_be_charged
-from merge_runner.llm.refusals import reason_of, why_refused
+from merge_runner.llm.rejections import reason_of, why_rejected
 from merge_runner.providers import ModelEntry
 from merge_runner.records import Usage
 from tests.support.cases import by_format, cases, table
@@ -82,7 +82,7 @@ def test_what_no_call_of_a_run_would_fare_better_with(case):
     assert reason_of(outcome, "http://localhost/v1/chat/completions") == reason
     if reason is not None:
         entry = ModelEntry(provider="local", format="openai-chat", id="m", max_output_tokens=10)
-        assert "\n" not in why_refused(reason, entry, outcome)
+        assert "\n" not in why_rejected(reason, entry, outcome)
 
 
 @pytest.mark.parametrize(("url", "reason"), table("http_outcomes", "urls").items())
@@ -141,7 +141,7 @@ json_values = st.recursive(
 @example("openai-chat", 200, '{"error": {"code": "²"}}')
 def test_no_body_makes_it_raise(wire, status, body):
     found = judged(wire, status, body)
-    assert found.action in ("accept", "retry", "fail", "quota", "refused")
+    assert found.action in ("accept", "retry", "fail", "quota", "rejected")
     assert (bool(found.name), isinstance(found.reading.text, str)) == (True, True)
 
 

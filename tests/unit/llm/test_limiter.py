@@ -2,6 +2,7 @@ import asyncio
 import random
 
 import pytest
+from asyncio_throttle.throttler import Throttler
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -67,6 +68,22 @@ async def test_a_late_arrival_of_an_older_trial_goes_first():
     queue.ask("oldest", order=1)
     await queue.all_served()
     assert queue.names == ["first", "oldest", "second"]
+
+
+async def test_an_older_request_that_comes_while_the_throttle_waits_is_next(monkeypatch):
+    acquire = Throttler.acquire
+
+    async def slowly(throttle):
+        await asyncio.sleep(1)
+        await acquire(throttle)
+
+    monkeypatch.setattr(Throttler, "acquire", slowly)
+    queue = Queue(Limiter(rpm=60))
+    for name, order in (("younger", 5), ("older", 1)):
+        queue.ask(name, order=order)
+        await ticks()
+    await asyncio.wait_for(queue.all_served(), MINUTE)
+    assert queue.names == ["younger", "older"]
 
 
 @pytest.mark.parametrize("rpm", [1, 7, 50, 245, 500])

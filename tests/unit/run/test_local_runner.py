@@ -1,11 +1,12 @@
 """How a trial is played live: what it asks at an instant is asked side by side."""
 
 import asyncio
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 
-from merge_runner.errors import SweepStopped, TrialSuspended, UsageError
+from merge_runner.errors import ProviderDown, SweepStopped, TrialSuspended, UsageError
 from merge_runner.llm.attempts import Meter
 from merge_runner.records import SIDES, CallFailed, ChatReply, ChatRequest, Slot
 from merge_runner.run.local_runner import LocalRunner
@@ -60,6 +61,24 @@ async def test_a_failed_call_leaves_the_other_one_its_answer(play, failing):
     trial = await play(Client(**{failing: CallFailed("no answer", REQUEST)}))
     assert (trial.status, trial.error) == ("failed", f"{failing}: no answer")
     assert [row.side for row in trial.decisions] == [side for side in SIDES if side != failing]
+
+
+@pytest.mark.parametrize("are_shared", [True, False])
+async def test_a_failed_call_that_trials_share_is_no_outage(are_shared):
+    class Failing(Client):
+        async def ask(self, prompt, slot, *, order):
+            key = "shared" if are_shared else str(order)
+            raise CallFailed("HTTP 400", replace(REQUEST, key=key))
+
+    plan, failed = make_plan("baseline", "emulator", conditions=["N_0_0"], repetitions=12), []
+    runner = LocalRunner(plan, {"emulator": Failing()}, 1)
+    playing = runner.play(plan.trial_specs(), lambda _, trial: failed.append(trial.status))
+    if are_shared:
+        await playing
+    else:
+        with pytest.raises(ProviderDown, match="the last 10 trials with emulator failed"):
+            await playing
+    assert failed == ["failed"] * (12 if are_shared else 10)
 
 
 async def test_a_trial_that_is_cancelled_takes_both_calls_with_it(play):

@@ -212,7 +212,7 @@ async def test_a_list_that_turns_in_a_circle_ends(server, service_at):
 )
 @pytest.mark.parametrize(
     ("kind", "statuses"),
-    {"lost": (404, 410), "again": (405, 413, 429, 500), "refused": (401,)}.items(),
+    {"lost": (404, 410), "again": (405, 413, 429, 500), "rejected": (401,)}.items(),
 )
 async def test_a_batch_that_may_exist_is_never_asked_singly(
     server, service_at, form, where, kind, statuses

@@ -365,7 +365,7 @@ async def test_results_that_never_come_are_waited_for_an_hour_and_unreadable_one
 
 
 @pytest.mark.parametrize(
-    ("kind", "raised", "code"), [("quota", QuotaExhausted, 3), ("refused", EndpointRefused, 2)]
+    ("kind", "raised", "code"), [("quota", QuotaExhausted, 3), ("rejected", EndpointRefused, 2)]
 )
 async def test_a_creation_that_is_refused_for_good_ends_the_run_and_costs_nothing(
     kind, raised, code, service, run
@@ -501,7 +501,7 @@ async def test_a_batch_that_is_gone_stops_the_run_unless_it_asks_singly(cache, s
     assert anew.ledger.read().open_attempts == 1  # nobody knows what it cost
 
 
-@pytest.mark.parametrize("kind", ["refused", "quota"])
+@pytest.mark.parametrize("kind", ["rejected", "quota"])
 async def test_a_batch_that_is_refused_to_a_key_is_never_asked_anew(cache, kind, service):
     await left_behind(cache, service)
     for _ in range(2):

@@ -9,7 +9,7 @@ from merge_runner.llm.formats.wire import as_dict, as_text, at, is_error
 from merge_runner.llm.http_outcome import AttemptOutcome
 from merge_runner.providers import PROVIDERS, ModelEntry
 
-# Statuses of a refusal of the request itself.
+# Statuses that reject the request itself.
 REQUEST_ITSELF = (200, 400, 413, 422, 429)
 REASONS = {
     "bad_certificate": "the endpoint's certificate cannot be trusted, and nothing was sent; check "
@@ -37,7 +37,7 @@ REASONS = {
     "llama.cpp: --reasoning-format none), or let the model think, as `chat_template_kwargs = "
     "{{ enable_thinking = true }}` among `parameters` of {place} does",
 }
-# A transient fault may look like these: only several of them mean the configuration.
+# A transient fault may look like these: only several mean the configuration.
 UNSURE = frozenset({"other_error", "text", "unreadable_reply", "proxy_refused"})
 # A repeated part of a path, as in /v1/v1/messages.
 _TWICE = re.compile(r"(/\w.*)\1(/|$)")
@@ -49,7 +49,7 @@ def reason_of(outcome: AttemptOutcome, url: str) -> str | None:
     None: others may succeed.
     """
     raw, name = outcome.raw, outcome.name
-    if outcome.action == "refused":
+    if outcome.action == "rejected":
         is_twice = name == "unknown_model" and _TWICE.search(urlsplit(url).path)
         return "path_twice" if is_twice else name
     if raw is None or name == "bad_prompt":
@@ -68,7 +68,7 @@ def reason_of(outcome: AttemptOutcome, url: str) -> str | None:
     return "reasoning_alone" if is_alone else None
 
 
-def why_refused(reason: str, entry: ModelEntry, outcome: AttemptOutcome) -> str:
+def why_rejected(reason: str, entry: ModelEntry, outcome: AttemptOutcome) -> str:
     """Return the text of a reason, with what to set and what the server sent."""
     raw = outcome.raw
     why = REASONS["other_format" if reason == "text" else reason].format(
