@@ -54,12 +54,13 @@ DIRECTIONS = {
 VERDICT_RULES = (
     "Like people in crashes or gap: the whole interval of the difference lies within 5 points, "
     "or 1 m",
-    "Like people in who goes first: their pattern is found, with p below .05, by a logistic "
-    "regression (Firth) over all trials without a crash, not by the counts shown",
+    "Like people in who goes first: the one ahead or, side by side, the slower one goes first more "
+    "often, with p below .05 in a logistic regression (Firth) over all trials without a crash, not "
+    "by the counts shown",
     "Fewer, more, smaller, larger, unlike: a difference is shown, with p below .05, corrected "
     "(Holm) for the driver's {tests}tests",
-    f"Cannot tell: neither is shown. No verdict: fewer than {ENOUGH} trials, or fewer than half of "
-    "those that ended",
+    f"Cannot tell: neither is shown. No verdict: fewer than {ENOUGH} trials are counted, or fewer "
+    "than half of those that ended",
 )
 FITTED_RULE = (
     "Like people in the gap by headway: more headway, more gap, with p below .05 in a linear "
@@ -478,8 +479,8 @@ def crashes(values: Values) -> str:
 def crash_text(rules: Sequence[tuple[str, Sequence[float]]]) -> str:
     """Return the meaning of a crash by the collision rules that were played, with their steps."""
     return " or, by the scenario of the trial, ".join(
-        f"{RULES_MEAN[rule]}, checked every {' or '.join(map('{:g}'.format, steps_s))} s "
-        f"({PLAYED_RULES[rule]})"
+        f"{RULES_MEAN[rule]}, checked every {' or '.join(map('{:g}'.format, steps_s))} s"
+        f"{'' if rule == 'rectangle' else f' ({PLAYED_RULES[rule]})'}"
         for rule, steps_s in rules
     )
 
@@ -621,7 +622,7 @@ def _tally(drivers: Sequence[Mapping[str, Values]]) -> str:
             who = " drivers" * (not like)
             like.append(f"{states.count(SHOWN) or 'none'} of {len(drivers)}{who} {does}")
     if not like:
-        return f"Whether {len(drivers)} drivers are like people cannot be told."
+        return f"For {len(drivers)} drivers no verdict on likeness to people is possible."
     rest = f" No verdict is possible on {joined(unclear)}." if unclear else ""
     return f"{capital('; '.join(like))}.{rest}"
 

@@ -224,7 +224,7 @@ def _notes(study: Study, by: str) -> Iterator[str]:
         measure, (of_primary, others) = primary(study), _families(study, by)
         name = METRIC_NAMES.get(measure.name, measure.heading)
         first = f"the {len(of_primary)} test{'s' * (len(of_primary) != 1)} of “{name}”"
-        rest = f"the {others} others together"
+        rest = f"the {others} other tests of the table effects"
         names = f" by {joined([*dict.fromkeys(of_primary)])}" if of_primary else ""
         yield f"{CORRECTED} {first}{names}, and apart from them for {rest}"
         yield "detectable: found at p < .05, before correction, with power .8"

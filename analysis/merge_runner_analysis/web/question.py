@@ -405,14 +405,14 @@ def _crossing_of(levels: Sequence[Row]) -> str:
 def _counted(levels: Sequence[Row], metric: str, effects: Sequence[Row]) -> str:
     """Return how many trials the measure counts, as in ``58 trials without a crash, 12 with one``.
 
-    Trials of equal drivers, words and course are one: ``80 that repeat another one are left out``,
+    Trials of equal drivers, words and course are one: ``80 identical to another one are left out``,
     with the levels that change nothing.
     """
     trials = f"{sum(count_of(row, 'n') for row in levels):,} trials"
     repeated = sum(count_of(row, "repeated") for row in levels)
     copied = joined([level_text(row) for row in effects if is_copied(row)] or [""])
     why = f" ({copied} changes nothing)" if copied else ""
-    left_out = f"; {repeated:,} that repeat another one{why} are left out" if repeated else ""
+    left_out = f"; {repeated:,} identical to another one{why} are left out" if repeated else ""
     crashed = sum(count_of(row, "crashed") for row in levels)
     what = " that ended" if metric == COLLISIONS.name else " that count"
     if metric == LEFT_FIRST.name:

@@ -70,7 +70,8 @@ PROGRAMS.register(
     "cei",
     Program(
         CeiDriver,
-        "a model of human merging (Siebinga et al. 2024), re-implemented with thresholds of ours",
+        "communication-enabled interaction (Siebinga et al. 2024), a model of human merging, with "
+        "other thresholds",
         {SET: BY_RESISTANCE, PAIR: 0},
         1 / TICK_S,
         settable=True,

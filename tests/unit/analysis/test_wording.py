@@ -134,12 +134,12 @@ NONE = "No language model drove here."
         ),
         (
             [OPEN_GAP, {"headway": row("headway", n=19, kind="mock")}],
-            ["Whether 2 drivers are like people cannot be told.", NONE],
+            ["For 2 drivers no verdict on likeness to people is possible.", NONE],
         ),
         (
             [of_kind(PROGRAM, gap=OPEN) | {"collisions": row("collisions", n=11, counted=counted)}
              for counted in ("11 of 11", "2 of 10", "1 of 11", "0 of 9")],
-            ["Whether 4 drivers are like people cannot be told.",
+            ["For 4 drivers no verdict on likeness to people is possible.",
              f"Crashes range from 0 of 9 trials (d3) to 11 of 11 trials (d0). {NONE}"],
         ),
     ],
@@ -170,7 +170,7 @@ def test_two_drivers_are_told_apart_with_names_and_numbers():
 
 def test_a_crash_is_explained_by_the_rules_that_were_played():
     assert crash_text([("rectangle", [0.05, 0.2])]) == (
-        "the vehicles' outlines overlap, checked every 0.05 or 0.2 s (people's rule)"
+        "the vehicles' outlines overlap, checked every 0.05 or 0.2 s"
     )
     both = crash_text([(rule, [0.2]) for rule in RULES_MEAN])
     assert " or, by the scenario of the trial, " in both

@@ -185,7 +185,7 @@ def test_a_side_has_its_count_and_the_chart_the_axis_of_its_data():
     # Of both drivers, which are drawn.
     assert (
         made.counted
-        == "400 trials without a crash, 12 with one; 28 that repeat another one are left out"
+        == "400 trials without a crash, 12 with one; 28 identical to another one are left out"
     )
     (chart,) = made.charts
     assert chart.title == "By factor"
@@ -206,7 +206,7 @@ def test_levels_that_are_not_tested_are_not_drawn():
     assert [line.head for line in chart.lines] == ["hurry", ""]
     assert (
         made.counted
-        == "200 trials without a crash, 6 with one; 14 that repeat another one (persona=yes "
+        == "200 trials without a crash, 6 with one; 14 identical to another one (persona=yes "
         "changes nothing) are left out"
     )
 
