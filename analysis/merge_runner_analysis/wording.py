@@ -58,7 +58,7 @@ VERDICT_RULES = (
     "often, with p below .05 in a logistic regression (Firth) over all trials without a crash, not "
     "by the counts shown",
     "Fewer, more, smaller, larger, unlike: a difference is shown, with p below .05, corrected "
-    "(Holm) for the driver's {tests}tests",
+    "(Holm) for a driver's {tests}tests",
     f"Cannot tell: neither is shown. No verdict: fewer than {ENOUGH} trials are counted, or fewer "
     "than half of those that ended",
 )
