@@ -41,7 +41,7 @@ def recording_export(
     from merge_runner.results.recorded_sweeps import carried_plugins, provenance_of
     from merge_runner.results.recording import export_recording
     from merge_runner.results.store import results_digest
-    from merge_runner.results.sweeps import recorded_sweeps, sweeps_with_calls
+    from merge_runner.results.sweeps import recorded_sweeps
 
     if sweeps and study is not None:
         raise UsageError(cli.NOT_BOTH)
@@ -50,12 +50,7 @@ def recording_export(
         rows, keys = recorded_sweeps(db, named, opened.has_all)
         sweep_ids = " and ".join(row["sweep_id"] for row in rows)
         if not keys:
-            others = " or ".join(f"--sweep {sweep_id}" for sweep_id in sweeps_with_calls(db))
-            name_one = f"Name one that did: {others}"
-            raise UsageError(
-                f"the sweep {sweep_ids} made no call: there is nothing to record. "
-                + (name_one if others else f"None in {db} did: programs drove")
-            )
+            raise UsageError(f"the sweep {sweep_ids} made no call: there is nothing to record")
         provenance = provenance_of(rows)
         calls = export_recording(file, opened, keys, provenance)
     say(f"{calls} calls of {sweep_ids} are in {file}")

@@ -53,8 +53,8 @@ STRICT = "Stop when another model answers."
 DASK = "Play on a Dask cluster: local:N, a scheduler's address, or its file."
 BATCH = "Send requests in the provider's batches: cheaper, but it takes hours."
 # Parameters of sweep that replay accepts and does not list.
-NO_EFFECT_IN_REPLAY = {"max_cost_usd", "batch", "in_flight", "rpm", "tpm", "dask", "strict_model"}
-NO_EFFECT_IN_REPLAY |= {"keep_going", "replay", "yes"}
+NO_EFFECT = {"max_cost_usd", "batch", "in_flight", "rpm", "tpm", "dask", "strict_model"}
+NO_EFFECT |= {"keep_going", "replay", "yes"}
 RECORDING = "Also replay from this file, without importing it; may be repeated."
 
 
@@ -209,11 +209,10 @@ def _refuse_a_part(recording: str, *, chosen: bool, replay: bool) -> None:
 
 
 def _as_in_replay(parameter: inspect.Parameter) -> inspect.Parameter:
-    if parameter.name not in NO_EFFECT_IN_REPLAY:
-        return parameter
     kind, info = get_args(parameter.annotation)
-    info = copy(info)
-    info.hidden = True
+    if parameter.name in NO_EFFECT:
+        info = copy(info)
+        info.hidden = True
     return parameter.replace(annotation=Annotated[kind, info])
 
 

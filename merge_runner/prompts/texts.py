@@ -33,7 +33,6 @@ _SITUATIONS = (
 
 
 def _tabled(situation: str) -> str:
-    """Return a situation with its list as a table."""
     introduction, *items = situation.split("\n- ")
     rows = (re.sub(r"(.*): (\S+) ?(.*)", r"| \1 | \2 | \3 |", item) for item in items)
     return "\n".join([introduction, "| quantity | value | unit |", "|---|---|---|", *rows])

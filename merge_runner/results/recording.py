@@ -249,7 +249,6 @@ def _fingerprint(key: str, attempts: str) -> bytes:
 
 
 def _provenance_hash(metadata: dict[str, str]) -> str:
-    """Return a hash of a file's metadata."""
     hashed = {name: text for name, text in metadata.items() if name != PROVENANCE_HASH}
     return hashlib.sha256(canonical_json(hashed).encode()).hexdigest()
 

@@ -261,7 +261,6 @@ def results_digest(path: Path, sweep_ids: Sequence[str] | None = None) -> tuple[
 
 
 def _add_factors(connection: duckdb.DuckDBPyConnection, rows: Sequence[Row]) -> None:
-    """Add the levels that are not stored yet."""
     keys = [row[:2] for row in rows]
     columns = "trial_id, spec_hash, factor"
     stored = set(rows_of_trials(connection, columns, "trial_factors", keys).fetchall())

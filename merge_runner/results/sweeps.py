@@ -29,11 +29,6 @@ FROM decisions JOIN trials USING (trial_id, spec_hash)
 SEMI JOIN (FROM sweep_trials WHERE list_contains(?, sweep_id)) USING (trial_id, spec_hash)
 WHERE call_key IS NOT NULL ORDER BY ALL
 """
-THAT_ASKED = """
-SELECT sweep_id FROM sweeps SEMI JOIN (
-    FROM sweep_trials SEMI JOIN calls USING (trial_id, spec_hash)
-) USING (sweep_id) ORDER BY started_at
-"""
 
 
 def recorded_sweeps(
@@ -41,8 +36,8 @@ def recorded_sweeps(
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """Return the rows of these sweeps and the keys of their calls.
 
-    Without ids it is the newest sweep whose calls are all ``cached``, or else the newest. Raises
-    UsageError.
+    Without ids it is the newest sweep with calls that are all ``cached``, or else the newest.
+    Raises UsageError.
     """
     with read_database(path) as connection:
         sweeps = {row["sweep_id"]: row for row in by_name(connection.execute(ALL_SWEEPS))}
@@ -53,15 +48,10 @@ def recorded_sweeps(
         ids = list(dict.fromkeys(sweep_ids))
         if not ids:
             newest = [*reversed(sweeps)] or [""]
-            ids = [next((name for name in newest if cached(calls_of(name))), newest[0])]
+            with_calls = ((name, keys) for name in newest if (keys := calls_of(name)))
+            ids = [next((name for name, keys in with_calls if cached(keys)), newest[0])]
         rows = [require(sweeps, "sweep", sweep_id, f"in {path}") for sweep_id in ids]
         return rows, calls_of(*ids)
-
-
-def sweeps_with_calls(path: Path) -> list[str]:
-    """Return the ids of the sweeps with calls, oldest first; raises UsageError."""
-    with read_database(path) as connection:
-        return [sweep_id for (sweep_id,) in connection.execute(THAT_ASKED).fetchall()]
 
 
 def sweep_facts(path: Path, sweep_id: str) -> dict[str, Any]:

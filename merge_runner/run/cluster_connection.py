@@ -33,7 +33,6 @@ LOGGERS = ("distributed", "distributed.client", "tornado", "tornado.application"
 
 @contextmanager
 def _silenced(loggers: Iterable[logging.Logger]) -> Iterator[None]:
-    """Silence loggers within a ``with`` block."""
     levels = [(logger, logger.level) for logger in loggers]
     try:
         for logger, _ in levels:

@@ -23,7 +23,6 @@ def _output_caps(expected: Estimate) -> Iterator[str]:
 
 
 def _by_model(expected: Estimate) -> Iterator[str]:
-    """Yield the cost of each of several models."""
     if len(expected.usd_by_model) > 1:
         yield from (
             f"        {name}: {usd_text(usd)}" for name, usd in expected.usd_by_model.items()

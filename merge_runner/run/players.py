@@ -49,7 +49,6 @@ async def open_player(
 
 
 def _count_stored(first: FirstDecisions, session: Session, store: Store) -> None:
-    """Count the decisions of stored trials."""
     labels = session.plan.by_label()
     arms = {spec.spec_hash: labels[spec.arm] for spec in session.stored}
     for spec_hash, side, *decisions in store.decisions_by_spec(arms) if arms else ():

@@ -142,7 +142,6 @@ class Progress:
         return elapsed_s / part - elapsed_s if part else None
 
     def _of(self, model: str, by_arm: Counter[str]) -> int:
-        """Return the number of trials in which a model takes part."""
         registered = self.plan.registered
         return sum(
             by_arm[arm.label]
@@ -165,7 +164,6 @@ class Progress:
         return {m: min(made[m] / calls, 0.99) for m, calls in expected.items() if calls}
 
     def _decided(self) -> Iterator[str]:
-        """Yield the share of its decisions that each model has made."""
         shares = self._shares()
         for model, share in shares.items():
             yield f"{f'{model}: ' * (len(shares) > 1)}about {share:.0%} of the decisions"

@@ -75,7 +75,6 @@ def as_dict(
 
 
 def _counts(progress: Progress) -> dict[str, Any]:
-    """Return the counts of calls, attempts and costs."""
     spending, meter = progress.ledger.spending, progress.meter()
     return {
         "calls": {"live": meter.calls_live, "cached": meter.calls_cached},
@@ -131,7 +130,6 @@ def as_lines(summary: dict[str, Any]) -> Iterator[str]:
 
 
 def _results(summary: dict[str, Any]) -> Iterator[str]:
-    """Yield the outcomes of the trials, or their first decisions."""
     if looks := summary["first_looks"]:
         yield as_table(looks)
     else:
@@ -146,7 +144,6 @@ def _results(summary: dict[str, Any]) -> Iterator[str]:
 
 
 def _outcomes(summary: dict[str, Any]) -> str:
-    """Return the outcomes of the stored trials, in one line."""
     rows = {(row["factor"], row["level"]): row for row in summary["outcomes_by_level"]}
     whole = dict(rows.get(("condition", "all"), {"trials": 0}))
     trials, planned = whole.pop("trials"), summary["trials"]["planned"]

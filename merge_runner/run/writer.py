@@ -140,7 +140,6 @@ class Flusher:
         return True
 
     def _fail(self, error: BaseException) -> None:
-        """Note why a batch is not written."""
         if isinstance(error, StoreError):
             self._problem = error
         else:

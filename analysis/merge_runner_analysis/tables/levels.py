@@ -50,7 +50,6 @@ def levels(study: Study) -> Table:
 
 
 def _counted_driver(study: Study) -> str:
-    """Return which driver's going first is counted."""
     trials = [group.trials for group in study.models]
     is_equal = all((of["model_left"] == of["model_right"]).all() for of in trials)
     if is_equal and all(of["focal"].isna().all() for of in trials):

@@ -45,7 +45,6 @@ class Agent:
         return float(self._agents.inputs[0])
 
     def _acceleration_mps2(self, seen: Observation, ticks: int) -> float:
-        """Return the other's acceleration in each of these ticks."""
         if ticks == 1 or not (seen.other_seen and self._last.other_seen):
             return seen.other_acceleration_mps2
         # Between decisions that are several ticks apart its speed is taken to change steadily.
@@ -56,7 +55,6 @@ class Agent:
 
 
 def _vehicles(seen: Observation) -> tuple[Vehicles, Vehicles]:
-    """Return the own vehicle and the other one."""
     own_m, other_m = seen.own_position_m, seen.own_position_m + seen.relative_distance_m
     return (
         Vehicles(np.array([own_m]), np.array([seen.own_speed_mps])),
