@@ -177,8 +177,7 @@ class ChatRequest:
 class CallFailed(MergeRunnerError):
     """A call ended without a reply.
 
-    The first ``cached_attempts`` of its ``attempts`` were made by earlier runs, or for another
-    trial.
+    The first ``cached_attempts`` were made before this run, or for another trial of it.
     """
 
     def __init__(
@@ -189,8 +188,7 @@ class CallFailed(MergeRunnerError):
         cached_attempts: int = 0,
     ) -> None:
         super().__init__(message)
-        self.request, self.attempts = request, attempts
-        self.cached_attempts = cached_attempts
+        self.request, self.attempts, self.cached_attempts = request, attempts, cached_attempts
 
 
 class ReplayMiss(CallFailed):

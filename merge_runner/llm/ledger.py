@@ -154,8 +154,7 @@ class Ledger:
         self.coordinator = coordinator
         self.spending = Spending()
         self.committed_usd = 0.0
-        # Sum in the writer thread: read() may replace committed_usd meanwhile.
-        self._in_transaction_usd = 0.0
+        self._in_transaction_usd = 0.0  # the writer's: read() may replace committed_usd meanwhile
         self._others = json.dumps([name for name in cap.scopes if name != scope] if cap else [])
         # A replay spends nothing and needs no record: a damaged one is an error only in a live run.
         with contextlib.suppress(UsageError, CacheFailed, RecordingError):

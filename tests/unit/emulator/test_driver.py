@@ -46,9 +46,7 @@ def play(condition, repetition):
 
     def decide(question):
         text = answer(question.prompt, question.slot)
-        return question.decision(
-            question.prompt, ChatReply(text, "ok", None, (), cached_attempts=0)
-        )
+        return question.decision(question.prompt, ChatReply(text, "ok", None, (), 0))
 
     spec = spec_of(condition, repetition=repetition, variant="baseline")
     model = LanguageModel("emulator", {"baseline": prompt_of("baseline")})

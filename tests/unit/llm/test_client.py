@@ -60,17 +60,18 @@ async def test_a_second_ask_is_answered_from_the_cache(make):
     assert (later.meter.calls_cached, later.meter.calls_shared) == (1, 0)
 
 
-async def test_two_who_ask_the_same_at_once_share_one_call(make):
-    client = make(answer("first"), answer("second"))
-    replies = await asyncio.gather(*(client.ask("prompt", slot()) for _ in range(2)))
-    assert [(reply.text, reply.cached) for reply in replies] == [("first", False), ("first", True)]
+async def test_all_who_ask_the_same_at_once_share_one_call_whose_attempts_count_once(make):
+    calls = Calls()
+    client, twin = (make(answer(f"from {n}"), calls=calls) for n in range(2))
+    replies = await asyncio.gather(
+        *(asker.ask("prompt", slot()) for asker in (client, client, twin))
+    )
+    assert [reply.text for reply in replies] == ["from 0"] * 3
+    assert [reply.cached for reply in replies] == [False, True, True]
     meter = client.meter
     assert (meter.calls_live, meter.calls_cached, meter.calls_shared) == (1, 1, 1)
-
-
-async def test_attempts_of_a_shared_call_that_fails_count_once(make):
-    client = make(error(400))
-    asked = [client.ask("prompt", slot()) for _ in range(2)]
+    failing = make(error(400))
+    asked = [failing.ask("another", slot()) for _ in range(2)]
     failed = await asyncio.gather(*asked, return_exceptions=True)
     assert [(len(call.attempts), call.cached_attempts) for call in failed] == [(1, 0), (1, 1)]
 
@@ -175,14 +176,6 @@ async def test_two_processes_that_ask_the_same_go_on_with_the_same_reply(make, t
     assert replies[0].attempts == replies[1].attempts
     for own in caches:
         own.close()
-
-
-async def test_two_entries_of_one_model_that_ask_the_same_make_one_call(make):
-    calls = Calls()
-    clients = [make(answer(f"from {n}"), calls=calls) for n in range(2)]
-    replies = await asyncio.gather(*(client.ask("prompt", slot()) for client in clients))
-    assert sum(len(client.direct.transport.sent) for client in clients) == 1
-    assert replies[0].text == replies[1].text
 
 
 async def test_a_rejected_request_fails_this_call_alone(make, cache):
