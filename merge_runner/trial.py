@@ -165,8 +165,9 @@ class _DriverState:
         self.number = self._world.step // self._interval
         self.observed = self._observer.observe(self._world.step) if self._observer else None
         observation = self.observed or self._world.observe(self.side)
-        outcome = self.driver.decide(observation, self.number)
-        return outcome if isinstance(outcome, Question) else _decided(outcome, self.side)
+        if isinstance(self.driver, LlmDriver):
+            return self.driver.ask(observation, self.number)
+        return _decided(self.driver.decide(observation, self.number), self.side)
 
     def take(self, decision: Decision) -> None:
         """Execute a decision from now on; raises UsageError for one that cannot be executed."""

@@ -8,6 +8,7 @@ import stat
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import FrameType
 
 
 @contextmanager
@@ -24,28 +25,32 @@ def on_signal(stop: Callable[[], object] | None, drop: Callable[[], object]) -> 
     import asyncio
 
     loop = asyncio.get_running_loop()
-    handled = [signal.SIGINT, signal.SIGTERM]
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
-        handled.append(signal.SIGHUP)
+    handled = (signal.SIGINT, signal.SIGTERM)
     calls = iter((stop or drop,))
 
-    def handle(number: signal.Signals) -> None:
-        if number is signal.SIGHUP:
-            handled.remove(number)
-            loop.remove_signal_handler(number)
-            signal.signal(number, signal.SIG_IGN)
-            _leave_terminal()
-        call = next(calls, drop if number is signal.SIGINT else None)
+    def handle(number: int) -> None:
+        call = next(calls, drop if number == signal.SIGINT else None)
         if call is not None:
             call()
 
+    def hang_up(number: int, _: FrameType | None) -> None:
+        # Not by the loop: when it removes a handler, the next signal ends the process.
+        signal.signal(number, signal.SIG_IGN)
+        _leave_terminal()
+        loop.call_soon_threadsafe(handle, number)
+
     for number in handled:
         loop.add_signal_handler(number, handle, number)
+    before = signal.getsignal(signal.SIGHUP)
+    if before is not signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, hang_up)
     try:
         yield
     finally:
         for number in handled:
             loop.remove_signal_handler(number)
+        if signal.getsignal(signal.SIGHUP) is hang_up:
+            signal.signal(signal.SIGHUP, before)
 
 
 def _leave_terminal() -> None:

@@ -57,7 +57,7 @@ class LlmDriver:
     _executed: int = 0
     _is_first: bool = True
 
-    def decide(self, observation: Observation, number: int) -> Question:
+    def ask(self, observation: Observation, number: int) -> Question:
         """Return the question whose reply decides."""
         spec, is_first = self.spec, self._is_first
         render = partial(

@@ -39,6 +39,7 @@ from merge_runner.run.cluster_worker import (
     play_chunk,
     stop,
 )
+from merge_runner.run.estimate import most_shares
 from merge_runner.run.guard import FirstDecisions
 from merge_runner.run.plan import Plan
 from merge_runner.run.replay import Replay
@@ -151,6 +152,7 @@ class ClusterRunner:
         self.workers = 0
         self._client = client
         self._setup = setup
+        self._most_shares = most_shares(setup.plan, setup.options)
         self._cache = cache
         self._ledger = ledger
         self._groups: deque[list[TrialSpec]] = deque()
@@ -218,7 +220,7 @@ class ClusterRunner:
     async def _give(self, address: str) -> None:
         """Give a chunk to a worker, unless the chunks under way hold all shares."""
         setup, options = self._setup, self._setup.options
-        slots = 1 if self._one_by_one else min(self.workers, options.in_flight)
+        slots = 1 if self._one_by_one else min(self.workers, self._most_shares)
         shares = sum(assignment.chunk.share for assignment in self._assigned.values())
         if shares + 1 / slots > 1.001:
             return

@@ -24,6 +24,7 @@ from merge_runner.study.arms import Arm
 
 # A reply's JSON around the prompt, and later prompts with longer histories and numbers.
 PROMPT_MARGIN = 1.25
+BYTES_A_TOKEN = 4  # about, in English
 # Trials that turn out longer, and attempts that are charged but bring no answer.
 TRIAL_MARGIN = 1.5
 # Latencies are those of the last ENOUGH calls of each model among the MOST_READ newest of all.
@@ -187,8 +188,7 @@ def trial_costs(
     """
     by_arm: defaultdict[str, float] = defaultdict(float)
     for arm in plan.arms:
-        # No tokeniser makes more tokens than bytes.
-        read = int(len(typical_prompt(plan, arm).encode()) * PROMPT_MARGIN)
+        read = _request_bytes(plan, arm)  # no tokeniser makes more tokens than bytes
         for name in filter(arm.entries.get, arm.asked.values()):
             entry = arm.entries[name]
             usual_usd = cost_usd(entry, _usage(plan, arm, name, facts)) or 0.0
@@ -198,9 +198,24 @@ def trial_costs(
     return {spec.order: by_arm[spec.arm] for spec in plan.trial_specs()}.__getitem__
 
 
+def _request_bytes(plan: Plan, arm: Arm) -> int:
+    return int(len(typical_prompt(plan, arm).encode()) * PROMPT_MARGIN)
+
+
+def most_shares(plan: Plan, options: Options) -> int:
+    """Return the number of shares of the rate limits that hold a request of any model each."""
+    shares = [math.inf]
+    for arm in plan.arms:
+        read = _request_bytes(plan, arm) // BYTES_A_TOKEN
+        for entry in arm.entries.values():
+            rpm, tpm = options.rates(entry)
+            shares += [rpm or math.inf, (tpm or math.inf) // (read + entry.max_output_tokens)]
+    return int(max(1, min(*shares, options.in_flight)))
+
+
 def _usage(plan: Plan, arm: Arm, name: str, facts: Mapping[str, Usage | None]) -> Usage:
     """Return the tokens of a call, as measured or as listed in the registry."""
-    read = len(typical_prompt(plan, arm).encode()) // 4  # English has about 4 bytes a token
+    read = len(typical_prompt(plan, arm).encode()) // BYTES_A_TOKEN
     entry = arm.entries[name]
     written = min(entry.typical_output_tokens, entry.max_output_tokens)
     return facts.get(name) or Usage(input_tokens=read, output_tokens=written)

@@ -219,16 +219,19 @@ def declared_catalogue(file: StudyFile) -> Catalogue:
 
 
 def _import_others(source: str) -> None:
-    """Import the other modules of a plug-in first: their registrations are no part of the study."""
+    """Import the other modules of a plug-in first: their registrations are no part of the study.
+
+    A name that a plug-in imports from a package may be one of the package's modules.
+    """
     names: list[str] = []
     with suppress(*FAULTS):  # reported, with its line, when the plug-in runs
         with _parsing:
-            body = ast.parse(source).body
-        for node in body:
+            tree = ast.parse(source)
+        for node in ast.walk(tree):
             if isinstance(node, ast.Import):
                 names += [alias.name for alias in node.names]
             elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-                names.append(node.module)
+                names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
     for name in names:
         with suppress(UsageError, *FAULTS), installing():
             import_module(name)

@@ -91,15 +91,15 @@ class Meanwhile:
     count: int = 0
 
     def patch(self, monkeypatch):
-        decide = LlmDriver.decide
+        ask = LlmDriver.ask
 
         def counted(driver, observation, number):
             self.count += 1
             if self.count % 10 == 1:
                 self.call()
-            return decide(driver, observation, number)
+            return ask(driver, observation, number)
 
-        monkeypatch.setattr(LlmDriver, "decide", counted)
+        monkeypatch.setattr(LlmDriver, "ask", counted)
 
 
 async def test_a_cell_that_runs_again_changes_nothing_of_its_study_that_runs(folder, monkeypatch):

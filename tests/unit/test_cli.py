@@ -1,6 +1,9 @@
 """The command line: its menu, its help, and what becomes of its options."""
 
+import asyncio
+import signal
 import sys
+from functools import partial
 from importlib import invalidate_caches
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -12,6 +15,7 @@ from typer.testing import CliRunner
 import merge_runner as package
 from merge_runner.cli import complete_app
 from merge_runner.cli.app import GROUP, app_with_one_command
+from merge_runner.cli.signals import on_signal
 from merge_runner.run.options import Options
 
 COMMANDS = {
@@ -116,3 +120,25 @@ def test_every_option_of_a_sweep_reaches_its_plan_or_its_run(monkeypatch, tmp_pa
     }
     assert (replayed.seat, replayed.conditions, len(replayed.arms)) == ("", ("L_4_8",), 4)
     assert (replaying.replay, [*replaying.recordings]) == (True, [Path("r.parquet")])
+
+
+async def test_a_terminal_that_closes_twice_stops_a_run_once_and_never_kills_it(monkeypatch):
+    def recorded(number, handler):
+        handlers.append((number, handler))
+        return set_handler(number, handler)
+
+    handlers, set_handler, stops = [], signal.signal, []
+    monkeypatch.setattr(signal, "signal", recorded)
+    monkeypatch.setattr("merge_runner.cli.signals._leave_terminal", lambda: None)
+    before = set_handler(signal.SIGHUP, signal.SIG_DFL)
+    try:
+        with on_signal(partial(stops.append, "stop"), partial(stops.append, "drop")):
+            for number in (signal.SIGHUP, signal.SIGHUP, signal.SIGTERM):
+                signal.raise_signal(number)
+            while not stops:
+                await asyncio.sleep(0)
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        set_handler(signal.SIGHUP, before)
+    assert stops == ["stop"]
+    assert (signal.SIGHUP, signal.SIG_DFL) not in handlers

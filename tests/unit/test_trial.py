@@ -8,7 +8,7 @@ import pytest
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import make_context
-from merge_runner.drivers.language_model import Question
+from merge_runner.drivers.language_model import LlmDriver, Question
 from merge_runner.drivers.pace import model_pace, program_pace
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
@@ -61,10 +61,10 @@ class Holding:
         return self.context.held(self.action)
 
 
-class Asking(Holding):
+class Asking(Holding, LlmDriver):
     """Asks a model, and holds its action whatever the model says."""
 
-    def decide(self, observation, number):
+    def ask(self, observation, number):
         self.seen[number] = observation
         slot = Slot("N_0_0", 1, self.context.side, number, 0)
         return Question("model", slot, "prompt", None, self.answered)

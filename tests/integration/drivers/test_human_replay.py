@@ -191,6 +191,9 @@ async def test_a_sweep_of_them_is_stored_audited_and_shown_with_a_caution(
     (tmp_path / "mine.toml").write_text(HUMAN)
     command = ("mine.toml", "--model", "human-replay+idm", "--json")
     assert (await merge_runner("sweep", *command)).summary["exit_code"] == 0
+    cluster = await merge_runner("sweep", *command, "--dask", "local:2")
+    told = "error: human-replay reads the database of this machine: leave --dask out\n"
+    assert (cluster.code, cluster.err) == (2, told)
     (first, *_) = audit_database(db)
     assert not first.findings
     assert not [note for note in first.notes if "not replayed" in note]

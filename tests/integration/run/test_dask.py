@@ -113,6 +113,11 @@ async def test_what_cannot_be_on_a_cluster_is_told_in_one_line(merge_runner, tmp
     assert (run.code, told in run.err, len(run.err.splitlines())) == (2, True, 1)
 
 
+async def test_no_share_of_a_limit_is_too_small_for_one_request(merge_runner):
+    few = ("--first", "--reps", 1, "--conditions", "N_0_0", "--tpm", 8_000, "--dask", "local:2")
+    await merge_runner("sweep", "baseline", *few, code=0)
+
+
 async def test_a_cluster_of_this_machine_leaves_its_host_as_it_is_and_needs_no_certain_port(
     recwarn, caplog, monkeypatch
 ):

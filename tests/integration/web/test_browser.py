@@ -4,9 +4,9 @@ All are on a copy of the golden study, which one server shows.
 """
 
 import json
-import os
 import re
 import shutil
+import socket
 import subprocess
 import time
 
@@ -371,9 +371,17 @@ def test_a_phone_shows_a_decision_that_is_tapped_and_leads_back_by_day_and_by_ni
     assert page.evaluate(OVER) <= 0
 
 
-def test_a_page_says_that_nobody_answers_it_until_somebody_does(browser, db):
+@pytest.fixture
+def port():
+    """A port that no other program gets, where a server may listen again and again."""
+    with socket.socket() as reserved:
+        reserved.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        reserved.bind(("127.0.0.1", 0))
+        yield reserved.getsockname()[1]
+
+
+def test_a_page_says_that_nobody_answers_it_until_somebody_does(browser, db, port):
     page = browser.new_page()  # whose console says what failed
-    port = 10_000 + os.getpid() % 20_000  # none that a socket gets that names no port
     with served(db, port) as site:
         page.goto(f"{site}/trials")
         expect(page.locator("footer")).to_contain_text(f"view --db {db} --export")

@@ -39,7 +39,7 @@ def ask(*replies, seen=SEEN, variant="baseline", begins=0, **scenario):
     context = make_context(scenario, trial, "left", model_pace(scenario))
     driver = LlmDriver("model", trial, context, prompt_of(variant))
     for number, reply in enumerate(replies, begins):
-        question = driver.decide(seen, number)
+        question = driver.ask(seen, number)
         assert (question.model, question.slot) == ("model", replace(SLOT, decision=number))
         answer = chat_reply(reply) if isinstance(reply, str) else reply
         yield question, question.decision(question.prompt, answer)

@@ -5,6 +5,7 @@ import sys
 import pytest
 
 from merge_runner.config import ScenarioConfig
+from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.prompts.blocks import blocks_of, prompt_of, render_prompt
 from merge_runner.registry import Registry, using
 from merge_runner.run.plan import make_plan
@@ -151,3 +152,21 @@ def test_what_a_plug_in_imports_is_no_part_of_its_study(plan_of, tmp_path, monke
     with using(plan.parts.catalogue):
         assert {*colours} == {"elsewhere", "own"}
     assert [*colours] == ["elsewhere"]
+
+
+@pytest.mark.parametrize(
+    "words", ["from {} import drivers", "try:\n    import {}.drivers\nfinally:\n    pass"]
+)
+def test_a_package_that_plug_ins_import_drives_in_all_studies_of_a_process(
+    plan_of, tmp_path, monkeypatch, words
+):
+    monkeypatch.setattr(PROGRAMS, "_things", {**PROGRAMS._things})
+    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
+    package = tmp_path / f"drivers_{len(words)}"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    (package / "drivers.py").write_text(DRIVER.format(action=-0.2))
+    for text in ("", "", "# another study\n"):
+        plugin = words.format(package.name)
+        plan = plan_of(f'{text}[plugins]\nfiles = ["mine.py"]\n', ["braking"], plugin=plugin)
+        assert "braking" in plan.parts.programs

@@ -1,7 +1,6 @@
 """Two processes on one key of an account."""
 
 import json
-import time
 
 from aiohttp import web
 
@@ -9,15 +8,14 @@ from tests.support.harness import watched
 
 
 async def test_two_sweeps_on_one_key_go_on_after_the_servers_429(merge_runner):
-    times, refused = [], []
+    answered, refused = [], []
 
     async def middle(request, handler):
-        now = time.monotonic()
-        if sum(now - at < 1 for at in times) >= 12:
-            refused.append(now)
+        if len(answered) // 12 > len(refused):  # however slow the machine is
+            refused.append(request)
             limit = {"message": "Rate limit reached", "code": "rate_limit_exceeded"}
             return web.json_response({"error": limit}, status=429, headers={"retry-after": "1"})
-        times.append(now)
+        answered.append(request)
         return await handler(request)
 
     sweep = ("sweep", "baseline", "--reps", 1, "--model", "o3", "--yes", "--json", "--rpm", 600)
@@ -30,5 +28,5 @@ async def test_two_sweeps_on_one_key_go_on_after_the_servers_429(merge_runner):
         ]  # fmt: skip
         summaries = [json.loads((await run.communicate())[0]) for run in runs]
     assert [run.returncode for run in runs] == [0, 0]
-    assert refused, "each keeps to a limit of its own"
-    assert sum(summary["calls"]["live"] for summary in summaries) == len(times)
+    assert refused
+    assert sum(summary["calls"]["live"] for summary in summaries) == len(answered)
