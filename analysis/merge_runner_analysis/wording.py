@@ -57,7 +57,7 @@ VERDICT_RULES = (
     "Like people in who goes first: their pattern is found, with p below .05, by a logistic "
     "regression (Firth) over all trials without a crash, not by the counts shown",
     "Fewer, more, smaller, larger, unlike: a difference is shown, with p below .05, corrected "
-    "(Holm) for the driver's {tests}tests",
+    "(Holm) for a driver's {tests}tests",
     f"Cannot tell: neither is shown. No verdict: fewer than {ENOUGH} trials, or fewer than half of "
     "those that ended",
 )

@@ -129,6 +129,7 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         middle=MIDDLE,
         linked=True,
         titles=dict(bar.prompts),
+        first=next(iter(names), ""),
         pair=names if len(names) == 2 and not apart else (),
         conditions=conditions,
     )
