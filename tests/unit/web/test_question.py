@@ -242,3 +242,8 @@ def test_a_small_price_keeps_two_digits():
 def test_what_a_person_sees_at_once_is_said_of_several_other_changes():
     others = [effect(measure=COST, p=0.0001), effect(measure="coll. (%)", p=0.01)]
     assert "Hurry changes how many trials end in a crash: " in answered([effect(p=0.2), *others])[1]
+
+
+def test_the_end_of_an_interval_reads_as_0_only_where_it_is():
+    assert effect_rows.interval_text(effect(ci=(0.001, 0.075))) == "[0.001, 0.075]"
+    assert effect_rows.interval_text(effect(ci=(-7.0, 0.0))) == "[−7.00, 0.00]"
