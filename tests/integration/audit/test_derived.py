@@ -200,3 +200,8 @@ def test_trials_of_another_program_or_other_prompts_are_a_note(db, monkeypatch):
 def test_a_difference_below_the_tolerance_is_none(db):
     damage(db, "UPDATE states SET position_m = position_m + 1e-11")
     assert findings(db) == []
+
+
+def test_a_position_that_is_no_number_is_a_finding(db):
+    damage(db, "UPDATE states SET position_m = 'nan' WHERE step > 20")
+    assert {finding.kind for finding in findings(db)} == {"replay"}

@@ -13,7 +13,6 @@ import pytest
 from merge_runner.errors import UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.results.recording import export_recording
-from merge_runner.run.stored_replay import audit_database
 from tests.support.harness import PROGRAM
 from tests.support.studies import write_study, yielding
 
@@ -66,13 +65,6 @@ def test_an_output_that_cannot_be_written_is_one_line(db):
         )  # fmt: skip
     assert run.returncode == 1
     assert run.stderr == "error: the output cannot be written: No space left on device\n"
-
-
-def test_a_position_that_is_no_number_is_a_finding(db):
-    with duckdb.connect(str(db)) as connection:
-        connection.execute("UPDATE states SET position_m = 'nan' WHERE step > 20")
-    kinds = {finding.kind for audit in audit_database(db) for finding in audit.findings}
-    assert {"gap", "outcome"} & kinds
 
 
 async def test_nothing_is_written_over_what_is_of_another_kind(merge_runner, db):
