@@ -40,6 +40,7 @@ ATTEMPTS = TypeAdapter(Attempts)
 UNANSWERED, _DAMAGED = "attempts ", "damaged "
 UNSEEN = "the run ended before a reply was seen; it may have been charged"
 _GET = "SELECT mode, filename, value FROM Cache WHERE key = ? AND raw = 1"
+_IS_STORED = "SELECT 1 FROM Cache WHERE key = ? AND raw = 1"  # the value may be damaged
 # The rows of a call, and of its attempts in flight when their process ended.
 _LOOK_UP = """
 SELECT key, mode, filename, value FROM Cache WHERE raw = 1 AND key IN (?1, ?2)
@@ -211,7 +212,7 @@ class CallStore(CacheFile):
 
     def has_all(self, keys: Iterable[str]) -> bool:
         """Return whether the calls with these keys are stored here, damaged ones included."""
-        return all(self.rows(_GET, key) for key in keys)
+        return all(self.rows(_IS_STORED, key) for key in keys)
 
     def in_recording(self, key: str) -> bool:
         """Return whether the recording holds an entry of a call key."""
