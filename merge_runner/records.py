@@ -78,7 +78,7 @@ class Slot:
     sample_set: Annotated[int, Field(ge=0)]
 
     def __str__(self) -> str:
-        """Return the slot as text for people."""
+        """Return the slot as text."""
         return f"{self.condition} rep {self.repetition} {self.side}, decision {self.decision}"
 
     def as_dict(self) -> dict[str, str | int]:

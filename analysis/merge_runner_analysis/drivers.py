@@ -44,4 +44,4 @@ def stand_in(models: Mapping[Side, str], sides: Collection[Side] = SIDES) -> str
     posing = "+".join(dict.fromkeys(name for side, name in named.items() if side in sides))
     real = [side for side in named if side not in sides]
     where = f" on the {'left' if real == ['right'] else 'right'}" if real else ""
-    return f"scripted stand-in{where}, {f'not {posing}' if posing else 'no language model'}"
+    return f"mock model{where}, {f'not {posing}' if posing else 'no language model'}"

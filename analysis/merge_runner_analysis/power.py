@@ -414,7 +414,7 @@ def power_table(title: str, rows: Sequence[Row]) -> Table:
         "collides twice as often. What words plant in the emulator is never assumed",
         "effects: a row for each level in the study's primary measure; nothing is assumed of "
         "interactions. n counts all trials; the table effects pools sample sets, and counts once "
-        "the trials of a scripted stand-in that differ in words that it does not read",
+        "the trials of a mock model that differ in words that it does not read",
     )
     return Table("power", COLUMNS, rows, notes, title=title)
 

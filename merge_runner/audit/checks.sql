@@ -189,7 +189,7 @@ FROM (SELECT count(*) AS stored FROM linked SEMI JOIN trials USING (trial_id, sp
     (SELECT count(*) AS decisions, count(*) FILTER (NOT valid) AS invalid
     FROM decisions SEMI JOIN audited USING (trial_id, spec_hash)),
     (SELECT count(DISTINCT call_key) AS calls, count(*) AS attempts,
-        count(*) FILTER (scripted) AS "attempts answered by a scripted stand-in"
+        count(*) FILTER (scripted) AS "attempts answered by a mock model"
     FROM calls SEMI JOIN audited USING (trial_id, spec_hash)),
     (SELECT count(DISTINCT reply_id) AS "reply ids"
     FROM reply_ids SEMI JOIN audited USING (trial_id, spec_hash));
@@ -235,4 +235,4 @@ WHERE NOT telling GROUP BY model_requested, endpoint
 -- Without replies of the emulator, which has only a few phrases.
 UNION ALL SELECT format('all {} answers to prompts that were asked before are word for word as before: '
     'are they samples?', answers)
-FROM alike, counts WHERE answers > 0 AND "attempts answered by a scripted stand-in" = 0;
+FROM alike, counts WHERE answers > 0 AND "attempts answered by a mock model" = 0;

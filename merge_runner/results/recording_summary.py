@@ -1,4 +1,4 @@
-"""Summary of a recording for people."""
+"""Summary of a recording as text."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def summary_lines(file: Path, summary: dict[str, Any]) -> Iterator[str]:
         yield f"model    {model}: {calls} calls"
     scripted, calls = summary["scripted"], summary["calls"]
     if scripted:
-        yield f"         {scripted} of {calls} calls were answered by a scripted stand-in"
+        yield f"         {scripted} of {calls} calls were answered by a mock model"
     outcomes = ", ".join(f"{number} {outcome}" for outcome, number in summary["outcomes"].items())
     usd = f"{summary['cost_usd']:.2f} USD"
     yield f"calls    {calls} ({outcomes}), {summary['attempts']} attempts, {usd}"

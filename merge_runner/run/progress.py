@@ -174,7 +174,7 @@ class Progress:
         for name, meter in self.runner.meters.items():
             yield from (f"another model answers: {pair}" for pair in sorted(meter.mismatches))
             if meter.mock_replies:
-                yield f"a scripted stand-in answers, not {name}"
+                yield f"a mock model answers, not {name}"
             yield from (f"{name}: {underpriced(tier)}" for tier in sorted(meter.underpriced))
 
     def _waits(self) -> list[str]:

@@ -206,9 +206,9 @@ def _faults(summary: dict[str, Any]) -> Iterator[str]:
         yield f"WARNING: another model answered than was asked for: {pair} ({answers} answers)"
     for driver, model, provider in summary["stand_ins"]:
         if provider == EMULATOR:
-            yield f"The model `{model}` is a scripted stand-in, no language model."
+            yield f"The model `{model}` is a mock model, no language model."
         else:
-            yield f"{driver}: a scripted stand-in answered, not {model}"
+            yield f"{driver}: a mock model answered, not {model}"
     if same := summary["same_prompts"]:
         prompts = "; ".join(map(", ".join, same))
         yield (

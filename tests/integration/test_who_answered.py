@@ -1,4 +1,4 @@
-"""A scripted stand-in is never taken for the model whose name was used."""
+"""A mock model is never taken for the model whose name was used."""
 
 import re
 import shutil
@@ -137,9 +137,9 @@ async def test_a_stand_in_is_said_to_answer_and_does_not_change_what_a_model_is_
     dry = await merge_runner(*sweep, "--dry-run", **pointed)
     assert f"driver  o3 at {host}+constant\n" in dry.out
     run = await merge_runner(*sweep, "--yes", code=0, **pointed)
-    assert f"o3 at {host}: a scripted stand-in answered, not o3\n" in run.out
+    assert f"o3 at {host}: a mock model answered, not o3\n" in run.out
     assert f"driver  o3 at {host}+constant\n" in run.err
-    assert "WARNING: a scripted stand-in answers, not o3" in run.err
+    assert "WARNING: a mock model answers, not o3" in run.err
     assert await estimated() == before
     assert before[1] is False
     # Nor at the very address where it answers.
@@ -175,8 +175,8 @@ async def test_answers_at_another_effort_or_place_do_not_change_it_either(
 
 async def test_the_emulator_by_its_own_name_is_said_to_be_one(merge_runner):
     run = await merge_runner("sweep", "baseline", *SMALL[:-1])
-    assert "The model `emulator` is a scripted stand-in, no language model.\n" in run.out
-    assert "stand-in answer" not in run.out + run.err
+    assert "The model `emulator` is a mock model, no language model.\n" in run.out
+    assert "mock model answer" not in run.out + run.err
 
 
 NAMING = in_memory({})

@@ -154,7 +154,7 @@ def listening(handle: Callable[[web.Request], Awaitable[web.StreamResponse]]):
 
 
 async def as_a_model(request: web.Request, handler) -> web.StreamResponse:
-    """Answer without the field that says that a stand-in does."""
+    """Answer without the field that says that a mock model does."""
     body = json.loads((await handler(request)).body)
     del body[SCRIPTED_FIELD]
     return web.json_response(body)
@@ -164,7 +164,7 @@ async def as_a_model(request: web.Request, handler) -> web.StreamResponse:
 async def watched(middle: Middle | None = None, faults=None, *, honest: bool = True):
     """Serve the emulator on loopback; ``middle`` may answer in its place.
 
-    Unless it is ``honest``, no header says that a stand-in answers.
+    Unless it is ``honest``, no header says that a mock model answers.
     """
     seen = Watched()
 

@@ -138,7 +138,7 @@ async def test_the_page_on_recording_leads_to_a_file_that_replays(folder, model,
             code, out = await shell(command, folder, **account)
             assert code == 0, f"{command}\n{out}"
             said.append(out)
-    assert "The model `emulator` is a scripted stand-in, no language model." in said[0]
+    assert "The model `emulator` is a mock model, no language model." in said[0]
     first, second = (out.split()[-3] for out in said[-2:])
     assert first == second
     assert (folder / f"{model}.parquet").is_file()

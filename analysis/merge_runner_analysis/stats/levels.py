@@ -119,7 +119,7 @@ def _level_of(group: Group, factor: str) -> str | None:
 def _level(every: list[Group], factor: str, name: str, by: str, *, apart: bool) -> Level:
     groups = [group for group in every if group.levels.get(factor) == name]
     texts = {group.posing for group in groups}
-    posing = texts.pop() if len(texts) == 1 else "scripted stand-ins"
+    posing = texts.pop() if len(texts) == 1 else "mock models"
     mark = " [scripted]" if apart and posing else ""
     at = f"{by}={_level_of(groups[0], by)}" if by else ""
     pooled = _with_cells(groups, {factor, by})

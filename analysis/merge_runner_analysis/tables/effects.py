@@ -64,7 +64,7 @@ def effects_table(study: Study) -> Table:
         (
             *([Column("at", by)] if by else []),
             Column("factor", "factor"),
-            Optional("drivers", "drivers", "text", "scripted: stand-ins"),
+            Optional("drivers", "drivers", "text", "scripted: mock models"),
             Column("level", "level"),
             Column("reference", "against"),
             Column("measure", "measure"),

@@ -20,12 +20,12 @@ USED = (
     ("p, corrected", "corrected p", "corrected"),
     ("prompt, Baseline", "prompt variant", "prompt"),
     ("ahead, side by side, headway", "projected headway", "ahead|side by side|headway"),
-    ("crash", "collision", "crash"),
+    ("collision", "collision", "collision|collided"),
     ("valid reply, plan", "plan", "valid|plan"),
     ("gap at the merge point", "gap", r"\bgap\b"),
     ("deviation from the initial speed", "RMSE", "initial speed"),
     ("both change their speed", "joint contribution", "change their speed"),
-    ("scripted stand-in", "mock model", "stand-in"),
+    ("mock model", "mock model", "mock model"),
 )
 _ROW = re.compile(r"\| (.+?) \| (.+) \|")
 _MARKED = (

@@ -133,7 +133,7 @@ def drivers_of(site: Site, table: Table | None, scope: Scope) -> list[Driver]:
 
 
 def _kind(facts: Row | None) -> str:
-    if facts and facts["who"] == "stand-ins":
+    if facts and facts["who"] == "mocks":
         return MOCK
     return LANGUAGE_MODEL if facts and facts["asked"] else PROGRAM
 
@@ -162,7 +162,7 @@ def noted(
 def by_condition(site: Site, scope: Scope, drivers: Sequence[Driver]) -> dict[str, Any]:
     """Return counts by condition, of the drivers' trials and of the humans' as published.
 
-    ``crash`` says by which rule drivers crash.
+    ``crash`` says by which rule drivers collide.
     None stands for a condition that somebody did not drive; without a driver they are the humans'.
     """
     rows = site.catalogue.counts(scope.trials(), "model", "variant", "condition")

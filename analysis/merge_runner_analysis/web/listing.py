@@ -87,7 +87,7 @@ LISTED = f"""
 CREATE TABLE listed AS
 SELECT row_number() OVER (ORDER BY trials.trial_id, spec_hash)::INTEGER AS number,
     trials.trial_id, spec_hash, source,
-    CASE WHEN source = 'human' THEN 'humans' WHEN scripted THEN 'stand-ins' ELSE 'drivers' END
+    CASE WHEN source = 'human' THEN 'humans' WHEN scripted THEN 'mocks' ELSE 'drivers' END
         AS who,
     trials.model_left, trials.model_right, if(source = 'human', 'human', driver) AS model, variant,
     condition, projected_headway_m, relative_velocity_mps, rep, pair, focal,

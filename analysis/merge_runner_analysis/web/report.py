@@ -65,7 +65,7 @@ MANY_FALLBACKS = 0.05
 # The worst first: what each alarm says of the groups that it names.
 MEANINGS = {
     "Another model answered": "These trials are not what they claim to be.",
-    "A scripted stand-in answered": "These rows stand last, are in no conclusion, and never beside "
+    "A mock model answered": "These rows stand last, are in no conclusion, and never beside "
     "the paper's row of that model.",
     "Too few valid decisions": "What was driven is mostly not what the model decided: no value, "
     "test or conclusion rests on these trials.",
@@ -293,7 +293,7 @@ def alarms(study: Study, origin: Provenance) -> dict[str, tuple[list[str], str]]
 
 
 def crashes(study: Study) -> dict[str, dict[str, int]]:
-    """Return the number of crashes of each driver and prompt by cause, the most first."""
+    """Return the number of collisions of each driver and prompt by cause, the most first."""
     with read_database(study.db) as connection:
         causes = {(name, spec): cause for name, spec, cause in judged_collisions(connection)}
     counted: dict[str, dict[str, int]] = {}
@@ -346,7 +346,7 @@ def _found(study: Study, origin: Provenance) -> Iterator[tuple[str, str]]:
         trials, counts = len(group.trials), tally(study, group)
         # A mock model's own name is honest.
         if group.scripted and MOCKS.isdisjoint(group.models):
-            yield "A scripted stand-in answered", f"{group.id}: {group.posing}"
+            yield "A mock model answered", f"{group.id}: {group.posing}"
         if failed := counts["failed"]:
             reasons = group.trials["error"].dropna()
             why = reasons.mode().get(0, "no reason is stored")

@@ -56,7 +56,7 @@ def numbers_of(catalogue: Catalogue, filters: TrialFilter) -> Mapping[str, Row]:
 
     Whatever several runs or trials share counts once. A run may have begun since: it has none.
     """
-    (total,) = catalogue.counts({**filters, "who": ["drivers", "stand-ins"]})
+    (total,) = catalogue.counts({**filters, "who": ["drivers", "mocks"]})
     counted = {row["sweep"]: row for row in catalogue.counts(filters, "sweep")}
     return defaultdict(lambda: dict.fromkeys(total, 0), {"": total} | counted)
 

@@ -401,7 +401,7 @@ def _one_cell(pooled: dict[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
 
 
 def _unread(level: str, trials: pd.DataFrame) -> dict[tuple, set]:
-    """The cells of other levels at which a stand-in plays the same trials, in every condition."""
+    """The cells of other levels at which a mock model plays the same trials, in every condition."""
     ended = trials[trials["status"] != "failed"]
     ways = ended.groupby("cell")["way"].agg(set).to_dict()
     others = sorted({cell[1:] for cell in ways})

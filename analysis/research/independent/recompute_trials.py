@@ -98,7 +98,7 @@ def read(db: str, study: str = "") -> pd.DataFrame:
                 row["way"] = (_as_seen(row["ego"], samples[key]), trial.status)
         found.append(row)
     every = _with_cells(pd.DataFrame(found))
-    # Stand-ins sample: of theirs that went alike the first is one, and so is the second.
+    # Mock models sample: of theirs that went alike the first is one, and so is the second.
     again = every.groupby(["driver", "variant", "cell", "way"]).cumcount()
     posing = every["scripted"].astype(bool) & ~every["programs"]
     ways = [(*way, n) for way, n in zip(every["way"], again, strict=True)]

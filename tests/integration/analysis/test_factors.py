@@ -22,7 +22,7 @@ CHEAP_COLD = "cheap+sleepy [temperature=0.2]"
 
 @pytest.fixture(scope="module")
 def study(played, tmp_path_factory):
-    """The study as if language models had answered, and no stand-in."""
+    """The study as if language models had answered, and no mock model."""
     db = tmp_path_factory.mktemp("factors") / "t.duckdb"
     db.write_bytes(played.db.read_bytes())
     return changed(db, "UPDATE trials SET scripted = false", "UPDATE calls SET scripted = false")
@@ -220,7 +220,7 @@ def test_means_are_compared_within_the_cells_that_both_levels_have_and_the_notes
     assert notes_with(factors, "temperature: every level has the same")
     cheap, dear = (set(level.pooled.finished["cell"]) for level in levels_by_factor(study)[0])
     assert dear < cheap
-    # The same stand-in answers under both names, so that equal cells hold equal trials.
+    # The same mock model answers under both names, so that equal cells hold equal trials.
     row = rows["model=dear/gap_m"]
     assert (row["difference"], row["p"]) == (pytest.approx(0, abs=1e-9), pytest.approx(1))
     assert abs(row["value"] - rows["model=cheap/gap_m"]["value"]) > 0.1

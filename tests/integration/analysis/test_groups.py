@@ -1,4 +1,4 @@
-"""Who stands in which group: endpoints, stand-ins, and deterministic drivers."""
+"""Who stands in which group: endpoints, mock models, and deterministic drivers."""
 
 import json
 from dataclasses import replace
@@ -73,26 +73,26 @@ def test_who_was_asked_is_read_from_the_columns_and_not_from_a_trials_name(db):
         ("other", ("other",)),
         ("o3+other", ("o3", "other")),
     ]
-    assert study.models[1].posing == "scripted stand-in, not o3+other"
+    assert study.models[1].posing == "mock model, not o3+other"
 
 
 def test_stand_ins_stand_last_and_every_row_of_theirs_says_so(db):
     study = changed(db, SCRIPTED + "trial_id LIKE 'o3/%'")
-    assert [group.label for group in study.models] == ["other", "o3 (scripted stand-in, not o3)"]
+    assert [group.label for group in study.models] == ["other", "o3 (mock model, not o3)"]
     for table in make_tables(study, QUICK):
         for row, plain in zip(table.rows, value_rows(table), strict=True):
             if row.groups[0].startswith("o3/"):
                 assert plain["driver"] in {"o3*", "o3*, of 2 models"}, table.name
         if any(row.groups[0].startswith("o3/") for row in table.rows):
-            assert table.notes.count("* o3: scripted stand-in, not o3") == 1, table.name
+            assert table.notes.count("* o3: mock model, not o3") == 1, table.name
 
 
 def test_a_mock_model_is_a_stand_in_for_no_model(tmp_path):
     drives = [yielding(name, reps=1)[0] for name in ("emulator", "random")]
     study = changed(write_study(tmp_path / "t.duckdb", drives), SCRIPTED + "true")
     assert {group.label for group in study.models} == {
-        "emulator (scripted stand-in, no language model)",
-        "random (scripted stand-in, no language model)",
+        "emulator (mock model, no language model)",
+        "random (mock model, no language model)",
     }
     assert alarms_of(study) == {}, "nobody takes it for a model"
 
@@ -101,7 +101,7 @@ def test_the_sides_of_a_stand_in_are_those_of_the_scripted_calls(tmp_path):
     drives = [replace(yielding("o3", reps=1)[0], said={})]
     scripted = "UPDATE calls SET scripted = true WHERE side = 'left'"
     study = changed(write_study(tmp_path / "t.duckdb", drives), scripted, SCRIPTED + "true")
-    assert study.models[0].label == "o3 (scripted stand-in on the left, not o3)"
+    assert study.models[0].label == "o3 (mock model on the left, not o3)"
 
 
 def test_trials_of_a_stand_in_are_never_pooled_with_those_of_the_model(db):
@@ -109,8 +109,8 @@ def test_trials_of_a_stand_in_are_never_pooled_with_those_of_the_model(db):
     sizes = {group.driver: len(group.trials) for group in study.models}
     assert sizes == {"o3": 22, "other": 33, "o3 [scripted]": 11}
     ((title, text),) = alarms_of(study).items()
-    assert title == "A scripted stand-in answered"
-    assert "o3 [scripted]/baseline: scripted stand-in, not o3" in text
+    assert title == "A mock model answered"
+    assert "o3 [scripted]/baseline: mock model, not o3" in text
     table = made(study, "ablation-quantitative")
     for row, trials in (("o3/baseline", 22), ("o3 [scripted]/baseline", 11)):
         assert listed(study, table, f"{row}:n") == trials

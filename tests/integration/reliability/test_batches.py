@@ -15,7 +15,7 @@ from tests.support.harness import FAST, PROJECT, a_model, watched
 from tests.support.mock_server import BatchPlan, FaultPlan
 
 TWO = ("--conditions", "L_4_0,N_0_0", "--reps", 1)
-# A stand-in that costs something, so that there is money to lose; it is told the slot.
+# A mock model that costs something, so that there is money to lose; it is told the slot.
 PRICE = {"input": 2.0, "output": 8.0, "source": "made up"}
 
 

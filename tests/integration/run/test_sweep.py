@@ -33,7 +33,7 @@ async def test_a_sweep_stores_every_trial_and_its_summary_is_five_lines(merge_ru
     assert sum(map(int, filter(None, ways.groups()))) == 11
     assert re.fullmatch(r"decisions: (\d+), 0 invalid, 0 fallbacks", decisions)
     assert re.fullmatch(r"calls: \d+ asked; cost 0.0000 USD", calls)
-    assert who == "The model `emulator` is a scripted stand-in, no language model."
+    assert who == "The model `emulator` is a mock model, no language model."
     assert checked == "checked: no problems; database: results/merge.duckdb"
     assert run.err.splitlines()[-1].startswith("trials: 11/11 ended; ")
     assert run.err.count("trials: 11/11 ended") == 1

@@ -146,14 +146,14 @@ def test_people_and_each_driver_are_summed_up_apart(listing):
     with duckdb.connect(str(listing.site.db), read_only=True) as connection:
         sums = connection.execute(
             "SELECT driver, count(*)::VARCHAR, format('{:.2f}', avg(gap_m)) FROM (SELECT *, "
-            "if(source = 'human', 'people', model_left) AS driver FROM trials) "
-            "JOIN trial_metrics USING (trial_id, spec_hash) WHERE driver IN ('people', 'o3') "
-            "GROUP BY driver ORDER BY driver <> 'people'"
+            "if(source = 'human', 'humans', model_left) AS driver FROM trials) "
+            "JOIN trial_metrics USING (trial_id, spec_hash) WHERE driver IN ('humans', 'o3') "
+            "GROUP BY driver ORDER BY driver <> 'humans'"
         ).fetchall()
     assert len(sums) == 2
     for address, expected in (("/trials", sums), ("/trials?model=human", sums[:1])):
         text = Page(listing.get(address).text).text
-        found = re.findall(r"(o3|people): (\d+), \d+ crashed, mean gap (\S+) m", text)
+        found = re.findall(r"(o3|humans): (\d+), \d+ collided, mean gap (\S+) m", text)
         assert found == expected
 
 
@@ -243,7 +243,7 @@ def test_trials_of_two_endpoints_are_listed_named_and_linked_apart_with_who_answ
         at = {"OPENAI_API_KEY": "x", "OPENAI_BASE_URL": f"http://{place}/v1"}
         run = prepare(tmp_path, "sweep", "baseline", *part, "--model", *options, **at)
         assert run.code == 0, run.err
-    client, words = client_of(tmp_path / "t.duckdb"), "scripted stand-in, not o3"
+    client, words = client_of(tmp_path / "t.duckdb"), "mock model, not o3"
     catalogue = read(client.site.db)
     drivers = [f"o3 at {host}", f"o3 at {other}+constant/set1"]
     assert sorted(catalogue.facets({})["model"]) == [(name, 2) for name in sorted(drivers)]
@@ -259,7 +259,7 @@ def test_trials_of_two_endpoints_are_listed_named_and_linked_apart_with_who_answ
     sweeps, runs = Page(client.get("/sweeps").text).text, list_runs(catalogue)
     for entry, driver in zip(runs, reversed(drivers), strict=True):
         name = driver.removesuffix("/set1")
-        assert (entry["driver"], f"{name} scripted stand-in" in sweeps) == (name, True)
+        assert (entry["driver"], f"{name} mock model" in sweeps) == (name, True)
         page = Page(client.get(f"/sweeps/{entry['sweep_id']}").text).text
         assert (f"baseline: {name}" in page, words in page) == (True, True)
     assert all(words in client.get(page).text for page in ("/", "/trials.csv"))

@@ -1,4 +1,4 @@
-"""What is said of trials in which a scripted stand-in answered."""
+"""What is said of trials in which a mock model answered."""
 
 import pytest
 

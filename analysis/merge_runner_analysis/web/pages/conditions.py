@@ -80,7 +80,7 @@ def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     if not site.in_words(name):
         raise NotThere(f"there is no condition {name!r} here")
     bar = scope_of(site, asked, any_prompt=True)
-    filters = {**bar.scope.filters, "condition": name, "who": ["drivers", "stand-ins"]}
+    filters = {**bar.scope.filters, "condition": name, "who": ["drivers", "mocks"]}
     rows = site.catalogue.every(filters)
     humans = site.catalogue.every({"condition": name, "who": "humans"})
     chosen = [rows[i * len(rows) // MOST] for i in range(MOST)] if len(rows) > MOST else rows

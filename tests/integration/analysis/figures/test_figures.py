@@ -117,7 +117,7 @@ LONG = "gemini-2.5-pro-preview-05-06+constant"
 
 @pytest.fixture(scope="module")
 def long_names(tmp_path_factory):
-    """A model with a long name, at an endpoint of its own, in whose name stand-ins answered too."""
+    """A model with a long name, at an endpoint of its own, for which mock models answered too."""
     drives = [
         *yielding(LONG, reps=2)[:4],
         *yielding(LONG, "A2", reps=2)[:4],
@@ -151,7 +151,7 @@ def test_no_name_is_cut_or_hidden_and_stand_ins_are_named(name, long_names):
         assert not box.padded(-1).overlaps(another.padded(-1)), (one, other)
     texts = [text.get_text().replace("\n", " ") for text in figure.findobj(Text)]
     shown = {text.replace("+ ", "+").replace("- ", "-") for text in texts}
-    marked = [text for text in shown if "scripted stand-in, not" in text]
+    marked = [text for text in shown if "mock model, not" in text]
     assert any(LONG in text for text in marked)
     assert not any("o3" in text and "not o3" in text for text in shown)
     if name not in {"figure2", "first-action"}:  # these show baselines alone

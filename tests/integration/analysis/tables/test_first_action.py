@@ -162,7 +162,7 @@ def test_who_was_only_asked_has_rows_beside_who_drove_with_the_same_first_action
         twin = rows[name.replace(" [asked]", "")]
         assert " [asked]" in row.values["driver"]
         assert row.values | {"driver": twin.values["driver"]} == twin.values
-    # A program of a scripted pair is no stand-in.
+    # A program of a scripted pair is no mock model.
     assert {row.values["driver"] for row in rows.values()} >= {
         "emulator of emulator+projected-order*", "projected-order of emulator+projected-order",
     }  # fmt: skip
