@@ -32,7 +32,7 @@ REASONS = {
     "or the gateway before it, send it plain or as gzip",
     "unreadable_reply": "what answers there cannot be read: have the server, or the gateway before "
     "it, send headers of at most 64 KiB and a body that is plain or gzip",
-    "reasoning_alone": "the whole answer lies in `reasoning_content`, and the content is empty: "
+    "reasoning_alone": "the whole reply lies in `reasoning_content`, and the content is empty: "
     "start the server without its reasoning parser (vLLM, SGLang: leave --reasoning-parser out; "
     "llama.cpp: --reasoning-format none), or let the model think, as `chat_template_kwargs = "
     "{{ enable_thinking = true }}` among `parameters` of {place} does",

@@ -80,7 +80,7 @@ def estimate_lines(expected: Estimate) -> Iterator[str]:
         return
     yield f"driver  {expected.driver}"
     yield f"trials  {expected.trials} to play"
-    yield f"calls   about {expected.calls} not recorded yet"
+    yield f"calls   about {expected.calls} not stored yet"
     yield f"tokens  {tokens}"
     yield from _output_caps(expected)
     if not expected.rounds:

@@ -71,7 +71,7 @@ async def play(
             expected = None
             if session.todo and not (options.replay or plan.is_free):
                 expected = await estimate_rest(session)
-                if expected.trials:  # some call is not recorded yet
+                if expected.trials:  # some call is not stored yet
                     agree(expected)
             return await run(session, expected, stopping)
 

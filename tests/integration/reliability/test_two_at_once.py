@@ -59,7 +59,7 @@ async def test_a_second_live_run_of_a_model_names_the_first_and_asks_nothing(mer
     assert f"another merge-runner (PID {first.pid} on " in line
     assert "asks scripted-driver at emulator with the cache cache/responses" in line
     assert (dry.code, read.code, after.code) == (0, 0, 0), (dry.err, read.err, after.err)
-    assert replayed.code == 4, "what is not recorded yet is no business of the first run"
+    assert replayed.code == 4, "what is not stored yet is no business of the first run"
 
 
 def test_a_lock_is_of_one_model_and_nothing_is_taken_where_one_is_not_free(tmp_path):
