@@ -1,6 +1,6 @@
 """What is measured: every case runs whole programs and returns its figures.
 
-``wall_s``, ``cpu_s`` and ``peak_mb`` are those of the process that is measured, ``calls`` how many
+``wall_s``, ``cpu_s`` and ``peak_mb`` describe the measured process, ``calls`` is how many
 calls it made or read; ``stall_s`` is by how much its event loop was late at worst and ``playing_s``
 how long its trials took.
 """
@@ -117,7 +117,7 @@ class Case:
 
 
 def figures_of(ran: Run, *, calls: int | None = None) -> Figures:
-    """The figures of a run; those of a sweep are in its summary."""
+    """The figures of a run; a sweep has them in its summary."""
     figures = {"wall_s": ran.wall_s, "cpu_s": ran.cpu_s, "peak_mb": ran.peak_mb}
     if calls is not None:
         return {**figures, "calls": calls}

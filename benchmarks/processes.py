@@ -27,7 +27,7 @@ PROGRAM = (PYTHON, "-c", "from merge_runner.cli import main; main()")
 class Run:
     """What one process took: wall and CPU time in s, peak memory in MB; and what it printed.
 
-    A peak below that of this process cannot be told from it: 0.
+    A peak below this process's peak cannot be measured: 0.
     """
 
     wall_s: float

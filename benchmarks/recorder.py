@@ -1,4 +1,4 @@
-"""Makes the recorded replies of many trials at once: those of one trial, under other slots."""
+"""Copies the recorded replies of one trial to many slots."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 The server runs in this process, counts what it is asked by slot and attempt, and bills every answer
 that it makes. What the sweep has spent by its own ledger stands beside that, and its digest beside
-that of a quiet run.
+a quiet run's digest.
 """
 
 from __future__ import annotations

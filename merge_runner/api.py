@@ -57,7 +57,7 @@ def sync(method: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, T]:
 class StudyOutcome:
     """Outcome of a run, with its trials as data frames, including those stored before.
 
-    ``exit_code`` is that of the command line: 0 if all trials ended; ``messages`` are its errors.
+    ``exit_code`` is as on the command line: 0 if all trials ended; ``messages`` are its errors.
     ``facts`` is the summary that ``merge-runner sweep --json`` prints.
     """
 
@@ -203,7 +203,7 @@ class Study:
         )
 
     async def areplay(self, *recordings: Path | str) -> StudyOutcome:
-        """Play all trials from recorded replies alone, those of the files first; send nothing."""
+        """Play all trials from recorded replies alone, first from the files; send nothing."""
         return await self.arun(replay=True, recordings=tuple(map(Path, recordings)))
 
     dry_run, run, replay = sync(adry_run), sync(arun), sync(areplay)

@@ -221,7 +221,7 @@ def validated(model: type[ModelT], value: object, where: str) -> ModelT:
 
 
 def experiments() -> list[Path]:
-    """Return the folders of studies: that of the working directory, then the shipped one."""
+    """Return the folders of studies: ``experiments`` here, then the shipped one."""
     folders = {path.resolve(): path for path in (SHIPPED_EXPERIMENTS, Path("experiments"))}
     return [path for path in reversed(folders.values()) if path.is_dir()]
 

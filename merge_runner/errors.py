@@ -8,7 +8,7 @@ MOST_NAMES = 40
 
 
 class MergeRunnerError(Exception):
-    """Base of all errors that users see as one line; ``exit_code`` is that of the process."""
+    """Base of all errors that users see as one line; the process ends with ``exit_code``."""
 
     exit_code = 1
 

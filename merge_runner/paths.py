@@ -23,7 +23,7 @@ DEFAULT_CACHE = Path("cache/responses")
 
 
 def home_of(study: str) -> Path:
-    """Return the folder of a study's results: that of its file, or the parent of ``experiments``.
+    """Return the folder of a study's results: its file's folder, or the parent of ``experiments``.
 
     A study given by name has its results in the working directory.
     """

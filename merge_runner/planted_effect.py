@@ -35,11 +35,11 @@ class PlantedEffect(BaseModel):
 
     logit P(left first) = k (x_left_first + x_headway h + x_relative_speed dv), where h is
     the projected headway in m, dv the relative speed in m/s, both left minus right, and
-    k = exp(-x_temperature (T - 1)) at the request's ``temperature`` T. Defaults are those of humans
+    k = exp(-x_temperature (T - 1)) at the request's ``temperature`` T. Defaults are the humans'
     (arXiv 2604.09609, Table III). ``x_noise`` is the standard deviation of the noise on the logit
     of each trial; it attenuates the coefficients of a regression. ``x_gap_m`` is added to the gap
     that both drivers aim at. ``x_own_first`` is added to the log-odds that the prompted driver goes
-    first, ``x_other_first`` to those of its opponent.
+    first, ``x_other_first`` to its opponent's log-odds.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)

@@ -112,7 +112,7 @@ class Provider:
 
     ``auth`` is ``bearer`` or the header of the key. ``error_members`` are the members that every
     error of the provider has, by its documentation: an error without them may be a gateway's.
-    ``parameters`` are accepted in addition to those of the wire format. ``batch`` are the terms of
+    ``parameters`` are accepted besides the wire format's parameters. ``batch`` are the terms of
     the batch mode. ``model_env`` is the variable with the model id of an UNNAMED entry; such a
     provider also lists its models at ``/models``. ``if_nobody`` is the advice for a refused
     connection.
@@ -195,7 +195,7 @@ class Endpoint:
 
     ``identity`` is a part of every cache key: the provider's name at its default URL, ``emulator``
     for our own server, otherwise the normalised base URL. ``auth_headers`` hold the secret and are
-    neither hashed nor stored. ``place`` is that of the entry.
+    neither hashed nor stored. ``place`` says where the entry stands.
     """
 
     provider: str

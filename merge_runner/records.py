@@ -100,7 +100,7 @@ class Observation:
     other is ahead. ``distance_to_merge_m`` is None on the straight road. The histories are oldest
     first, one value per simulation step: the accelerations that the ego executed, and the other's
     observed speeds before now. ``own_position_m`` is measured along the ego's branch;
-    ``other_acceleration_mps2`` is that of the other over the last step, 0 before the first. Only
+    ``other_acceleration_mps2`` is the other's over the last step, 0 before the first step. Only
     programs use these two; no prompt contains them. ``other_seen`` is false while the other is out
     of sight: prompts say so and its history is empty. For a program that ignores the field, the
     other is then FAR_BEHIND_M behind the ego and as fast, where it cannot matter.

@@ -104,7 +104,7 @@ class Registry(Mapping[str, T]):
 
     @property
     def _all(self) -> ChainMap[str, T]:
-        """Installed things and those of the study in use; ``register`` prevents equal names."""
+        """Parts of packages and of the study in use; ``register`` prevents equal names."""
         load_plugins()
         if not _installing.get():
             self.complete()
@@ -177,7 +177,7 @@ def remember(db: Path, catalogue: Catalogue) -> None:
 
 
 def in_use_for(db: Path) -> Catalogue:
-    """Return the catalogue in use, or else that of the study last planned into ``db``."""
+    """Return the catalogue in use, or else of the study last planned into ``db``."""
     return in_use() if in_use().text else _of_results.get(db.absolute(), in_use())
 
 

@@ -4,7 +4,7 @@ from merge_runner.records import ANSWERS, NO_DECISION
 
 # One row a trial. A call is asked at one decision, in attempts from 1 on; the last one is its
 # answer, which a lost call has not; ``faults`` are attempts without one. ``answers`` are replies,
-# ``others`` those of another model, as the condition on a row of calls has it that stands for it.
+# ``others`` come from another model, as the condition on a row of calls has it that stands for it.
 # ``failures`` has in lines what each answer lacks, a valid plan or the decision asked for.
 COUNTED = f"""
 SELECT trial_id, spec_hash,

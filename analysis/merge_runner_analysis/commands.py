@@ -58,7 +58,7 @@ ALL = "All trials, also those that the value does not count."
 OUT, HTML_FILE = "The folder to write to.", "The HTML file to write."
 ALSO, EXPORT = (
     "Also write all tables and figures here.",
-    "A new folder, or that of an earlier export.",
+    "A new folder, or the folder of an earlier export.",
 )
 SINGLE, STUDY_FILE = "Write one page with the --trials.", "experiments/STUDY.toml, or a path."
 FORM = "text (the default), csv, json, md or latex."

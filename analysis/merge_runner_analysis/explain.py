@@ -152,7 +152,7 @@ def _source(
     parts = (
         f"{len(trials)} of {len(group.trials)} trials; not finished: {group.left_out}",
         group.remark,
-        f"collisions and who merged first are those of {len(outcomes)} published outcomes: "
+        f"collisions and who merged first come from {len(outcomes)} published outcomes: "
         f"{citation('human_outcomes')}"
         if outcomes is not None
         else "",

@@ -96,7 +96,7 @@ FROM (
 ) USING (trial_id, spec_hash)
 """
 # One row a vehicle: its speeds under control, and whether the simulator slowed it by itself. It
-# cruises until its first decision; those of humans are not on record.
+# cruises until its first decision; humans' decisions are not on record.
 SPEEDS = """
 SELECT trial_id, spec_hash, side, list(time_s ORDER BY step) AS time_s,
     list(velocity_mps ORDER BY step) AS velocity_mps,

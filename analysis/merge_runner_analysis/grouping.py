@@ -170,7 +170,7 @@ def in_human_conditions(trials: pd.DataFrame) -> tuple[int, ...]:
 
 def of_trials(frame: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
     """Return the rows of a per-trial frame that belong to these trials."""
-    # To join all rows takes longer than to leave out those of other groups first.
+    # Leaving out other groups' rows first is faster than joining all rows.
     near = frame["spec_hash"].isin(trials["spec_hash"].unique())
     return frame[near].merge(trials[KEYS], on=KEYS)
 
@@ -316,7 +316,7 @@ def _model_group(rows: pd.DataFrame, first: pd.Series, unjudged: Reason) -> Grou
 
 
 def _distinct(group: Group, *, programs: bool, scripted: bool) -> Group:
-    """Return the group without copies if only programs drive; count those of a language model.
+    """Return the group without copies if only programs drive; count a language model's copies.
 
     A mock model's nth trial of one course is a copy of the nth one of another prompt.
     """

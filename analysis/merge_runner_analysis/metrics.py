@@ -19,7 +19,7 @@ STATUS = {"finished": "status = 'finished'", "ended": "status <> 'failed'"}
 DECIMALS = 2
 INTERVALS = "Wilson for rates, Student's t for means, order statistics for medians"
 # Values that the analysis adds to each trial, as no column of the database has them: whether it
-# collided by the rule of its scenario, and by that of the human experiment.
+# collided by the rule of its scenario, and by the human rule.
 JUDGED = ("collided", "collided_boxes")
 
 

@@ -43,7 +43,7 @@ class Study:
     """The groups of a database, humans first, and results that are computed once.
 
     ``models`` are the ``played`` groups that are judged, ``unjudged`` the others; ``asked`` are
-    those of first-decision probes. ``state`` is that of the results before they were read.
+    groups of first-decision probes. ``state`` is the results' state before they were read.
     """
 
     def __init__(self, db: Path | str = DEFAULT_DB, selection: Selection = EVERYTHING) -> None:
@@ -219,7 +219,7 @@ def _chosen(db: Path, studies: Studies, source: StudySource | None) -> tuple[str
     study = study_name(source.name, order)
     if study not in studies.orders:
         stored = ", ".join(studies.orders) or "none"
-        raise UsageError(f"{db} holds no trial of the study {study}; it holds those of: {stored}")
+        raise UsageError(f"{db} holds no trial of the study {study}; its studies: {stored}")
     recorded = studies.orders[study]
     return study, {
         factor: list(dict.fromkeys([*order.get(factor, ()), *recorded.get(factor, ())]))

@@ -36,7 +36,7 @@ TOO_FEW = (
     "Too few trials without a collision for a verdict "
     f"(at least {ENOUGH}, and half of all, are needed)"
 )
-ALPHA = 0.05  # that of all tests: to import it would take pandas, which no page needs
+ALPHA = 0.05  # of all tests; importing it would load pandas, which no page needs
 # So far from humans, in points and in m, a driver still is like them.
 MARGINS = {"collisions": 5.0, "gap": 1.0}
 # States in words, on every page and in every table for humans; of MARGINS with a direction.

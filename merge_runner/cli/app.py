@@ -52,7 +52,7 @@ app = Program(
     pretty_exceptions_enable=False,
 )
 app.callback(invoke_without_command=True)(common)
-# Groups of the commands in --help, also of those of the analysis.
+# Groups of the commands in --help; the analysis has commands, too.
 PLAY, LOOK, KEEP, CHECK = "Play", "Look", "Keep", "Check"
 for _panel, _commands in {
     PLAY: (sweep, replay, init, models, emulate),

@@ -50,13 +50,13 @@ def beside_study(ctx: typer.Context, param: typer.CallbackParam, path: Path) -> 
     return homes.pop() / path
 
 
-DB = "The results database; that of a study's file is in its folder."
-CACHE = "The folder of recorded replies; that of a study's file is in its folder."
+DB = "The results database; for a study's file it is in the file's folder."
+CACHE = "The folder of stored replies; for a study's file it is in the file's folder."
 DbOption = Annotated[Path, option("FILE", DB, "--db", callback=beside_study, **FILES)]
 CacheOption = Annotated[Path, option("DIR", CACHE, "--cache", callback=beside_study, **FILES)]
 MODEL = (
     "A model or program of `merge-runner models`, or a pair LEFT+RIGHT; may be repeated. Default: "
-    "those of the study's file, or the emulator."
+    "the models of the study's file, or the emulator."
 )
 ONLY = "Only this level of a factor, of model or of prompt; may be repeated."
 CONDITIONS, PROMPTS = "Conditions, separated by commas.", "Prompts, separated by commas."

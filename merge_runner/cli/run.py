@@ -219,7 +219,7 @@ def _as_in_replay(parameter: inspect.Parameter) -> inspect.Parameter:
 
 
 @wraps(sweep, assigned=["__annotations__"])
-def replay(**options: Any) -> None:  # noqa: ANN401 # those of sweep
+def replay(**options: Any) -> None:  # noqa: ANN401 # the options of sweep
     """Run a study again from recorded replies alone: no key, no network.
 
     Example: merge-runner replay theirs.parquet

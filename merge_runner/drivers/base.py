@@ -23,7 +23,7 @@ class DriverContext:
 
     ``seed`` is a whole number below 2**64: all random draws of the driver in this trial come from
     it. ``other_seed`` is the other side's, so that both sides can share a draw. ``condition`` and
-    ``repetition`` (from 1) are those of the trial. ``parameters`` are those of a program, with the
+    ``repetition`` (from 1) describe the trial. ``parameters`` belong to the program, with the
     values that a study sets; ``data`` are the human trials that it replays.
     """
 

@@ -33,7 +33,7 @@ class Program:
     it, so that its trials are played anew. ``meaning`` is a short description; ``rate_hz`` is the
     number of decisions in a second (None: the prompt rate of the scenario).
 
-    ``parameters`` are those of its rule; a study can set them if the program is ``settable`` and
+    ``parameters`` belong to its rule; a study can set them if the program is ``settable`` and
     reads them from its context. ``sets`` are named sets of further parameters; the parameter
     ``set`` chooses one. ``check`` raises UsageError for invalid parameters, ``check_clock`` for a
     clock in s (the time between two decisions) that does not fit them.
@@ -89,7 +89,7 @@ class Program:
 
     @property
     def values(self) -> dict[str, Parameter]:
-        """All parameters: those of the chosen set, overridden by the given ones."""
+        """All parameters: the chosen set, overridden by the given ones."""
         chosen = self.sets[str(self.parameters[SET])] if self.sets else {}
         # First for the order of the names, last for precedence.
         return {**self.parameters, **chosen, **self.parameters}

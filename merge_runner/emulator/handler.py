@@ -1,6 +1,6 @@
 """The emulator as a handler of HTTP requests: a transport of httpx, or the core of its server.
 
-Requests and responses are those of httpx in both cases.
+It takes and returns objects of httpx in both cases.
 """
 
 from __future__ import annotations

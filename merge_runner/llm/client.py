@@ -40,9 +40,9 @@ NO_MONEY = "for calls in flight to be paid, under the cap"
 class LlmClient:
     """Client of one model, which answers its prompts.
 
-    ``direct`` sends normal requests, ``batch`` what goes into batches. ``calls`` are those of the
-    run. A call whose trials are all cancelled goes on while it may be billed, so that its reply is
-    kept; one that waits is cancelled. ``strict``: a reply of another model stops the sweep.
+    ``direct`` sends normal requests, ``batch`` what goes into batches. ``calls`` are the run's
+    calls. A call whose trials are all cancelled goes on while it may be billed, to store its reply;
+    one that waits is cancelled. ``strict``: a reply of another model stops the sweep.
     """
 
     endpoint: EndpointState

@@ -64,7 +64,7 @@ TOO_LONG, LONGEST = "Got more than", 300
 class HttpTransport:
     """Transport to one endpoint over at most ``connections`` connections.
 
-    A reply of more than ``most_bytes`` is refused. Proxies are those of the environment; loopback
+    A reply of more than ``most_bytes`` is refused. The environment names proxies; loopback
     never goes through one. Only the emulator gets the slot. Each attempt has an id; a reply that
     echoes another request's id is refused. After a timeout, a truncated or an unexpected reply the
     endpoint is ``doubted``: connections are not reused unless the server echoes ids. A ``carrier``

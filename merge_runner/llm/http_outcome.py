@@ -137,7 +137,7 @@ class TransportFailure(MergeRunnerError):
     """An attempt without a reply; ``outcome`` names the failure in the table of calls.
 
     ``sent`` is False where the request was certainly not sent, so that it cannot be billed.
-    ``action`` and ``reason`` are those of an AttemptOutcome.
+    AttemptOutcome explains ``action`` and ``reason``.
     """
 
     def __init__(
@@ -163,7 +163,7 @@ class AttemptOutcome:
     ``accept`` it as the answer, ``retry`` after ``delay_s`` (``pause``: all calls of the key wait),
     ``fail`` this call, or stop the sweep because the ``quota`` is exhausted or the endpoint has
     ``rejected`` the key or the model. Without a ``raw`` reply the attempt may have been ``charged``
-    all the same; then ``reason`` is that of ``rejections.reason_of``, if it is known.
+    all the same; ``rejections.reason_of`` then gives the ``reason``, if it is known.
     """
 
     action: Action

@@ -1,4 +1,4 @@
-"""Models of the registry: those that ship, those of a user, and their parameters."""
+"""Models of the registry, shipped or a user's, and their parameters."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def load_models(study_folder: Path | None = None) -> dict[str, ModelEntry]:
     """Return the entries by name, each with a known format and provider; raise UsageError.
 
     Entries of a ``models.toml`` in the working directory, in its ``experiments``, or in
-    ``study_folder`` are added to those that ship, and replace those of the same name.
+    ``study_folder`` join the shipped entries, and replace equal names.
     """
     load_plugins()  # first, so that an error in a plug-in is not reported as the file's
     entries: dict[str, ModelEntry] = {}

@@ -80,7 +80,7 @@ def attempt_usd(
         most = replace(worst, output_tokens=usage.output_tokens)
         usd = cost_usd(entry, most, outcome.reading.service_tier)
     else:
-        # Where no model ever answered, a web page is that of another server.
+        # Where no model ever answered, a web page comes from another server.
         stray = raw.status == 200 and raw.is_web_page and not endpoint.has_answered
         usd = None if may_be_charged(raw, endpoint.identity) and not stray else 0.0
     return usd and usd * price_factor

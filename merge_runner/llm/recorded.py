@@ -102,7 +102,7 @@ class RecordedReplies:
         )
 
     def read(self, recorded: CachedCall, cached_attempts: int) -> ChatReply:
-        """Read a recorded reply by the present rules, as an audit does, not by those of its run."""
+        """Read a recorded reply by the present rules, not by its run's, as an audit does."""
         attempts, last = recorded.attempts, recorded.attempts[-1]
         payload = reply_object(last.reply or "{}") if last.http_status == 200 else {}
         reading = read_reply(self.wire, payload)

@@ -119,7 +119,7 @@ def _count_newer(after: int, execute: Execute) -> int:
 def recorded_values(cache: ResponseCache, name: str, **fields: str) -> set[str]:
     """Return the values of ``name`` in templates with these ``fields``.
 
-    They are those of the recording, or else of the folder.
+    They come from the recording, or else from the folder.
     """
     for counts in answer_counts(cache):
         matching = [t for t in counts if all(getattr(t, f) == value for f, value in fields.items())]

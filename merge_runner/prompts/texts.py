@@ -1,4 +1,4 @@
-"""Texts of the prompt blocks: those of the paper, and further ones for studies."""
+"""Texts of the prompt blocks, of the paper and further ones for studies."""
 
 from __future__ import annotations
 

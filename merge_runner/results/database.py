@@ -26,7 +26,7 @@ from merge_runner.text_safety import first_line, quoted
 
 SCHEMA_VERSION = 10
 SCHEMA = Path(__file__).with_name("schema.sql")
-"""Tables and views without those of the measures (``schema_sql`` has both)."""
+"""Tables and views, without the views of measures (``schema_sql`` has both)."""
 LOCK_RETRY_S = 0.05
 PATIENCE_S = 60.0
 ROWS_AT_ONCE = 100

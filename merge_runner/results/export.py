@@ -131,7 +131,7 @@ def wide_trials(factors: Iterable[tuple[str, str]], sweep_ids: Sequence[str] | N
 
 
 def export_tables(db: Path, folder: Path, sweep_ids: Sequence[str] | None = None) -> None:
-    """Write a folder with all rows, or with those of some sweeps and their trials.
+    """Write a folder with all rows, or only with some sweeps and their trials.
 
     The dictionary has the meaning of each column and, in a row without a column, of each table.
     Raises UsageError if the folder has content that is not an earlier export.

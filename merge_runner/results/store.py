@@ -237,7 +237,7 @@ def answering(
 
 
 def results_digest(path: Path, sweep_ids: Sequence[str] | None = None) -> tuple[str, int]:
-    """Return a hash of all results, or of those of some sweeps, and the number of its trials.
+    """Return a hash of all results, or of some sweeps' results, and the number of its trials.
 
     The hash covers trials, states and decisions, in any storage order. It does not cover clock
     times, latencies, costs, cache keys or spec hashes.

@@ -50,7 +50,7 @@ def live_clients(
 ) -> dict[str, LlmClient]:
     """Return clients with connections, closed with ``stack``, and a share of the rate limits.
 
-    ``usage`` is a result of ``earlier_answers``. ``rounds`` are those of this run, which get the
+    ``usage`` is a result of ``earlier_answers``. ``rounds`` are this run's; they get the
     batch modes of its models. Variables in ``urls`` go before the environment. ``limiters`` by
     registered model go on from earlier clients, and get those that are made. Raises UsageError
     where a key is missing, or a cap could not be enforced.
@@ -62,7 +62,7 @@ def live_clients(
     # Models at one endpoint share its pauses: a server that is overloaded is so for all of them.
     pauses = {endpoint: Pause() for endpoint in plan.endpoints.values()}
     transports = {}
-    # Connections and limits are those of a model, with whatever parameters it is asked.
+    # Connections and limits belong to a model, with whatever parameters it is asked.
     for model, name in {plan.registered[name]: name for name in plan.entries}.items():
         transports[model] = connect(name)
         stack.push_async_callback(transports[model].close)

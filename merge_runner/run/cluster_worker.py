@@ -62,7 +62,7 @@ class Chunk:
     """Trials for one worker, their recorded calls, and its ``share`` of the rate limits.
 
     Its attempts are reserved under its ``name`` until it ends. The options of ``setup`` have its
-    share of the trials in flight, and ``cap`` that of the money.
+    share of the trials in flight, and ``cap`` its share of the money.
     """
 
     name: str

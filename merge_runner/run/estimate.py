@@ -27,7 +27,7 @@ PROMPT_MARGIN = 1.25
 BYTES_A_TOKEN = 4  # about, in English
 # Trials that turn out longer, and attempts that are charged but bring no answer.
 TRIAL_MARGIN = 1.5
-# Latencies are those of the last ENOUGH calls of each model among the MOST_READ newest of all.
+# Latencies come from each model's last ENOUGH calls among the MOST_READ newest of all.
 ENOUGH, MOST_READ = 200, 10_000
 NONE_KNOWN: Mapping[str, float] = {}
 
@@ -88,7 +88,7 @@ def _mean(answers: AnswerCounts) -> Usage | None:
 class Estimate:
     """Estimate of a live run: drivers, trials, calls, tokens, USD (None: unknown price), minutes.
 
-    It is ``measured`` if the tokens per call are those of earlier replies. ``singly_usd`` is the
+    It is ``measured`` if the tokens per call come from earlier replies. ``singly_usd`` is the
     cost of normal requests; batches cost less, and take ``rounds`` in place of minutes.
     ``usd_by_model`` has the models of the registry. ``planned`` counts all trials, also the
     ``stored`` ones. ``left_usd`` is left under the cap; None: there is no cap. ``output_caps`` has
@@ -127,7 +127,7 @@ def estimate(
 
     ``calls`` has by arm the approximate number of calls that each model has yet to answer.
     ``facts`` are the mean tokens of each model's earlier answers to similar requests at its
-    endpoint, and ``latencies_s`` their median latencies, in place of those of the registry.
+    endpoint, and ``latencies_s`` their median latencies, in place of the registry's.
     """
     number = read = written = 0
     usd = singly_usd = 0.0
@@ -149,7 +149,7 @@ def estimate(
             asked_usd = asked * call_usd * _price_factor(entry, options.batch)
             usd += asked_usd
             by_model[model] += asked_usd
-            # An account's limits are those of a model, with whatever parameters it is asked.
+            # An account's limits hold for a model, with whatever parameters it is asked.
             latency_s = latencies_s.get(name, entry.typical_latency_s)
             call_s = max(latency_s / at_once, _limited_s(options, entry, usage, latency_s))
             busy_s[model] += asked * call_s

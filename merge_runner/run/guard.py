@@ -63,7 +63,7 @@ class FirstDecisions:
     def add(
         self, model: str, valid: int, invalid: int, failure: str | None, text: str | None
     ) -> None:
-        """Count numbers of decisions; ``failure`` and ``text`` are those of an invalid one."""
+        """Count numbers of decisions; an invalid one has a ``failure`` and a ``text``."""
         if valid:
             self.valid.add(model)
             self._changed.set()

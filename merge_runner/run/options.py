@@ -13,8 +13,8 @@ from merge_runner.providers import ModelEntry
 class Options:
     """The options of a run; none of them changes a result.
 
-    ``rpm`` and ``tpm`` override the registry's. ``max_cost_usd`` also covers ``ledgers``, those of
-    other sweeps. ``dask`` names the cluster that plays the trials; None: this process. A
+    ``rpm`` and ``tpm`` override the registry's. ``max_cost_usd`` also covers ``ledgers``, the
+    names of other sweeps. ``dask`` names the cluster that plays the trials; None: this process. A
     ``dry_run`` sends nothing, a ``quiet`` run shows no progress, and one that is to ``keep_going``
     goes on with a model that gives no valid decision. In a ``batch`` run all trials ask together,
     at a lower price. ``typed`` are the command's arguments, which resume the run. ``name`` is the

@@ -30,7 +30,7 @@ class Parts:
 
     They are resolved when the plan is made, and not looked up again: another study may give the
     same names to other things. ``prompts`` are by variant; ``programs``, and the wire ``formats``
-    of models, are those of its arms. The ``catalogue`` is all that its study adds.
+    of models, serve its arms. The ``catalogue`` has all that its study adds.
     """
 
     conditions: Mapping[str, Condition] = field(default_factory=dict)

@@ -43,7 +43,7 @@ CLOSE_IT = "you may close this: the same command goes on"
 class TrialCounts:
     """Numbers of trials: ``stored`` before a run, and by arm those ``todo`` in it.
 
-    ``done`` has by arm those of them that have ended, ``outcome_counts`` their outcomes: a Status,
+    ``done`` has by arm how many of them ended, ``outcome_counts`` their outcomes: a Status,
     or ``suspended`` until there is more money. ``unstored`` returns the reason why trials are not
     stored; empty: nothing is wrong.
     """
@@ -126,7 +126,7 @@ class Progress:
     def _left_s(self, elapsed_s: float, ended: int) -> float | None:
         """Return the estimated time left in s; None while there is nothing to estimate it from.
 
-        It is that of the slowest model. Trials that run in step all end late, so early in a run the
+        The slowest model determines it. Trials that run in step all end late, so early in a run the
         calls are a better basis.
         """
         total = self.trials.todo.total()

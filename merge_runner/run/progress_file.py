@@ -24,7 +24,7 @@ class ProgressSnapshot(BaseModel):
     """Snapshot of a sweep, for its display and for other processes.
 
     ``ended`` trials have an outcome, those that were stored before this run among them. ``left_s``
-    is the estimated time left, None while there is no estimate. ``rows`` are those of the display,
+    is the estimated time left, None while there is no estimate. ``rows`` are the display's,
     each with its name: ``WARNING``, ``waiting`` (for what), ``trials``, ``cost`` and so on.
     """
 

@@ -21,7 +21,7 @@ from merge_runner.text_safety import first_line, one_line
 def recorded_plans(file: Path, *, db: Path, trust: bool) -> Iterator[Plan]:
     """Yield the plans of the sweeps in a recording, equal ones once.
 
-    A study's code needs the user's agreement, as that of a study's file does. ``db`` has the human
+    A study's code needs the user's agreement, as with a study's file. ``db`` has the human
     trials that are to be replayed. Raises UsageError or RecordingError.
     """
     seen = set[str]()

@@ -24,7 +24,7 @@ async def with_names(
 ) -> Plan:
     """Return the plan with its models' names, and in a replay with the recorded endpoints.
 
-    A model's name is that of its entry, its recorded replies or its server. Raises UsageError.
+    A model's name comes from its entry, its recorded replies or its server. Raises UsageError.
     """
     entries, endpoints = dict(plan.entries), dict(plan.endpoints)
     for name, entry in entries.items():

@@ -27,7 +27,7 @@ from merge_runner.trial_records import TrialRecord, TrialSpec
 class Session:
     """An open plan; its trials are ``stored`` by earlier runs, or ``todo``.
 
-    ``say`` shows a line to the user. ``exit_code`` is that of the first problem, ``messages`` are
+    ``say`` shows a line to the user. The first problem sets ``exit_code``, ``messages`` are
     of all.
     """
 

@@ -48,7 +48,7 @@ from merge_runner.trial_records import TrialRecord, TrialSpec
 
 TOLERANCE = 1e-9
 """Numbers may differ by this much, as between the arithmetic of two machines."""
-# The columns that no replay gives; docs/recordings.md says why. A cache has those of
+# The columns that no replay gives; docs/recordings.md says why. A cache has the columns of
 # ``calls``, except ``cached``.
 NOT_REPLAYED = (
     "calls.cached",
@@ -80,7 +80,7 @@ def audit_database(
 ) -> list[Audit]:
     """Audit every sweep, oldest first, and then the orphan rows; or some sweeps alone.
 
-    A trial that several sweeps have is audited with the newest of them. The replies are those of
+    A trial that several sweeps have is audited with the newest of them. The replies come from
     the folder ``cache``, if it is named, and are compared with the stored ones. Raises UsageError.
     """
     opened = nullcontext() if cache is None else closing(ResponseCache(cache, read_only=True))
@@ -139,7 +139,7 @@ def _audit(
     *,
     finished: bool,
 ) -> Audit:
-    """Audit a sweep; its replies are those of a cache, if there is one."""
+    """Audit a sweep; its replies come from a cache, if there is one."""
     problems: list[Finding] = []
     notes: Counter[str] = Counter()
     planned: dict[str, str] = {}

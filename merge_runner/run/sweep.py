@@ -59,7 +59,7 @@ async def play(
         if not options.recordings and shipped.is_file():
             with closing(ResponseCache(options.cache)) as cache:
                 has_replies = _has_replies(cache, plan)
-            if not has_replies:  # a user's own are never mixed with those of somebody else
+            if not has_replies:  # a user's replies are never mixed with other people's
                 options = replace(options, recordings=(shipped,))
                 say(f"The replies are from the recording that ships with merge-runner: {shipped}")
         part = plan if whole else _recorded_part(plan, options.recordings)

@@ -34,8 +34,8 @@ class Arm:
     """Arm of a study: one combination of levels, played in all conditions.
 
     ``model`` is a part of trial ids. ``sides`` are the drivers by their names in the registry;
-    ``asked`` are their names with parameters, the keys of ``entries``. ``names`` are those of
-    ``asked``, the ego's first, without the effects that text factors plant in the emulator.
+    ``asked`` are their names with parameters, the keys of ``entries``. ``names`` are ``asked``,
+    the ego's first, without the effects that text factors plant in the emulator.
     ``factors`` are the levels as texts; ``label`` has the levels in which the arms differ. ``ego``
     is the side of the focal driver (``ego_side``). ``focal`` is the same if the two drivers have
     different texts, parameters or perceptions, else None. ``prompts`` are by side if not both have

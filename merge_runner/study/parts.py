@@ -68,7 +68,7 @@ def load_study(
 ) -> tuple[StudySource, Catalogue]:
     """Read a study, and return it with its catalogue after the user's consent to its code.
 
-    ``registered`` are parts that were registered for it. ``models`` replace those of the file;
+    ``registered`` are parts that were registered for it. ``models`` replace the file's models;
     None: no model is called. Consent also covers the servers that get keys. ``trust`` gives
     consent. Raises UsageError.
     """
@@ -137,7 +137,7 @@ def _ask(study: StudySource, risks: Collection[tuple[Path, str]]) -> None:
 def _endpoints(folder: Path, models: Iterable[str]) -> Iterator[tuple[Path, str, object]]:
     """Yield the models whose endpoints need consent: (file, description, content to consent to).
 
-    They are those of a models.toml that does not ship, if they replace a shipped model, send a key
+    They are entries of a user's models.toml, if they replace a shipped model, send a key
     that is not the provider's, or send anything to a URL that is not the provider's. Loopback
     counts as the provider's if it needs no key.
     """

@@ -35,7 +35,5 @@ def runs_of(db: Path, study: StudySource) -> list[str]:
     }
     if requested not in played.values():
         studies = ", ".join(dict.fromkeys(played.values())) or "none"
-        raise UsageError(
-            f"{db} holds no trial of the study {requested}; it holds those of: {studies}"
-        )
+        raise UsageError(f"{db} holds no trial of the study {requested}; its studies: {studies}")
     return [sweep_id for sweep_id, name in played.items() if name == requested]

@@ -68,7 +68,7 @@ def plugin(folder: Path, source: str, module: str = "dummies") -> dict[str, str]
 
 
 def a_model(name: str = "emulator", **fields: object) -> str:
-    """An entry of models.toml: that of the emulator, but for these fields."""
+    """The emulator's entry of models.toml with these fields."""
 
     def toml(value: object) -> str:
         if not isinstance(value, dict):

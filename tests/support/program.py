@@ -21,7 +21,7 @@ from merge_runner.results import database
 from merge_runner_analysis import cache
 from tests.support.harness import PROGRAM, Run
 
-# A folder, an environment and streams are those of the whole process.
+# Folder, environment and streams belong to the whole process.
 _alone = threading.Lock()
 # What Python shows to nobody who runs a program.
 UNTOLD = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)

@@ -28,7 +28,7 @@ AGENT = "<class 'agents.steeringwheelagent.SteeringWheelAgent'>"
 
 @dataclass
 class Recording:
-    """One trial: a list a column; those of scalars hold one value."""
+    """One trial: a list for each column, with one value for a scalar."""
 
     columns: dict[str, list] = field(default_factory=dict)
 

@@ -19,8 +19,8 @@ OF_FIGURE_2 = (
     "merges first and second. (C) How often the left vehicle merges first by projected headway, "
     "with Wilson intervals. (D) Mean gap at the merge point and (E) mean RMSE of the speed from "
     "the initial speed, two values a trial, with intervals of Student's t. Where sides are "
-    "counterbalanced the left vehicle is the ego's, on whichever side it drove: that of the driver "
-    "that is named first, or is told the words. Colours and markers tell the "
+    "counterbalanced the left vehicle is the ego's, on whichever side it drove. The ego is "
+    "the driver that is named first, or reads the texts. Colours and markers tell the "
     "relative velocities apart, dotted lines are the humans (in C as published until all are "
     "imported); few very wide intervals of D and E are cut at the frame."
 )
@@ -28,7 +28,7 @@ FIGURES = {
     "effects": About(
         "each level of each factor in every measure, a mark for each driver",
         "Each level of each factor by driver, over all of its trials: shares with Wilson "
-        "intervals, means with those of Student's t. Dotted: neither driver is favoured. How far "
+        "intervals, means with Student's t intervals. Dotted: neither driver is favoured. How far "
         "levels are apart, within equal conditions, is in the table effects.",
         "levels",
     ),

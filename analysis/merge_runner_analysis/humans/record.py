@@ -129,7 +129,7 @@ def trial_record(trace: Trace, experiment: int, iteration: int, page: str = "") 
     status = _status(trace)
     condition = _condition(trace)
     if page not in ("", condition):
-        raise Unreadable(f"its speeds are not those of {page}")
+        raise Unreadable(f"its speeds do not belong to {page}")
     states = tuple(_states(trace))
     pair = PAIRS.get(experiment, f"experiment_{experiment}")
     arrivals = {side: _arrival(trace.positions_m[side]) for side in SIDES}

@@ -209,7 +209,7 @@ def rejected(n: int, m: int) -> NDArray[np.bool_]:
 def contrast_means(first: Trials, second: Trials, measure: str) -> Estimate | None:
     """Compare two means within the conditions that both have, by Welch's test.
 
-    The difference is that of a linear model with a level for each condition. Its error (HC2;
+    The difference comes from a linear model with a level for each condition. Its error (HC2;
     MacKinnon and White 1985) and degrees of freedom (Bell and McCaffrey 2002) hold where groups
     differ in size and variance. None where no condition is shared, or a single trial is all of one;
     without a test where all trials of a condition are equal.
@@ -218,7 +218,7 @@ def contrast_means(first: Trials, second: Trials, measure: str) -> Estimate | No
     if not len(cells):
         return None
     trials = np.bincount(cells)[cells]
-    # The slope of the residuals within conditions is that of the whole model (Frisch and Waugh
+    # The slope of the residuals within conditions equals the whole model's (Frisch and Waugh
     # 1933; Lovell 1963).
     group, value = (
         column - np.bincount(cells, column)[cells] / trials for column in (belongs, values)

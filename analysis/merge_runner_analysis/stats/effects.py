@@ -226,7 +226,7 @@ def _interactions(study: Study, by: str = "") -> Iterator[Effect]:
 def _effect(
     study: Study, metric: Metric, levels: Sequence[Level], *, swapped: bool = False
 ) -> Effect:
-    """Compare two levels; of four, the first two's difference with that of the others."""
+    """Compare two levels; or, of four, the difference of the first two with the last two's."""
     frames = trials_by_cell(study, tuple(level.pooled for level in levels), metric)
     left_out = {copy for level in levels for copy in level.copies}
     for level, frame in zip(levels, frames, strict=False):

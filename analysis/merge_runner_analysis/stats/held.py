@@ -132,7 +132,7 @@ def _last_piece(sums: list[Array], end: int) -> tuple[Array, Array]:
     n, m0, m1, m2, m3 = n[long], m0[long], m1[long], m2[long], m3[long]
     bend = (m2 - m0 * (n**2 - 1) / 12) ** 2 / (n * (n**2 - 1) * (n**2 - 4) / 180)
     turn = (m3 - m1 * (3 * n**2 - 7) / 20) ** 2 / (n * (n**2 - 1) * (n**2 - 4) * (n**2 - 9) / 2800)
-    # Rounding leaves those of exact pieces below 0.
+    # Rounding leaves residuals of exact pieces below 0.
     return np.maximum(line, 0), np.maximum(line[long] - bend - turn, 0)
 
 

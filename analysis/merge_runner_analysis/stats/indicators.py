@@ -97,7 +97,7 @@ def gains(study: Study, group: Group) -> pd.DataFrame:
 
 
 def mean_gain(study: Study, group: Group) -> Estimate:
-    """Return the mean gain of a group's trials; that of humans over the means of their pairs."""
+    """Return the mean gain of a group's trials; for humans, of the means of their pairs."""
     known = gains(study, group).dropna(subset="gain")
     return replace(mean(_independent(known, "gain")), n=len(known))
 

@@ -149,7 +149,7 @@ def known(group: Group, metric: Metric) -> bool:
 
 
 def estimate_or_reference(group: Group, metric: Metric) -> Estimate | None:
-    """Return a group's estimate; of humans without traces that of the paper, or None."""
+    """Return a group's estimate; for humans without traces the paper's value, or None."""
     if known(group, metric):
         return estimate(group, metric)
     if not metric.paper_of_humans:

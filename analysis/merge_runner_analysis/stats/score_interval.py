@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import sqrt
 
-Z = 1.959963984540054  # of 95 %, as scipy has it; that of statistics.NormalDist rounds up
+Z = 1.959963984540054  # for 95 %, as scipy has it; statistics.NormalDist rounds up
 
 
 def wilson(p: float, n: float, z: float = Z) -> tuple[float, float]:

@@ -106,7 +106,7 @@ def _compared_row(study: Study, effect: Effect) -> Row:
     sides = (effect.level, effect.at_level), (effect.reference, effect.at_reference)
     for of, (level, estimate) in zip(SIDES, sides, strict=True):
         shown = level_estimate(study, level, effect.metric) if estimate.value is None else estimate
-        k = shown.k if effect.metric.rate else None  # that of valid replies counts replies
+        k = shown.k if effect.metric.rate else None  # k of valid replies counts replies
         values |= {f"k{of}": k, f"n{of}": shown.n, f"value{of}": shown.value}
     return _row(study, effect, values)
 
@@ -356,7 +356,7 @@ def contrasts(study: Study) -> Table:
         "contrasts",
         (
             Column("driver", "driver"),
-            Column("setting", "setting"),
+            Column("setting", "prompt"),
             Column("reference", "against"),
             Column("measure", "measure"),
             Column("difference", "difference", "number", "first minus second"),

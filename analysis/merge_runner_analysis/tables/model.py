@@ -71,7 +71,7 @@ class Row:
     untested: bool = False
 
 
-GROUP_COLUMNS = (Column("driver", "driver"), Column("setting", "setting"))
+GROUP_COLUMNS = (Column("driver", "driver"), Column("setting", "prompt"))
 
 
 def row_of(

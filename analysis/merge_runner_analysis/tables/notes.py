@@ -49,7 +49,7 @@ def _of_trials(table: Table, study: Study) -> Iterator[str]:
         if len(pooled) > 1:
             yield (
                 f"trials of several studies: {', '.join(pooled)}. A difference "
-                "between trials of different studies has no p; `--study FILE` keeps those of one"
+                "between trials of different studies has no p; `--study FILE` selects one study"
             )
     if study.human in groups:
         yield from _human_notes(study, table)

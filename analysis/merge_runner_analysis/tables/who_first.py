@@ -50,7 +50,7 @@ def who_first(study: Study) -> Table:
 
 def _fits(group: Group) -> list[Fit]:
     """Return fits by maximum likelihood and by Firth, of humans also with errors by pair."""
-    # Wald's p fails where conditions nearly separate the outcomes, as those of humans do (Hauck and
+    # Wald's p fails where conditions nearly separate the outcomes, as with humans (Hauck and
     # Donner 1977); Firth's penalty (1993) keeps estimates finite there.
     every: list[Fit] = [("", "", {"": fits(group).logit, "firth_": fits(group).firth})]
     if not group.setting and group.measured:

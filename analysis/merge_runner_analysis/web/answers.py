@@ -137,7 +137,7 @@ class Numbers:
         return self.study if selection == Selection() else Study(self.db, selection)
 
     def _figure(self, name: str, form: Literal["svg", "png"]) -> bytes:
-        """Return a figure as a file; one that a report has drawn is that of the report."""
+        """Return a figure as a file, the report's if a report has drawn it."""
 
         def draw() -> str:
             from merge_runner_analysis.figures.gallery import rendered

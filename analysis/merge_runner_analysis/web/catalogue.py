@@ -271,7 +271,7 @@ class Catalogue:
         return next(iter(rows), None)
 
     def condition_texts(self) -> dict[str, str]:
-        """Return the conditions in words: those that humans drove, and those of all trials."""
+        """Return the conditions in words, of humans' trials and of all others."""
         numbers = "condition, projected_headway_m, relative_velocity_mps"
         played = self.ask(f"SELECT DISTINCT {numbers} FROM listed")  # noqa: S608 # constants
         return {

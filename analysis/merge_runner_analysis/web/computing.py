@@ -39,7 +39,7 @@ BROKEN = (
 class Job:
     """A computation, of a state of the database (its stamp), begun at a time (s since 1970).
 
-    ``before`` is that of an earlier state, whose answer stands until this one is there; the
+    ``before`` computes an earlier state, whose answer stands until this one is there; the
     database has changed since where it is ``older``.
     """
 

@@ -121,7 +121,7 @@ def is_shown(row: Row) -> bool:
 
 
 def factors_of(row: Row) -> set[str]:
-    """Return the factor of a level, or those of a crossing."""
+    """Return the factor of a level, or the factors of an interaction."""
     return {*str(row.values["factor"]).split(TIMES)}
 
 

@@ -155,7 +155,7 @@ async def _crawl(
     stage: Path,
     progress: Callable[[int], object],
 ) -> None:
-    """Save the pages to which links lead, and those of all trials."""
+    """Save the pages to which links lead, and a page for each trial."""
     files, waiting = {begin: INDEX}, [begin]
     names, done = {INDEX}, count(1)
     transport = httpx.ASGITransport(explorer(site), raise_app_exceptions=False)

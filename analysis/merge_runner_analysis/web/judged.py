@@ -51,8 +51,8 @@ WHERE list_contains($1::VARCHAR[], model || '/' || variant) GROUP BY rule ORDER 
 class Driver:
     """A driver with a prompt: its verdicts, and counts of its trials.
 
-    ``facts`` are counts of the list of trials, None where it has none of them; ``parameters`` are
-    those of the requests to its model.
+    ``facts`` are counts of the list of trials, None where it has none of them; ``parameters``
+    are sent with each request to its model.
     """
 
     name: str

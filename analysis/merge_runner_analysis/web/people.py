@@ -40,7 +40,7 @@ UNPOSED = {
 class Likeness:
     """One measure of a driver beside humans: a mark with its word, and what was counted.
 
-    Of a count there are ``k`` and ``n``, else a value as ``text``; ``row`` is that of the verdict.
+    A count has ``k`` and ``n``, any other value a ``text``; ``row`` is the verdict's row.
     """
 
     mark: str
@@ -57,7 +57,7 @@ def likeness_of(driver: Driver) -> dict[str, Likeness]:
 
 
 def counted(driver: Driver) -> int | None:
-    """Return the number of a driver's trials that are compared, where it is not that of all."""
+    """Return the number of a driver's compared trials; None if all are compared."""
     crashes = driver.cells["collisions"].values if "collisions" in driver.cells else {}
     n = int(str(crashes.get("counted") or "0 of 0").split(" of ")[1])
     is_all = driver.facts is not None and driver.facts["trials"] == n
@@ -130,7 +130,7 @@ def people_of(conditions: Mapping[str, Any], human: Mapping[str, Any]) -> dict[s
         if cell
     ]
     counts = {"collisions": [(cell["collided"], cell["ended"]) for _, cell in rows]}
-    # The side that is expected first: of two that are side by side that of the slower one.
+    # The side that is expected first; side by side it is the slower one's.
     expected = {
         "headway": [(at.projected_headway_m, cell) for at, cell in rows],
         "velocity": [

@@ -333,7 +333,7 @@ def _named(row: Row) -> str:
 
 
 def _changes(rows: Sequence[Row], sides: dict[str, Row], primary: str) -> list[Change]:
-    """Return the effects with both sides of each; those of a measure have one axis."""
+    """Return the effects with both sides of each; effects on one measure share an axis."""
     ends = ends_of(rows)
     return [_change(row, sides, ends[metric_of(row)], primary) for row in rows]
 

@@ -221,7 +221,7 @@ def _once(tables: Iterable[Mapping[str, Any]]) -> dict[str, list[str]]:
 def design(study: Study) -> tuple[list[str], dict[str, list[str]], dict[str, str]]:
     """Read the design of a study from what was played: descriptions, levels, prompts.
 
-    The levels are those of each factor, the conditions and the trials; prompts have by title the
+    Levels are by factor, then conditions and trials; prompts have by title the
     text of the first one, of variants the lines that differ from the baseline's.
     """
     described, shown_to = load(DESCRIPTIONS, study.db), load(PROMPTS, study.db)

@@ -52,7 +52,7 @@ def list_runs(catalogue: Catalogue) -> list[Row]:
 
 
 def numbers_of(catalogue: Catalogue, filters: TrialFilter) -> Mapping[str, Row]:
-    """Return counts of a filter's trials by run; the empty id has those of all together.
+    """Return counts of a filter's trials by run; the empty id has the total.
 
     Whatever several runs or trials share counts once. A run may have begun since: it has none.
     """

@@ -165,7 +165,7 @@ def filter_of(asked: Mapping[str, str]) -> dict[str, str]:
 
 
 def sort_of(asked: Mapping[str, str]) -> str:
-    """Return the order in an address; an unknown one is that of the names."""
+    """Return the order in an address; by name, if it is unknown."""
     sort = asked.get("sort", "trial")
     return sort if sort.removeprefix("-") in SORTS else "trial"
 

@@ -33,7 +33,7 @@ ACTION = (
 # A line break is a space to whoever looks for a phrase.
 FOLDED = f"lower(translate(left(rationale, {LONGEST}), chr(10) || chr(13) || chr(9), '   '))"
 # A change of mind is between what a driver said and what it had said before. ``place`` is the row
-# of the text: all texts are read to find some of them, and those of a page to show them.
+# of the text: a search reads all texts, a page reads only the texts that it shows.
 HITS = f"""
 CREATE TEMP TABLE hits AS
 WITH decided AS (
@@ -65,7 +65,7 @@ class Words:
         limits: Mapping[str, str] | None = None,
         page: int = 1,
     ) -> dict[str, Any]:
-        """Return decisions with all ``terms`` within ``limits``; ``hits`` are those of a page.
+        """Return decisions with all ``terms`` within ``limits``; ``hits`` are one page's.
 
         Those of mock models are the last. Each has the ``pieces`` of its words. ``crossed`` counts
         all of them by intention, M or Y, and by plan.

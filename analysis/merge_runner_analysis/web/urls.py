@@ -16,7 +16,7 @@ HOME = "index"
 class Links:
     """Addresses of the pages, as they are ``served``.
 
-    Where no server is, ``leads`` turns an address into that of a file; empty where there is none.
+    Where no server is, ``leads`` turns an address into a file's; empty where there is no file.
     """
 
     def __init__(self, leads: Callable[[str], str] | None = None) -> None:

@@ -163,7 +163,7 @@ class Lifecycle:
         status = await service.status(note.batch_id)  # which may name more files than before
         async for key, raw in service.results(status.paths or []):
             outcome = no_result("expired", "it was not asked in time", charged=False)
-            if raw:  # a rate limit would be that of batches: it pauses no normal request
+            if raw:  # a rate limit for batches pauses no normal request
                 outcome = replace(judge(raw, service.wire), pause=False, delay_s=None)
             broken += not key
             if key in note.lines:  # others are of other batches; the first of two counts
@@ -208,7 +208,7 @@ class Lifecycle:
         if can_be_found and (self.submits or exc.kind != "lost"):
             raise EndpointRefused(
                 f"{note.model}: batch {note.batch_id or note.mark} is refused to this key ({exc}): "
-                "set that of the account that has submitted it. If it is gone, the same command "
+                "set the key of the account that submitted it. If it is gone, the same command "
                 "without --batch asks its calls anew"
             ) from exc
         batch.default = no_result("batch_lost", str(exc))

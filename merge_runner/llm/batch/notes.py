@@ -41,7 +41,7 @@ class Batch:
     """A batch and its results.
 
     ``work`` follows it to its end; None: no call of this run waits for it yet. ``results`` has the
-    outcomes that are not taken yet, by key, and ``default`` that of all other requests; None: they
+    outcomes that are not taken yet, by key. All other requests have ``default``; None: they
     go into the next round. ``refused`` has, by key, why the money of a request was not reserved.
     An ``error`` ends the sweep.
     """

@@ -1,6 +1,6 @@
 """Wire formats: make request bodies of prompts, and read answers from reply bodies.
 
-Two formats of OpenAI, which many servers speak, and those of Gemini and Anthropic. A package can
+OpenAI has two, which many servers speak; Gemini and Anthropic have one each. A package can
 add others.
 """
 

@@ -37,7 +37,7 @@ DURATION = re.compile(r"(\d+(?:\.\d+)?)s")
 class ServerError:
     """An error in one shape: servers send nested, flat, listed and string errors.
 
-    ``status`` is that of the reply, or the equivalent of an error within a 200. ``names`` are its
+    ``status`` is the reply's status, or the equivalent of an error within a 200. ``names`` are its
     type, its code, its status in words and the reasons among its ``details``.
     """
 

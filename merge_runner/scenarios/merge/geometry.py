@@ -15,7 +15,7 @@ from merge_runner.records import Side
 
 @dataclass(frozen=True)
 class Track:
-    """Dimensions of the track in m; the defaults are those of the human experiment.
+    """Dimensions of the track in m; the human experiment has the defaults.
 
     ``tunnel_exit_m``, ``merge_point_m`` and ``end_m`` are travelled distances. The measures in SQL
     have the same numbers (measures.sql).

@@ -117,7 +117,7 @@ def test_a_second_study_changes_no_reference(copy):
 
 
 def test_a_study_that_was_not_played_is_named_beside_those_that_were(db):
-    with pytest.raises(UsageError, match="no trial of the study ablations; it holds those of: "):
+    with pytest.raises(UsageError, match="no trial of the study ablations; its studies: "):
         Study(db, Selection(file="ablations"))
 
 

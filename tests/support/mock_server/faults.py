@@ -10,7 +10,7 @@ from merge_runner.chance import draw
 from merge_runner.emulator.handler import GEMINI, MESSAGES, as_json
 from merge_runner.records import SCRIPTED_FIELD
 
-# The faults that are errors of the provider, beside a rate limit, and those of the connection.
+# Faults of the provider (besides a rate limit), and of the connection.
 ERRORS = {"request_timeout": 408, "conflict": 409, "server_error": 500, "overloaded": 503}
 BREAKS = ("hang", "reset", "truncated_body")
 # A sweep with these ends like one without; answers that are ``empty`` or ``malformed`` are kept.

@@ -19,7 +19,7 @@ KEY = "trial_id", "spec_hash"
 Scale = Callable[[float], float]
 """Place of a value in the picture."""
 CROSS = "m-5-5 10 10m0-10-10 10"
-# The drawn series of a trial, each a list; the headway is that of the vehicle that went first.
+# The drawn series of a trial, each a list; the headway belongs to the vehicle that went first.
 PANELS = {
     "first_mps": "Speed of the vehicle that merged first (m/s)",
     "second_mps": "Speed of the second one (m/s)",

@@ -108,7 +108,7 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
     conditions = by_condition(site, scope, shown)
     names = [driver.name for driver in shown]
     short = short_names(names)
-    # Humans' gap is that of the situations in which the first driver finished.
+    # Humans' gap covers the situations in which the first driver finished.
     human = humans_of(values["table"], next(iter(shown), None))
     return site.render(
         "home.html",

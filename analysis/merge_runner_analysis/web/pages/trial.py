@@ -167,7 +167,7 @@ def others(site: Site, trial_id: str, asked: Mapping[str, str]) -> dict[str, Any
     """Return other trials for a trial's page: one to compare, one on offer, or several.
 
     ``compare=KEY`` gives what a replay draws of it, ``offer=KIND`` a key; None where there is none.
-    ``q=WORDS`` gives the first trials that have the words, those of the same condition before
+    ``q=WORDS`` gives the first trials that have the words, in the same condition before
     others. Raises NotThere.
     """
     row = site.trial(trial_id, asked.get("spec", ""))

@@ -1,4 +1,4 @@
-"""Search in drivers' words: decisions whose words hold those of a query."""
+"""Search in drivers' words: decisions whose words contain a query's words."""
 
 from __future__ import annotations
 

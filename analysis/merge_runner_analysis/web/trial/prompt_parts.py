@@ -54,7 +54,7 @@ def parts_of(
 
 
 def digests_of(blocks: Mapping[str, str], side: Side) -> dict[str, str]:
-    """Return the digests of a spec's blocks, without those of the other side's prompt alone."""
+    """Return the digests of a spec's blocks, without blocks that only the other side reads."""
     named = ((name.partition("@"), digest) for name, digest in blocks.items())
     return {name: digest for (name, _, of), digest in named if of in ("", side)}
 

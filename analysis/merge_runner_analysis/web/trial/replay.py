@@ -68,7 +68,7 @@ def replay_data(row: Row, trial: Trial, account: Account | None) -> dict[str, An
 
 
 def marks(row: Row, trial: Trial, account: Account | None) -> list[dict[str, Any]]:
-    """Return the moments that matter, in order: merges, a collision, those of the account."""
+    """Return the moments that matter, in order: merges, a collision, the account's moments."""
     moments: list[tuple[float, str, str, str]] = [
         (reached_s, side, "merge", f"{side} merges")
         for side, samples in trial.states.items()

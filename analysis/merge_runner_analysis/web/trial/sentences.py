@@ -82,7 +82,7 @@ def summary(trial: Trial) -> list[str]:
     lines = []
     for side, samples in trial.states.items():
         speeds = controlled(samples, "velocity_mps")
-        # A sample's acceleration is that of the step before it.
+        # A sample's acceleration covers the step before it.
         hardest = max(controlled(samples, "acceleration_mps2")[1:], key=abs, default=0.0)
         if speeds:
             lines.append(
