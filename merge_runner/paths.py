@@ -44,7 +44,7 @@ def command_at(command: str, option: str, place: Path | str, usual: Path) -> str
     return f"{command}{at}"
 
 
-def refuse_another_kind(file: Path, begins: bytes, kind: str) -> None:
+def check_kind(file: Path, begins: bytes, kind: str) -> None:
     """Raise UsageError if a file exists and does not begin like a file of this kind."""
     if not file.is_file():
         return

@@ -14,18 +14,18 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from merge_runner_analysis.frames import load, load_trials
-    from merge_runner_analysis.study import Study
+    from merge_runner_analysis.study import StudyResults
     from merge_runner_analysis.tables import TABLES, table
 
 # Names are loaded when they are used: the command line must not wait for pandas.
 _PLACES = {
-    "Study": "merge_runner_analysis.study",
+    "StudyResults": "merge_runner_analysis.study",
     "load": "merge_runner_analysis.frames",
     "load_trials": "merge_runner_analysis.frames",
     "table": "merge_runner_analysis.tables",
     "TABLES": "merge_runner_analysis.tables",
 }
-__all__ = ["TABLES", "Study", "load", "load_trials", "table"]
+__all__ = ["TABLES", "StudyResults", "load", "load_trials", "table"]
 
 
 def __getattr__(name: str) -> object:

@@ -1,7 +1,7 @@
 """Cache of results: a study's in memory, tables and figures in a file beside the database.
 
 The file keeps a table as JSON, a figure as SVG in Base64, and the digest, until the results change.
-Where it cannot be written, as on a read-only disk, nothing is kept, and the next run computes all
+Where it cannot be written, as on a read-only disk, nothing is cached, and the next run computes all
 again.
 """
 
@@ -22,7 +22,7 @@ import merge_runner_analysis
 from merge_runner.errors import UsageError
 from merge_runner.registry import in_use, plugin_sources, plugins
 
-KEPT = """
+CREATE_TABLE = """
 CREATE TABLE IF NOT EXISTS finished (
     state TEXT NOT NULL, options TEXT NOT NULL, name TEXT NOT NULL, content TEXT NOT NULL
 )
@@ -67,7 +67,7 @@ def program() -> str:
 
 
 def finished(db: Path, made_of: str, options: str, names: Sequence[str]) -> dict[str, str]:
-    """Return the tables or figures that are kept of this state, by name."""
+    """Return the tables or figures that are cached for this state, by name."""
     if not Path(f"{db}.derived").exists():
         return {}
     query = "SELECT name, content FROM finished WHERE state = ? AND options = ?"
@@ -75,7 +75,7 @@ def finished(db: Path, made_of: str, options: str, names: Sequence[str]) -> dict
     return {name: content for name, content in rows if name in names}
 
 
-def keep_finished(db: Path, made_of: str, options: str, contents: Mapping[str, str]) -> None:
+def cache_finished(db: Path, made_of: str, options: str, contents: Mapping[str, str]) -> None:
     """Keep tables or figures, unless the results have left the state that these are ``made_of``."""
     rows = [(made_of, options, name, content) for name, content in contents.items()]
     if present_state(db) == made_of:
@@ -83,31 +83,34 @@ def keep_finished(db: Path, made_of: str, options: str, contents: Mapping[str, s
         _run(db, "INSERT INTO finished VALUES (?, ?, ?, ?)", rows)
 
 
-def kept(db: Path, made_of: str, options: str, name: str, make: Callable[[], str]) -> str:
+def cached(db: Path, made_of: str, options: str, name: str, make: Callable[[], str]) -> str:
     """Return the cached text of this state under a name; make and cache it if there is none."""
     contents = finished(db, made_of, options, [name])
     if not contents:
         contents = {name: make()}
-        keep_finished(db, made_of, options, contents)
+        cache_finished(db, made_of, options, contents)
     return contents[name]
 
 
 def digest_of(db: Path, made_of: str) -> str:
     """Return the digest of all results, for which all of them have to be read."""
-    # Here, since it imports duckdb, which no kept table needs.
+    # Here, since it imports duckdb, which no cached table needs.
     from merge_runner.results.store import results_digest
 
-    return kept(db, made_of, "", "digest", lambda: results_digest(db)[0])
+    return cached(db, made_of, "", "digest", lambda: results_digest(db)[0])
 
 
 def _run(db: Path, sql: str, rows: Sequence[tuple[str, ...]]) -> list[tuple[str, str]]:
     """Run a statement for each of these rows, in one transaction; nothing where that fails."""
     try:
-        with closing(sqlite3.connect(f"{db}.derived", timeout=PATIENCE_S)) as kept, kept:
-            kept.execute(KEPT)
-            return [result for row in rows for result in kept.execute(sql, row)]
+        with (
+            closing(sqlite3.connect(f"{db}.derived", timeout=PATIENCE_S)) as connection,
+            connection,
+        ):
+            connection.execute(CREATE_TABLE)
+            return [result for row in rows for result in connection.execute(sql, row)]
     except sqlite3.Error as exc:
-        warn_once("what was computed is not kept for the next time: %s", str(exc))
+        warn_once("what was computed is not cached for the next time: %s", str(exc))
         return []
 
 

@@ -29,14 +29,14 @@ from merge_runner.cli.options import (
     use_study,
 )
 from merge_runner.errors import UsageError
-from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, refuse_another_kind
+from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, check_kind
 from merge_runner.text_safety import say
 from merge_runner_analysis.humans.commands import human_app
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.table_format import TableFormat
 
 if TYPE_CHECKING:
-    from merge_runner_analysis.study import Study
+    from merge_runner_analysis.study import StudyResults
 
 HTML = b"<!doctype html"
 TOLD_EVERY = 100  # pages
@@ -115,13 +115,13 @@ def tables(
     if against is None:
         made = finished_tables(db, names or (), selection=selection)
     else:
-        from merge_runner_analysis.study import Study
+        from merge_runner_analysis.study import StudyResults
         from merge_runner_analysis.tables.against import PAPER
         from merge_runner_analysis.tables.against import against as with_paper
 
         if against != PAPER:
             raise UsageError(f"--against {against}: valid is {PAPER}")
-        study = Study(db, selection)
+        study = StudyResults(db, selection)
         made = [with_paper(table, study) for table in finished_tables(db, names or (), study)]
     width = None if wide else terminal_width()
     print_out(render(made, TableFormat.JSON if as_json else output, width))
@@ -189,7 +189,7 @@ def power(
     from merge_runner.run.plan import make_plan
     from merge_runner.run.sweep import unsent
     from merge_runner_analysis.power import chances, power_table
-    from merge_runner_analysis.study import Study
+    from merge_runner_analysis.study import StudyResults
     from merge_runner_analysis.tables.formats import render
 
     plan = make_plan(
@@ -204,7 +204,7 @@ def power(
     use(plan.parts.catalogue)
     expected = asyncio.run(unsent(plan, Options(db=db, cache=cache), say=say, whole=True))
     cost_usd = 0.0 if expected.free else expected.cost_usd
-    played = Study(db).models if db.exists() else []
+    played = StudyResults(db).models if db.exists() else []
     with _status_line("simulating") as say_now:
         rows = list(chances(plan, cost_usd, played, sims, say_now))
     if as_json:
@@ -275,7 +275,7 @@ def report(
 
     Example: merge-runner report --study my-study/study.toml
     """
-    refuse_another_kind(out, HTML, "page of HTML")
+    check_kind(out, HTML, "page of HTML")
     study = _study(db, _selection(models, where, study_file, run=run), trust=trust)
     from merge_runner_analysis.web.report import write_report
 
@@ -287,7 +287,7 @@ def report(
 
 
 @contextmanager
-def _while_computed(study: Study, what: str) -> Iterator[Callable[[str], None]]:
+def _while_computed(study: StudyResults, what: str) -> Iterator[Callable[[str], None]]:
     """Announce a long computation, and show its progress in a terminal."""
     say(
         f"computing the {what} of {len(study.frames.trials)} trials; a thousand take about a minute"
@@ -335,11 +335,11 @@ def _selection(
     return Selection(drivers(models), levels, file, by, without_fallbacks, run or "")
 
 
-def _study(db: Path, selection: Selection, *, trust: bool) -> Study:
+def _study(db: Path, selection: Selection, *, trust: bool) -> StudyResults:
     use_study(selection.file, trust=trust)
-    from merge_runner_analysis.study import Study
+    from merge_runner_analysis.study import StudyResults
 
-    return Study(db, selection)
+    return StudyResults(db, selection)
 
 
 def drivers(text: str | None) -> list[str] | None:

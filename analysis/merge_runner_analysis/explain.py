@@ -17,7 +17,7 @@ from merge_runner_analysis.provenance import call_counts
 from merge_runner_analysis.published import HUMAN, citation
 from merge_runner_analysis.stats.levels import distinct
 from merge_runner_analysis.stats.verdicts import hits
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables.formats import shown_value
 from merge_runner_analysis.tables.model import COUNTED, ENDED, FINISHED, STORED, Column, Row, Table
 
@@ -67,7 +67,7 @@ class Explanation(NamedTuple):
         return lines
 
 
-def explain(study: Study, table: Table, cell: str) -> Explanation:
+def explain(study: StudyResults, table: Table, cell: str) -> Explanation:
     """Explain a ROW of a table, or ``ROW:COLUMN``; raises UsageError."""
     rows = {row.id: row for row in table.rows}
     row_id, _, name = (cell, "", "") if cell in rows else cell.rpartition(":")
@@ -86,19 +86,19 @@ def explain(study: Study, table: Table, cell: str) -> Explanation:
     )
 
 
-def sql_command(study: Study) -> str:
+def sql_command(study: StudyResults) -> str:
     """Return the command that runs a query on a study's database."""
     return command_at("merge-runner sql", "--db", study.db, DEFAULT_DB)
 
 
 def sources_of(
-    study: Study, table: Table, row: Row, column: Column | None = None
+    study: StudyResults, table: Table, row: Row, column: Column | None = None
 ) -> tuple[Source, ...]:
     """Return the trials of each group behind a row, and those that a share counts."""
     if column is not None and column.name.startswith("ceiling"):
         resampled = "data sets resampled from the published counts and regression, not trials"
         return (Source(HUMAN, resampled),)
-    known = (*study.groups, *study.asked, *study.unjudged, *study.unjudged_asked)
+    known = (*study.groups, *study.probes, *study.unjudged, *study.unjudged_probes)
     groups = [group for group in known if group.id in row.groups]
     if column is not None and column.counts == COUNTED and row.values.get(column.name):
         once = (distinct(study, group) for group in groups)
@@ -126,7 +126,7 @@ def _counted(group: Group, measure: str) -> Source:
 
 @remembered
 def _source(
-    study: Study,
+    study: StudyResults,
     group: Group,
     rests_on: str,
     conditions: tuple[str, ...],

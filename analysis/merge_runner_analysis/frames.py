@@ -119,7 +119,7 @@ SPECS = "SELECT DISTINCT spec_hash, spec FROM specs JOIN trials USING (spec_hash
 KEYS = ["trial_id", "spec_hash"]
 # The newest run comes first: the order of its levels counts.
 SWEEPS = """
-SELECT sweep_id, name, coalesce('-' || nullif(config->>'$.seat', ''), '') AS seat,
+SELECT sweep_id, name, coalesce('-' || nullif(config->>'$.seat', ''), '') AS suffix,
     coalesce(config->'$.levels', '{}') AS levels, config->>'$.run_name' AS run_name,
     config->>'$.study.text' AS text
 FROM sweeps ORDER BY started_at DESC, sweep_id
@@ -180,7 +180,7 @@ class Frames(NamedTuple):
 
     trials: pd.DataFrame
     """TRIALS and TRACES with a column for each metric, and whether they collided."""
-    asked: pd.DataFrame
+    probes: pd.DataFrame
     """First situations that were only asked: of equal columns, of trials that end there."""
     specs: Mapping[str, dict[str, Any]]
     """By their hashes."""
@@ -216,7 +216,7 @@ def _studies(sweeps: pd.DataFrame, links: pd.DataFrame) -> Studies:
     orders: dict[str, dict[str, list[str]]] = {}
     for row in sweeps.itertuples():
         order = json.loads(row.levels)
-        names[row.sweep_id] = study_name(row.name.removesuffix(row.seat), order)
+        names[row.sweep_id] = study_name(row.name.removesuffix(row.suffix), order)
         known = orders.setdefault(names[row.sweep_id], {})
         for factor, levels in order.items():
             known[factor] = list(dict.fromkeys([*known.get(factor, ()), *levels]))

@@ -96,7 +96,7 @@ class Group:
         return "trial_id" in self.trials
 
     @property
-    def seats(self) -> tuple[int, int]:
+    def ego_sides(self) -> tuple[int, int]:
         """Numbers of stored trials with the ego on the left and on the right."""
         left, right = (int((self.stored.trials["ego"] == side).sum()) for side in SIDES)
         return left, right

@@ -16,7 +16,7 @@ from merge_runner.results.database import read_database
 from merge_runner.served_model import other_models, sql_of
 from merge_runner_analysis.frames import KEYS
 from merge_runner_analysis.grouping import Group
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.task import leaves, task_settings
 
 SWEEPS = """
@@ -103,7 +103,7 @@ def provenance(db: Path) -> Provenance:
     return Provenance(sweeps, calls, model_costs, mismatches, settings)
 
 
-def call_counts(study: Study, group: Group) -> pd.DataFrame:
+def call_counts(study: StudyResults, group: Group) -> pd.DataFrame:
     """Return the counts of each trial's calls; the table ``attempts`` explains them.
 
     Each reason for an invalid answer has a count, too; ``no_decision`` is not one of these.
@@ -121,7 +121,7 @@ def call_counts(study: Study, group: Group) -> pd.DataFrame:
     )
 
 
-def tally(study: Study, group: Group) -> Counter[str]:
+def tally(study: StudyResults, group: Group) -> Counter[str]:
     """Return the sums of ``call_counts`` over a group's trials."""
     return Counter({name: int(n) for name, n in call_counts(study, group).sum().items()})
 

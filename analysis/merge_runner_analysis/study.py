@@ -33,16 +33,16 @@ from merge_runner_analysis.humans.imported import VELOCITY_PAGES, findings, of_p
 from merge_runner_analysis.published import HUMAN, HUMAN_TRIALS
 from merge_runner_analysis.selection import Selection
 
-ONLY_ASKED = " [asked]"  # ends the name of a driver that was only asked
+PROBE = " [asked]"  # ends the name of a driver asked only for first decisions
 EVERYTHING = Selection()
 # So many human trials in every condition make a reference; fewer are shown, but not compared with.
 ENOUGH_PER_CONDITION = 5
 
 
-class Study:
+class StudyResults:
     """The groups of a database, humans first, and results that are computed once.
 
-    ``models`` are the ``played`` groups that are judged, ``unjudged`` the others; ``asked`` are
+    ``models`` are the ``played`` groups that are judged, ``unjudged`` the others; ``probes`` are
     groups of first-decision probes. ``state`` is the results' state before they were read.
     """
 
@@ -53,14 +53,14 @@ class Study:
         self.frames = read_frames(self.db)
         self.source = None if selection.file is None else read_study(selection.file)
         self.file, self.order = _chosen(self.db, self.frames.studies, self.source)
-        trials, asked = self.frames.trials, self.frames.asked
+        trials, probes = self.frames.trials, self.frames.probes
         is_human, condition = trials["source"] == HUMAN, selection.condition
         self.human = humans_of(of_published_pairs(trials[is_human]))
         if condition:
             self.human = self.human.part(lambda rows: rows["condition"] == condition)
         played = self._groups(self._driven(trials[~is_human]))
-        only_asked = self._groups(asked.assign(driver=asked["driver"] + ONLY_ASKED))
-        chosen = self._selected([*played, *only_asked])
+        probed = self._groups(probes.assign(driver=probes["driver"] + PROBE))
+        chosen = self._selected([*played, *probed])
         self.empty = not played
         self.played = [group for group in played if group in chosen]
         self.models = [group for group in self.played if not group.unjudged]
@@ -70,9 +70,9 @@ class Study:
             named = sorted(self.models, key=lambda group: place(without_endpoint(group.driver)))
             levels = [group.levels[MODEL] for group in named if MODEL in group.levels]
             self.order = {**self.order, MODEL: list(dict.fromkeys(levels))}
-        only_asked = [group for group in only_asked if group in chosen]
-        self.asked = [group for group in only_asked if not group.unjudged]
-        self.unjudged_asked = [group for group in only_asked if group.unjudged]
+        probed = [group for group in probed if group in chosen]
+        self.probes = [group for group in probed if not group.unjudged]
+        self.unjudged_probes = [group for group in probed if group.unjudged]
         with_human = selection.models is None or HUMAN in selection.models
         self.groups = [self.human] * with_human + self.models
 
@@ -110,9 +110,7 @@ class Study:
     def _selected(self, groups: list[Group]) -> list[Group]:
         """Return the chosen groups; first-decision probes go by their models' names."""
         names = {
-            group: group.name.removesuffix(ONLY_ASKED)
-            if group.name.endswith(ONLY_ASKED)
-            else group.driver
+            group: group.name.removesuffix(PROBE) if group.name.endswith(PROBE) else group.driver
             for group in groups
         }
         valid = dict.fromkeys([HUMAN, *names.values()])
@@ -203,7 +201,7 @@ def _keys(trials: pd.DataFrame) -> pd.MultiIndex:
 
 
 @remembered
-def in_one_study(study: Study, *groups: Group) -> bool:
+def in_one_study(study: StudyResults, *groups: Group) -> bool:
     """Return whether all trials of these groups belong to one study."""
     known = study.frames.studies
     return len(known.orders) < 2 or any(

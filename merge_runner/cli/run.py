@@ -189,7 +189,7 @@ def _plans(name: str, *, selection: dict[str, Any], options: Options, trust: boo
     from merge_runner.run.recorded_plans import recorded_plans
 
     if name.endswith(".parquet"):
-        _refuse_a_part(name, chosen=any(selection.values()), replay=options.replay)
+        _check_whole(name, chosen=any(selection.values()), replay=options.replay)
         return [*recorded_plans(Path(name), db=options.db, trust=trust)]
     plan = make_plan(name, **selection, db=options.db, trust=trust)
     if options.dask is not None and options.replay:
@@ -199,7 +199,7 @@ def _plans(name: str, *, selection: dict[str, Any], options: Options, trust: boo
     return [plan]
 
 
-def _refuse_a_part(recording: str, *, chosen: bool, replay: bool) -> None:
+def _check_whole(recording: str, *, chosen: bool, replay: bool) -> None:
     """Raise UsageError unless a recording is replayed whole."""
     if not replay:
         raise UsageError(f"{recording} is a recording: merge-runner replay {recording}")

@@ -36,7 +36,7 @@ SETTINGS = diskcache.DEFAULT_SETTINGS | {
 }
 FAILURES = (OSError, sqlite3.Error, UnicodeDecodeError)
 # ``spent`` has sums, since a sum over all attempts at each reservation would take ever longer.
-TABLES = (
+CREATE_TABLES = (
     """CREATE TABLE spent (
     scope TEXT, driver TEXT, usd REAL NOT NULL, overrun_usd REAL NOT NULL,
     most_overrun REAL NOT NULL, PRIMARY KEY (scope, driver)) STRICT""",
@@ -102,7 +102,7 @@ def close_texts(texts: diskcache.Cache) -> None:
     texts.close()
 
 
-def refuse_others(folder: Path) -> bytes:
+def checked_format(folder: Path) -> bytes:
     """Return the format that a folder's file names.
 
     Raises UsageError for unknown settings, which diskcache would apply, and for the file of another
@@ -136,7 +136,7 @@ def make(folder: Path) -> None:
         if not (folder / FILE).exists():
             with closing(open_texts(Path(new))) as made, made.transact():
                 made.set(FORMAT_KEY, FORMAT)
-                for statement in TABLES:
+                for statement in CREATE_TABLES:
                     made._sql(statement)
             os.replace(Path(new) / FILE, folder / FILE)
 
@@ -145,7 +145,7 @@ def upgrade(folder: Path) -> None:
     """Upgrade a folder of the previous format, with its ledger."""
     locks = ModelLocks(folder)
     with folder_lock(folder), closing(connect(folder / FILE, "rw")) as database, closing(locks):
-        if refuse_others(folder) == FORMAT.encode():
+        if checked_format(folder) == FORMAT.encode():
             return
         if not locks.take_all():
             raise UsageError(f"an older merge-runner works with {folder}: wait until it has ended")
@@ -154,7 +154,7 @@ def upgrade(folder: Path) -> None:
             database.execute("ATTACH ? AS before", [str(folder / LEDGER)])
         with database:
             database.execute("BEGIN IMMEDIATE")
-            for statement in TABLES:
+            for statement in CREATE_TABLES:
                 database.execute(statement)
             for table in ("spent", "open") if has_ledger else ():
                 database.execute(f"INSERT INTO main.{table} SELECT * FROM before.{table}")  # noqa: S608
@@ -171,7 +171,7 @@ def prepare(folder: Path, *, read_only: bool, allow_previous: bool) -> None:
         require(folder)
     else:
         make(folder)
-    if refuse_others(folder) == BEFORE.encode() and not allow_previous:
+    if checked_format(folder) == BEFORE.encode() and not allow_previous:
         if read_only:
             raise UsageError(
                 f"the cache {folder} has format {BEFORE}: a sweep or a replay with it brings it to "

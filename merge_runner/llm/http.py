@@ -132,7 +132,7 @@ class HttpTransport:
                 reply = await self._carrier.handle_async_request(request)
                 async with aclosing(reply):
                     headers = dict(reply.headers.items())  # httpx has their names in lower case
-                    self._refuse_others(headers, request_id)
+                    self._check_request_id(headers, request_id)
                     text = await self._read(reply, most_bytes or self._most_bytes)
                     return RawReply(reply.status_code, headers, text)
         except TransportFailure:
@@ -148,7 +148,7 @@ class HttpTransport:
         """Close all connections."""
         await self._carrier.aclose()
 
-    def _refuse_others(self, headers: Mapping[str, str], request_id: str) -> None:
+    def _check_request_id(self, headers: Mapping[str, str], request_id: str) -> None:
         """Raise TransportFailure where a reply echoes the id of another request."""
         self._echoes_ids = False
         for header in ID_HEADERS:

@@ -29,7 +29,7 @@ from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.store import ATTEMPTS, CachedCall, Overlay
 from merge_runner.llm.templates import count_by_template
-from merge_runner.paths import refuse_another_kind
+from merge_runner.paths import check_kind
 from merge_runner.records import (
     DAMAGED,
     KEY_VERSION,
@@ -94,7 +94,7 @@ def export_recording(
     """
     if file.is_dir():
         raise UsageError(f"{file} is a folder: name a file")
-    refuse_another_kind(file, b"PAR1", "recording")
+    check_kind(file, b"PAR1", "recording")
     damaged: list[str] = []
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -298,7 +298,7 @@ def opened(file: Path) -> Iterator[tuple[duckdb.DuckDBPyConnection, dict[str, st
                     f"{file} has the format {versions[0]!r} with keys of version {versions[1]!r}, "
                     f"this program reads {FORMAT!r} with keys of version {KEY_VERSION}"
                 )
-            _refuse_bombs(file, pattern, connection)
+            _check_sizes(file, pattern, connection)
             yield connection, metadata
         except (duckdb.Error, UnicodeDecodeError) as exc:
             READER.drop()
@@ -307,7 +307,7 @@ def opened(file: Path) -> Iterator[tuple[duckdb.DuckDBPyConnection, dict[str, st
             ) from exc
 
 
-def _refuse_bombs(file: Path, pattern: str, connection: duckdb.DuckDBPyConnection) -> None:
+def _check_sizes(file: Path, pattern: str, connection: duckdb.DuckDBPyConnection) -> None:
     """Raise RecordingError for more rows or longer texts than recordings have.
 
     The size of the decoded data is known before anything is decoded.

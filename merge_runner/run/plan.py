@@ -42,7 +42,7 @@ class Plan(BaseModel):
     the drivers except opponents, separated by commas, as ids of sweeps do. ``levels`` has the
     levels of each factor of its file, the reference first. ``entries`` are the language models of
     all arms by their names in an arm's ``asked``, and ``endpoints`` the identities of their
-    endpoints (``providers.Endpoint``). ``seat`` is ``first`` where only first decisions are asked,
+    endpoints (``providers.Endpoint``). ``probe`` is ``first`` where only first decisions are asked,
     and empty in a sweep. ``parts`` are no part of the JSON: a plan that is read has none.
     """
 
@@ -59,7 +59,7 @@ class Plan(BaseModel):
     conditions: tuple[str, ...]
     sample_set: int
     order_seed: int
-    seat: Literal["", "first"] = ""
+    probe: Literal["", "first"] = Field("", validation_alias="seat", serialization_alias="seat")
     parts: Annotated[InstanceOf[Parts], Field(exclude=True)] = Parts()
 
     @property
@@ -71,8 +71,8 @@ class Plan(BaseModel):
         if self.study.file.budget:
             return self.study.name
         models = ",".join(sorted(self.model.split(",")))
-        seat = f"/{self.seat}" if self.seat else ""
-        return f"{self.study.name}/{models}/set{self.sample_set}{seat}"
+        probe = f"/{self.probe}" if self.probe else ""
+        return f"{self.study.name}/{models}/set{self.sample_set}{probe}"
 
     @property
     def registered(self) -> dict[str, str]:
@@ -135,10 +135,10 @@ class Plan(BaseModel):
         specs = [
             TrialSpec(
                 trial_id=trial_id(
-                    arm, condition, repetition, sample_set=self.sample_set, seat=self.seat
+                    arm, condition, repetition, sample_set=self.sample_set, probe=self.probe
                 ),
                 spec_hash=hashed,
-                source="first_decision" if self.seat else "llm" if arm.entries else "driver",
+                source="first_decision" if self.probe else "llm" if arm.entries else "driver",
                 model_left=arm.sides["left"],
                 model_right=arm.sides["right"],
                 variant=arm.variant,
@@ -234,7 +234,7 @@ def make_plan(
         conditions=names,
         sample_set=sample_set,
         order_seed=order_seed,
-        seat="first" if first else "",
+        probe="first" if first else "",
         parts=parts,
     )
 

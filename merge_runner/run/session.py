@@ -19,7 +19,7 @@ from merge_runner.results.store import Store
 from merge_runner.run.options import Options
 from merge_runner.run.plan import Plan
 from merge_runner.run.served_names import with_names
-from merge_runner.run.stored_replay import refuse_changed_programs
+from merge_runner.run.stored_replay import check_programs
 from merge_runner.trial_records import TrialRecord, TrialSpec
 
 
@@ -90,7 +90,7 @@ async def open_session(
         with unreadable_is_usage():
             ended = set() if options.replay else Store(options.db).ended_trials(specs)
             stored = [spec for key, spec in specs.items() if key in ended]
-            refuse_changed_programs(options.db, plan, stored)
+            check_programs(options.db, plan, stored)
         todo = [spec for key, spec in specs.items() if key not in ended]
         live = bool(todo) and not options.sends_nothing
         if live and options.dask is None:

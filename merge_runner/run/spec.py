@@ -13,9 +13,9 @@ from merge_runner.text_safety import in_a_name
 from merge_runner.trial_records import SPEC_VERSION
 
 
-def trial_id(arm: Arm, condition: str, repetition: int, *, sample_set: int, seat: str) -> str:
+def trial_id(arm: Arm, condition: str, repetition: int, *, sample_set: int, probe: str) -> str:
     """Return the id of a trial of an arm."""
-    begin = "seat/" if seat else ""
+    begin = "seat/" if probe else ""
     set_ = f"/set{sample_set}" if sample_set else ""
     # The prompt and the opponent are in it already.
     levels = "".join(

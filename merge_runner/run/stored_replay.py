@@ -99,7 +99,7 @@ def audit_database(
         return [*reversed(audits), *orphans]
 
 
-def refuse_changed_programs(path: Path, plan: Plan, stored: Sequence[TrialSpec]) -> None:
+def check_programs(path: Path, plan: Plan, stored: Sequence[TrialSpec]) -> None:
     """Raise UsageError where a program drives otherwise than in a stored trial of its revision.
 
     One trial of each spec with a program is played, by the stored replies.
@@ -151,7 +151,7 @@ def _audit(
             text = f"it disagrees with itself in {', '.join(wrong)}"
             problems.append(Finding("config", text, sweep_id))
         planned = {
-            trial_id(arm, condition, repetition, sample_set=plan.sample_set, seat=plan.seat): ""
+            trial_id(arm, condition, repetition, sample_set=plan.sample_set, probe=plan.probe): ""
             for arm in plan.arms
             for condition in plan.conditions
             for repetition in range(1, arm.repetitions + 1)

@@ -12,7 +12,7 @@ from merge_runner.study.arms import MODEL, PROMPT
 from merge_runner.study.file import StudySource
 
 NAMED = """
-SELECT sweep_id, name, coalesce('-' || nullif(config->>'$.seat', ''), '') AS seat,
+SELECT sweep_id, name, coalesce('-' || nullif(config->>'$.seat', ''), '') AS suffix,
     coalesce(config->'$.levels', '{}') AS levels
 FROM sweeps ORDER BY started_at, sweep_id
 """
@@ -30,8 +30,8 @@ def runs_of(db: Path, study: StudySource) -> list[str]:
         rows = connection.execute(NAMED).fetchall()
     requested = study_name(study.name, study.file.factors)
     played = {
-        sweep_id: study_name(name.removesuffix(seat), json.loads(levels))
-        for sweep_id, name, seat, levels in rows
+        sweep_id: study_name(name.removesuffix(suffix), json.loads(levels))
+        for sweep_id, name, suffix, levels in rows
     }
     if requested not in played.values():
         studies = ", ".join(dict.fromkeys(played.values())) or "none"

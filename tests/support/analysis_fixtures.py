@@ -9,7 +9,7 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.humans.archive import open_files
 from merge_runner_analysis.humans.load import import_trials, sort_files
 from merge_runner_analysis.selection import Selection
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables import make_tables
 from tests.support.recordings import drive, write_folder
 from tests.support.studies import ANSWERS, Said, write_study, yielding
@@ -53,20 +53,20 @@ def study(tmp_path_factory):
         ),
     ]
     path = tmp_path_factory.mktemp("study") / "study.duckdb"
-    return Study(write_study(path, drives, config=CONFIG))
+    return StudyResults(write_study(path, drives, config=CONFIG))
 
 
 @pytest.fixture(scope="session")
 def small(tmp_path_factory):
     """o3 alone, once in every condition, and no model was asked: what drawing and writing need."""
     path = tmp_path_factory.mktemp("small") / "small.duckdb"
-    return Study(write_study(path, yielding("o3", reps=1)))
+    return StudyResults(write_study(path, yielding("o3", reps=1)))
 
 
 @pytest.fixture(scope="session")
 def tables(study):
     """All tables of the study by name; the verdicts are of one driver, which takes seconds."""
-    verdicts = make_tables(Study(study.db, Selection(["other"])), ["verdicts"])
+    verdicts = make_tables(StudyResults(study.db, Selection(["other"])), ["verdicts"])
     return {table.name: table for table in [*verdicts, *make_tables(study, QUICK)]}
 
 
@@ -86,4 +86,4 @@ def imported(tmp_path_factory):
     db = write_study(folder / "t.duckdb", yielding("o3", reps=2))
     with open_files(write_folder(folder / "recordings", files)) as found:
         import_trials(sort_files(found), Store(db))
-    return Study(db)
+    return StudyResults(db)

@@ -17,7 +17,7 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 from merge_runner.trial_records import DecisionRow, FailedCall, TrialRecord, TrialSpec
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 
 SCENARIO = ScenarioConfig()
 ANSWERS = ("ok", "refusal", "truncated", "empty")
@@ -183,12 +183,12 @@ def damage(db: Path, *statements: str) -> None:
             assert rows[0][0] > 0, f"nothing was damaged: {statement}"
 
 
-def changed(db: Path, *statements: str) -> Study:
+def changed(db: Path, *statements: str) -> StudyResults:
     """The study of a database after some changes."""
     with duckdb.connect(str(db)) as connection:
         for statement in statements:
             connection.execute(statement)
-    return Study(db)
+    return StudyResults(db)
 
 
 @cache

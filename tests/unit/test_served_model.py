@@ -10,7 +10,7 @@ from merge_runner.results.sweeps import sweep_facts
 from merge_runner.served_model import others_among
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.provenance import provenance, tally
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables.attempts import attempts
 from merge_runner_analysis.web.catalogue import Catalogue
 from merge_runner_analysis.web.runs import list_runs
@@ -65,7 +65,7 @@ def test_a_configuration_that_declares_nonsense_declares_nothing(db):
 
 
 def test_the_table_and_the_trials_behind_its_cell_agree(db):
-    study = Study(db)
+    study = StudyResults(db)
     (group,) = study.models
     assert tally(study, group)["other_model"] == len(OTHERS)
     (source,) = explain(study, attempts(study), f"{group.id}:other_model").sources

@@ -21,7 +21,7 @@ from merge_runner_analysis.metrics import LEFT_FIRST
 from merge_runner_analysis.stats.effects import measured
 from merge_runner_analysis.stats.levels import Level, levels_by_factor
 from merge_runner_analysis.stats.sides import level_estimate
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 
 ACROSS = 3  # panels
 LABEL, LEGEND = 24, 48  # characters of a line
@@ -30,7 +30,7 @@ MARK = 0.03  # of an axis: the width of a mark
 EVEN = 50.0  # percent: neither driver is favoured
 
 
-def effects_figure(study: Study) -> Figure:
+def effects_figure(study: StudyResults) -> Figure:
     """Return the figure: a panel per measure, a line per level, a mark per driver."""
     lines = _lines(study)
     every = [level for levels in lines.values() for _, level in levels]
@@ -76,7 +76,7 @@ def effects_figure(study: Study) -> Figure:
     return figure
 
 
-def _lines(study: Study) -> dict[str, list[tuple[str, Level]]]:
+def _lines(study: StudyResults) -> dict[str, list[tuple[str, Level]]]:
     """Return by line its levels, each with its driver; without a factor one line of all drivers."""
     factors = levels_of(study.models, study.order)
     lines: dict[str, list[tuple[str, Level]]] = {

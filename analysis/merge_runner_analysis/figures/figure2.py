@@ -33,7 +33,7 @@ from merge_runner_analysis.published import HUMAN, published
 from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.intervals import mean, proportion
 from merge_runner_analysis.stats.regressions import Array, gap_design
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 
 Styles = dict[float, Style]  # of relative velocities in m/s
 LABEL = 21  # characters of a line of a row's name
@@ -62,7 +62,7 @@ SHOWN = 0.95
 MANY_TRACES = 100
 
 
-def figure2(study: Study, chosen: list[Group]) -> Figure:
+def figure2(study: StudyResults, chosen: list[Group]) -> Figure:
     """Return Figure 2: left speeds (A, B), who was first (C), gap (D), speed deviation (E)."""
     groups = [_played(study, group) for group in chosen]
     velocities = sorted({velocity for _, velocity in study.conditions.values()})
@@ -86,7 +86,7 @@ def figure2(study: Study, chosen: list[Group]) -> Figure:
                 _draw_humans(axis, groups[0], summary, styles, ":")
     _scale(axes, groups, study)
     # A group that is mirrored has its ego on the left.
-    left = "ego" if any(group.measured and group.seats[1] for group in groups) else "left"
+    left = "ego" if any(group.measured and group.ego_sides[1] for group in groups) else "left"
     for axis, heading, panel in zip(axes[0], HEADINGS, "ABCDE", strict=True):
         axis.set_title(heading.format(left=left))
         axis.set_title(panel, loc="left", fontweight="bold")
@@ -156,13 +156,13 @@ def _points(group: Group, summary: Summary) -> dict[float, Points]:
 
 
 @remembered
-def _played(study: Study, group: Group) -> Group:
+def _played(study: StudyResults, group: Group) -> Group:
     """Return the group in the conditions of the study: humans drove in others, too."""
     return group.part(lambda trials: trials["condition"].isin(study.conditions))
 
 
 @remembered
-def left_traces(study: Study, group: Group, first: str) -> dict[float, list[Array]]:
+def left_traces(study: StudyResults, group: Group, first: str) -> dict[float, list[Array]]:
     """Return times in s and left speeds in m/s by velocity, where ``first`` merged first."""
     if not group.measured:
         return {}
@@ -183,7 +183,7 @@ def published_gap_line(velocity_mps: float) -> tuple[Array, Array]:
     return headway, gap_design(headway, np.full_like(headway, velocity_mps)) @ terms
 
 
-def _draw_traces(axis: Axes, study: Study, group: Group, first: str, styles: Styles) -> None:
+def _draw_traces(axis: Axes, study: StudyResults, group: Group, first: str, styles: Styles) -> None:
     traces = left_traces(study, group, first)
     count = sum(len(traces.get(velocity, ())) for velocity in styles)
     if not count:
@@ -228,7 +228,7 @@ def _draw_humans(axis: Axes, human: Group, summary: Summary, styles: Styles, das
         axis.plot(x, y, color=styles[velocity]["color"], ls=dashes, lw=0.8)
 
 
-def _scale(axes: NDArray[np.object_], groups: list[Group], study: Study) -> None:
+def _scale(axes: NDArray[np.object_], groups: list[Group], study: StudyResults) -> None:
     """Set one scale per quantity: all values and lines, intervals as far as single trials reach."""
     speeds = [limit for axis in axes[0, :2] for limit in axis.get_ylim()]
     for axis in axes[0, :2]:

@@ -18,19 +18,19 @@ from merge_runner_analysis.figures.style import (
 )
 from merge_runner_analysis.published import published
 from merge_runner_analysis.stats.estimate import Estimate
-from merge_runner_analysis.stats.first_action import Seat, first_actions, mean, seats
+from merge_runner_analysis.stats.first_action import GroupDriver, drivers_of, first_actions, mean
 from merge_runner_analysis.stats.intervals import interval
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 
 LEGEND = 48  # characters of a line
 
 
-def first_action(study: Study) -> Figure:
+def first_action(study: StudyResults) -> Figure:
     """Return the figure."""
-    groups = [g for g in (*study.baselines, *study.asked) if g.setting == BASELINE]
+    groups = [g for g in (*study.baselines, *study.probes) if g.setting == BASELINE]
     drawn = [(LINES | {"color": "black", "marker": "o"}, "humans", _human_first_actions(study))]
-    for number, seat in enumerate(seat for group in groups for seat in seats(group)):
-        drawn.append((style(number), seat.name, _first_actions(study, seat)))
+    for number, driver in enumerate(driver for group in groups for driver in drivers_of(group)):
+        drawn.append((style(number), driver.name, _first_actions(study, driver)))
     labels = [wrapped(name, LEGEND) for _, name, _ in drawn]
     legend_in = LINE_IN * sum(label.count("\n") + 1.5 for label in labels)
     figure = Figure(figsize=(PAGE_IN, max(2.7, legend_in)), layout="constrained")
@@ -49,9 +49,9 @@ def first_action(study: Study) -> Figure:
     return figure
 
 
-def _human_first_actions(study: Study) -> Points:
+def _human_first_actions(study: StudyResults) -> Points:
     if study.complete:
-        return _first_actions(study, Seat(study.human))
+        return _first_actions(study, GroupDriver(study.human))
     return [
         (row.relative_velocity_mps, Estimate(mps2, *interval(mps2, row.se_mps2), row.n))
         for row in published("human_first_actions").itertuples()
@@ -59,7 +59,7 @@ def _human_first_actions(study: Study) -> Points:
     ]
 
 
-def _first_actions(study: Study, seat: Seat) -> Points:
-    by_velocity = first_actions(study, seat).groupby("velocity_mps")
+def _first_actions(study: StudyResults, driver: GroupDriver) -> Points:
+    by_velocity = first_actions(study, driver).groupby("velocity_mps")
     estimates = ((float(velocity), mean(rows)) for velocity, rows in by_velocity)
     return [(velocity, estimate) for velocity, estimate in estimates if estimate]

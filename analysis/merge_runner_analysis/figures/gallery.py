@@ -16,7 +16,7 @@ from merge_runner_analysis.figures.effects import effects_figure
 from merge_runner_analysis.figures.figure2 import figure2
 from merge_runner_analysis.figures.first_action import first_action
 from merge_runner_analysis.figures.style import SETTINGS
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.tables.formats import render
@@ -28,7 +28,7 @@ METADATA: dict[str, dict[str, None]] = {
     "png": {"Software": None},
     "svg": {"Date": None, "Creator": None},
 }
-MAKERS: dict[str, Callable[[Study], Figure]] = {
+MAKERS: dict[str, Callable[[StudyResults], Figure]] = {
     "effects": effects_figure,
     "figure2": lambda study: figure2(study, study.baselines),
     "figure2-variants": lambda study: figure2(study, study.groups),
@@ -36,7 +36,7 @@ MAKERS: dict[str, Callable[[Study], Figure]] = {
 }
 
 
-def write_figures(study: Study, folder: Path) -> Iterator[Path]:
+def write_figures(study: StudyResults, folder: Path) -> Iterator[Path]:
     """Write every figure in all FORMS, and its table; yields paths. Raises UsageError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -54,7 +54,7 @@ def write_figures(study: Study, folder: Path) -> Iterator[Path]:
             yield path
 
 
-def rendered(study: Study, name: str, form: Form) -> bytes:
+def rendered(study: StudyResults, name: str, form: Form) -> bytes:
     """Return a figure as a file, without a date, so that equal results give equal bytes."""
     out = io.BytesIO()
     with mpl.rc_context(SETTINGS):

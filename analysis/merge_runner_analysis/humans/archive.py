@@ -65,7 +65,7 @@ def open_files(path: Path) -> Iterator[list[File]]:
             yield [file for file in members if not file.name.endswith("/")]
 
 
-def refuse_bombs(files: Iterable[File]) -> None:
+def check_sizes(files: Iterable[File]) -> None:
     """Raise UsageError where a zip declares sizes that recordings cannot have."""
     total = 0
     for file in files:

@@ -10,7 +10,7 @@ from pathlib import PurePath
 
 from merge_runner.results.store import Store, query
 from merge_runner.trial_records import TrialRecord
-from merge_runner_analysis.humans.archive import File, Unreadable, refuse_bombs
+from merge_runner_analysis.humans.archive import File, Unreadable, check_sizes
 from merge_runner_analysis.humans.record import (
     SPECS,
     condition_of,
@@ -47,7 +47,7 @@ def sort_files(files: Iterable[File]) -> list[Source]:
             sources.append(("", int(name[1]), int(name[2]), file))
         elif condition := condition_of(file.name):
             sources.append((condition, 0, 0, file))
-    refuse_bombs(file for *_, file in sources)
+    check_sizes(file for *_, file in sources)
     return sorted(sources, key=lambda source: source[:3])
 
 

@@ -25,7 +25,7 @@ from merge_runner_analysis.stats.intervals import difference
 from merge_runner_analysis.stats.levels import DRIVER, Cell, Level, copied_cells, levels_by_factor
 from merge_runner_analysis.stats.measures import linear, undecided
 from merge_runner_analysis.stats.sides import from_both_sides, one_sided
-from merge_runner_analysis.study import Study, in_one_study
+from merge_runner_analysis.study import StudyResults, in_one_study
 from merge_runner_analysis.wording import TIMES, UNREADABLE
 
 Columns = dict[str, NDArray[Any]]  # of trials
@@ -84,7 +84,7 @@ class Effect:
 
 
 @remembered
-def effects(study: Study, by: str = "") -> list[Effect]:
+def effects(study: StudyResults, by: str = "") -> list[Effect]:
     """Return the effects of every factor and their interactions, or those at each level of ``by``.
 
     Holm corrects p in two families: main effects on the primary measure (of ``model`` only if
@@ -110,7 +110,7 @@ def effects(study: Study, by: str = "") -> list[Effect]:
     return [*_with_corrected(study, simple), *interactions]
 
 
-def driver_effects(study: Study, driver: Group, reference: Group) -> list[Effect]:
+def driver_effects(study: StudyResults, driver: Group, reference: Group) -> list[Effect]:
     """Compare two drivers with their prompts in every measure, in the conditions of both."""
     levels = []
     for group in (reference, driver):
@@ -121,13 +121,13 @@ def driver_effects(study: Study, driver: Group, reference: Group) -> list[Effect
 
 
 @remembered
-def primary(study: Study) -> Metric:
+def primary(study: StudyResults) -> Metric:
     """Return the study's primary measure, by default who goes first. Raises UsageError."""
     return _measures()[_named(study) or PRIMARY]
 
 
 @remembered
-def asks_of_models(study: Study) -> bool:
+def asks_of_models(study: StudyResults) -> bool:
     """Return whether a study names a primary measure, and varies nothing but the model."""
     factors = levels_of(study.models, study.order)
     varying = {name for name, levels in factors.items() if len(levels) > 1}
@@ -138,7 +138,7 @@ def _measures() -> dict[str, Metric]:
     return {PRIMARY: LEFT_FIRST, "collided": COLLISIONS, **METRICS}
 
 
-def _named(study: Study) -> str:
+def _named(study: StudyResults) -> str:
     """Return the primary measure of the study's file, unless its plug-in is missing."""
     file, _ = _file(study)
     if file is None or "primary" not in file.model_fields_set:
@@ -149,23 +149,23 @@ def _named(study: Study) -> str:
     return file.primary
 
 
-def texts_of(study: Study) -> dict[str, dict[str, StudyText]]:
+def texts_of(study: StudyResults) -> dict[str, dict[str, StudyText]]:
     """Return the texts of a study's factors by level; empty where its file is not known."""
     file, _ = _file(study)
     return {} if file is None else dict(file.texts)
 
 
-def unreadable(study: Study) -> str:
+def unreadable(study: StudyResults) -> str:
     """Say that the stored study that was played cannot be read, and why; empty where it can."""
     return _file(study)[1]
 
 
-def _text_at_hand(study: Study) -> str:
+def _text_at_hand(study: StudyResults) -> str:
     return study.source.text if study.source else in_use().text
 
 
 @remembered
-def _file(study: Study) -> tuple[StudyFile | None, str]:
+def _file(study: StudyResults) -> tuple[StudyFile | None, str]:
     """Return the study's file, or why the stored one cannot be read. Raises UsageError."""
     if text := _text_at_hand(study):
         return StudySource(name="", text=text, plugins={}).file, ""
@@ -178,7 +178,7 @@ def _file(study: Study) -> tuple[StudyFile | None, str]:
 
 
 @remembered
-def measured(study: Study) -> list[Metric]:
+def measured(study: StudyResults) -> list[Metric]:
     """Return the metrics that some trial has, the primary one first."""
     trials = [group.trials for group in study.models]
     same = all(rows[COLLISIONS.column].equals(rows[BOXES.column]) for rows in trials)
@@ -190,13 +190,13 @@ def measured(study: Study) -> list[Metric]:
     ]
 
 
-def _of_levels(study: Study, levels: Sequence[Level]) -> Iterator[Effect]:
+def _of_levels(study: StudyResults, levels: Sequence[Level]) -> Iterator[Effect]:
     reference, *others = levels
     for metric, level in product(measured(study), others):
         yield _effect(study, metric, (level, reference))
 
 
-def _interactions(study: Study, by: str = "") -> Iterator[Effect]:
+def _interactions(study: StudyResults, by: str = "") -> Iterator[Effect]:
     """Compare effects between the levels of another factor, or of ``by``, and its first.
 
     Both differences are effects of the factor that is listed first, so that either order gives one
@@ -224,7 +224,7 @@ def _interactions(study: Study, by: str = "") -> Iterator[Effect]:
 
 
 def _effect(
-    study: Study, metric: Metric, levels: Sequence[Level], *, swapped: bool = False
+    study: StudyResults, metric: Metric, levels: Sequence[Level], *, swapped: bool = False
 ) -> Effect:
     """Compare two levels; or, of four, the difference of the first two with the last two's."""
     frames = trials_by_cell(study, tuple(level.pooled for level in levels), metric)
@@ -263,7 +263,9 @@ def _counted(frame: Columns, metric: Metric) -> Estimate:
     return Estimate(n=len(np.unique(frame["row"])), k=k)
 
 
-def _compared(study: Study, level: Columns, reference: Columns, metric: Metric) -> Comparison:
+def _compared(
+    study: StudyResults, level: Columns, reference: Columns, metric: Metric
+) -> Comparison:
     """Return both values and their difference; None if the difference is not known.
 
     Several views show the same comparison, which is made once.
@@ -277,7 +279,7 @@ def _compared(study: Study, level: Columns, reference: Columns, metric: Metric) 
 
 
 @remembered
-def _comparisons(_: Study) -> dict[tuple[object, ...], Comparison]:
+def _comparisons(_: StudyResults) -> dict[tuple[object, ...], Comparison]:
     return {}
 
 
@@ -306,7 +308,7 @@ def _interaction(frames: Sequence[Columns], metric: Metric) -> Estimate | None:
     return difference(mean, other) if mean and other else None
 
 
-def _with_corrected(study: Study, effects: list[Effect]) -> list[Effect]:
+def _with_corrected(study: StudyResults, effects: list[Effect]) -> list[Effect]:
     """Correct p in both families; effects without variance and difference are in neither."""
     of_model = {MODEL, DRIVER} if asks_of_models(study) else set()
     is_primary = [
@@ -331,7 +333,7 @@ def _with_corrected(study: Study, effects: list[Effect]) -> list[Effect]:
     ]
 
 
-def trials_by_cell(study: Study, groups: tuple[Group, ...], metric: Metric) -> list[Columns]:
+def trials_by_cell(study: StudyResults, groups: tuple[Group, ...], metric: Metric) -> list[Columns]:
     """Return by group the ``condition`` and ``value`` of trials in cells of all, and their ``row``.
 
     Copied cells are left out. Empty for groups of several studies or with undecided trials.
@@ -365,7 +367,7 @@ def trials_by_cell(study: Study, groups: tuple[Group, ...], metric: Metric) -> l
 
 @remembered
 def _codes(
-    study: Study, groups: tuple[Group, ...]
+    study: StudyResults, groups: tuple[Group, ...]
 ) -> list[tuple[NDArray[np.int_], NDArray[np.int_]]]:
     """Return by group the rows of trials outside copied cells, and codes of these cells."""
     copied = copied_cells(study, groups)

@@ -29,7 +29,7 @@ from merge_runner_analysis.stats.regressions import (
     unfit_for_logit,
     who_first_data,
 )
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 
 # One row a vehicle: the acceleration of the first step that its driver controls, and the word of
 # the first decision. Where each driver takes control at its own exit the other one cruises yet:
@@ -50,7 +50,7 @@ HOLD_MPS2 = 0.2
 SAME_MPS2 = 1e-9
 
 
-class Seat(NamedTuple):
+class GroupDriver(NamedTuple):
     """A driver of a group: in a mixed pair the one on a ``side`` (the ego is left), else both."""
 
     group: Group
@@ -67,20 +67,24 @@ class Seat(NamedTuple):
         return f"{driver} ({remark})" if remark else driver
 
 
-def seats(group: Group) -> list[Seat]:
+def drivers_of(group: Group) -> list[GroupDriver]:
     """Return the drivers of a group."""
-    return [Seat(group)] if len(group.models) == 1 else [Seat(group, side) for side in SIDES]
+    return (
+        [GroupDriver(group)]
+        if len(group.models) == 1
+        else [GroupDriver(group, side) for side in SIDES]
+    )
 
 
 @remembered
-def first_actions(study: Study, seat: Seat) -> pd.DataFrame:
+def first_actions(study: StudyResults, driver: GroupDriver) -> pd.DataFrame:
     """Return a driver's first actions in trials that ended, one row each.
 
     Headway and velocity are the driver's own, minus the other's; ``cluster`` numbers trials or
     pairs.
     """
-    rows = _stored(study, seat)
-    if repeats_itself(study, seat):
+    rows = _stored(study, driver)
+    if repeats_itself(study, driver):
         rows = rows.drop_duplicates(["condition", "side"])
     sign = rows["side"].map({"left": 1.0, "right": -1.0})
     cluster = rows["pair"].where(rows["pair"].notna(), rows["trial_id"] + rows["spec_hash"])
@@ -91,12 +95,12 @@ def first_actions(study: Study, seat: Seat) -> pd.DataFrame:
     )
 
 
-def repeats_itself(study: Study, seat: Seat) -> bool:
+def repeats_itself(study: StudyResults, driver: GroupDriver) -> bool:
     """Return whether one driver of a mixed pair is deterministic and repeats its first actions."""
-    rows = _stored(study, seat)
-    sat = np.where(rows["ego"] == seat.side, *SIDES)
-    known = set(zip(rows["spec_hash"], sat, strict=True))
-    if not seat.side or any(
+    rows = _stored(study, driver)
+    sides = np.where(rows["ego"] == driver.side, *SIDES)
+    known = set(zip(rows["spec_hash"], sides, strict=True))
+    if not driver.side or any(
         has_chance(study.frames.specs.get(name, {}), [side]) for name, side in known
     ):
         return False
@@ -105,10 +109,10 @@ def repeats_itself(study: Study, seat: Seat) -> bool:
 
 
 @remembered
-def _stored(study: Study, seat: Seat) -> pd.DataFrame:
-    trials = seat.group.ended[[*KEYS, *CONDITION, "condition", "pair", "ego"]]
+def _stored(study: StudyResults, driver: GroupDriver) -> pd.DataFrame:
+    trials = driver.group.ended[[*KEYS, *CONDITION, "condition", "pair", "ego"]]
     rows = of_trials(study.read(FIRST_ACTIONS), trials).merge(trials, on=KEYS)
-    return rows[rows["side"] == seat.side] if seat.side else rows
+    return rows[rows["side"] == driver.side] if driver.side else rows
 
 
 def slope(rows: pd.DataFrame) -> Estimate | None:

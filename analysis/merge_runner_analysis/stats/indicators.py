@@ -29,7 +29,7 @@ from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.held import KEY, measure_profiles
 from merge_runner_analysis.stats.intervals import difference, mean
 from merge_runner_analysis.stats.regressions import Regression
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.wording import ALPHA, INDICATORS, Fact, Why
 
 PUBLISHED, BY_EYE = Fact(Why.NO_TRACES), Fact(Why.BY_EYE)
@@ -76,33 +76,33 @@ def _judged(fit: Regression, name: str, *, robust: bool) -> Judgement:
     return Judgement(fit.equivalence_p < ALPHA)
 
 
-def profiles(study: Study, group: Group) -> pd.DataFrame:
+def profiles(study: StudyResults, group: Group) -> pd.DataFrame:
     """Return a row a vehicle: whether it acted, and how far its acceleration is held."""
     return of_trials(_all_profiles(study), group.trials)
 
 
 @remembered
-def _all_profiles(study: Study) -> pd.DataFrame:
+def _all_profiles(study: StudyResults) -> pd.DataFrame:
     # One side after the other: the samples of all vehicles take the most memory of all tables.
     sides = (read(study.db, f"FROM ({SPEEDS}) WHERE side = '{side}'") for side in SIDES)
     return pd.concat(map(measure_profiles, sides)).sort_values(KEY, ignore_index=True)
 
 
 @remembered
-def gains(study: Study, group: Group) -> pd.DataFrame:
+def gains(study: StudyResults, group: Group) -> pd.DataFrame:
     """Return a row a finished trial: condition, pair, ``steady`` (nobody acted), ``gain``."""
     by_trial = profiles(study, group).groupby(KEYS, as_index=False)
     gain = by_trial.agg(steady=("steady", "all"), gain=("gain", "mean"))
     return group.finished[[*KEYS, "condition", "pair"]].merge(gain, on=KEYS)
 
 
-def mean_gain(study: Study, group: Group) -> Estimate:
+def mean_gain(study: StudyResults, group: Group) -> Estimate:
     """Return the mean gain of a group's trials; for humans, of the means of their pairs."""
     known = gains(study, group).dropna(subset="gain")
     return replace(mean(_independent(known, "gain")), n=len(known))
 
 
-def less_humans(study: Study, group: Group) -> Estimate | None:
+def less_humans(study: StudyResults, group: Group) -> Estimate | None:
     """Return the mean gain less the humans' in equal conditions, in their SD, if known."""
     if group is study.human or not study.calibrated:
         return None
@@ -133,7 +133,7 @@ def _independent(trials: pd.DataFrame, column: str) -> pd.Series:
     return pd.concat([trials.loc[~paired, column], means])
 
 
-def piecewise_constant(study: Study, group: Group) -> Judgement:
+def piecewise_constant(study: StudyResults, group: Group) -> Judgement:
     """Judge I5: whether the accelerations of a group are piecewise constant."""
     gain = mean_gain(study, group)
     if gain.low is not None:
@@ -196,7 +196,7 @@ def total(judged: dict[str, Judgement]) -> str | None:
 
 
 @remembered
-def score(study: Study, group: Group) -> Score:
+def score(study: StudyResults, group: Group) -> Score:
     """Judge a group's indicators."""
     fit = fits(group)
     paper = judge(fit.logit, fit.ols, robust=False)

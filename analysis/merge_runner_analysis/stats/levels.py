@@ -13,7 +13,7 @@ from merge_runner.records import SIDES
 from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.frames import KEYS
 from merge_runner_analysis.grouping import Group, levels_of
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.wording import TIMES
 
 # Shown by this one, prompts are compared driver by driver; a driver has all other levels in it.
@@ -59,7 +59,7 @@ class Level:
 
 
 @remembered
-def copied_cells(study: Study, groups: tuple[Group, ...]) -> set[Cell]:
+def copied_cells(study: StudyResults, groups: tuple[Group, ...]) -> set[Cell]:
     """Return the cells of programs that ignore the groups' difference, whose trials are copies.
 
     Conditions are never left out one by one: which of them stay would depend on what happened
@@ -75,7 +75,7 @@ def copied_cells(study: Study, groups: tuple[Group, ...]) -> set[Cell]:
 
 
 @remembered
-def _ways(study: Study, group: Group) -> dict[Cell, dict[str, set[object]]]:
+def _ways(study: StudyResults, group: Group) -> dict[Cell, dict[str, set[object]]]:
     """Return the ways in which trials went, by the levels of the other factors and by condition."""
     ways: dict[Cell, dict[str, set[object]]] = {}
     for (condition, *others), way in zip(group.ended["cell"], group.ended["way"], strict=True):
@@ -92,14 +92,16 @@ def _are_copies(ways: Mapping[str, set[object]], others: Mapping[str, set[object
 
 
 @remembered
-def copied_of_shared(study: Study, *levels: Level) -> tuple[int, int]:
+def copied_of_shared(study: StudyResults, *levels: Level) -> tuple[int, int]:
     """Return the numbers of copied cells and of all cells that levels share."""
     shared = set.intersection(*({*level.pooled.ended["cell"]} for level in levels))
     return len(shared & copied_cells(study, tuple(level.pooled for level in levels))), len(shared)
 
 
 @remembered
-def levels_by_factor(study: Study, by: str = "", at: str = "", least: int = 2) -> list[list[Level]]:
+def levels_by_factor(
+    study: StudyResults, by: str = "", at: str = "", least: int = 2
+) -> list[list[Level]]:
     """Return the levels of factors with at ``least`` this number of them, the reference first."""
     chosen = [group for group in study.models if not by or _level_of(group, by) == at]
     kinds = [[g for g in chosen if g.scripted == scripted] for scripted in (False, True)]
@@ -138,7 +140,7 @@ def _with_cells(groups: Sequence[Group], apart_from: set[str]) -> Group:
     return replace(groups[0], trials=pd.concat(parts, ignore_index=True))
 
 
-def crossing(study: Study, factors: Sequence[str], levels: Mapping[str, str]) -> list[Level]:
+def crossing(study: StudyResults, factors: Sequence[str], levels: Mapping[str, str]) -> list[Level]:
     """Return the trials at levels of several factors; mock models get a separate level."""
     chosen = [g for g in study.models if all(_level_of(g, f) == at for f, at in levels.items())]
     crossed = []
@@ -152,7 +154,7 @@ def crossing(study: Study, factors: Sequence[str], levels: Mapping[str, str]) ->
     return crossed
 
 
-def _distinct(study: Study, levels: list[Level]) -> list[Level]:
+def _distinct(study: StudyResults, levels: list[Level]) -> list[Level]:
     """Return the levels without copies of trials; cells that share copies become one."""
     names: dict[Cell, Cell] = {}
 
@@ -168,7 +170,7 @@ def _distinct(study: Study, levels: list[Level]) -> list[Level]:
     return [_without_copies(level, first) for level in levels]
 
 
-def _with_copies(study: Study, group: Group) -> Iterator[Iterable[Cell]]:
+def _with_copies(study: StudyResults, group: Group) -> Iterator[Iterable[Cell]]:
     """Yield cells with copies of each other; single equal trials of a mock model are chance."""
     if not group.scripted:
         yield from (cells for _, cells in group.trials.groupby(["condition", "way"])["cell"])
@@ -181,7 +183,7 @@ def _with_copies(study: Study, group: Group) -> Iterator[Iterable[Cell]]:
 
 
 @remembered
-def distinct(study: Study, group: Group) -> Group:
+def distinct(study: StudyResults, group: Group) -> Group:
     """Return a group with each trial once, as a level has it; ``whole`` has the copies, too."""
     every = Level(DRIVER, group.id, (group.id,), _with_cells([group], set()))
     (level,) = _distinct(study, [every])

@@ -14,11 +14,11 @@ from merge_runner_analysis.metrics import LEFT_FIRST, Metric
 from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.levels import Cell, Level
 from merge_runner_analysis.stats.measures import estimate
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 
 
 @remembered
-def one_sided(study: Study) -> bool:
+def one_sided(study: StudyResults) -> bool:
     """Return whether in some trials only one of two equal drivers is given something."""
     return any(
         (group.trials["focal"].notna() & _of_equals(group.trials)).any() for group in study.models
@@ -26,7 +26,7 @@ def one_sided(study: Study) -> bool:
 
 
 @remembered
-def level_estimate(study: Study, level: Level, metric: Metric) -> Estimate:
+def level_estimate(study: StudyResults, level: Level, metric: Metric) -> Estimate:
     """Return a metric of a level's trials; those that count for both sides have no variance."""
     group = level.pooled
     trials = group.trials
@@ -44,7 +44,7 @@ def level_estimate(study: Study, level: Level, metric: Metric) -> Estimate:
     return Estimate(value, low, high, n)
 
 
-def cells_seen(study: Study, level: Level) -> set[Cell]:
+def cells_seen(study: StudyResults, level: Level) -> set[Cell]:
     """Return the cells of a level's ended trials, with the mirrored cells of equal drivers."""
     trials = level.pooled.ended
     seen = {*trials["cell"]}
@@ -62,7 +62,7 @@ def _of_equals(trials: pd.DataFrame) -> pd.Series:
     return trials["model_left"] == trials["model_right"]
 
 
-def from_both_sides(study: Study, frame: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
+def from_both_sides(study: StudyResults, frame: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
     """Return who goes first by cell and side, so that no side is favoured."""
     trials = trials.loc[frame.index]
     sided = [(*cell, ego) for cell, ego in zip(frame["condition"], trials["ego"], strict=True)]
@@ -80,7 +80,7 @@ def read_twice(frame: pd.DataFrame, images: pd.Series) -> pd.DataFrame:
 
 
 @remembered
-def _mirrored(study: Study, condition: str) -> str:
+def _mirrored(study: StudyResults, condition: str) -> str:
     headway_m, velocity_mps = study.conditions[condition]
     numbers = (0 - headway_m, 0 - velocity_mps)
     if numbers == (headway_m, velocity_mps):

@@ -33,7 +33,7 @@ from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.indicators import TESTED, Judgement, fits, judge, less_humans
 from merge_runner_analysis.stats.regressions import CONDITION, GAP_TERMS, MIN_PAIRS, Regression
 from merge_runner_analysis.stats.score_interval import wilson
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.wording import (
     ALPHA,
     MEASURES,
@@ -112,7 +112,7 @@ class Comparison:
 
 
 @remembered
-def compared(study: Study, group: Group) -> tuple[Comparison, ...]:
+def compared(study: StudyResults, group: Group) -> tuple[Comparison, ...]:
     """Compare a driver with the humans by every measure."""
     alike = comparable(group)
     both = Both(alike, study.human, _likeness(study, alike))
@@ -135,7 +135,7 @@ def compared(study: Study, group: Group) -> tuple[Comparison, ...]:
 
 
 @remembered
-def of_humans(study: Study) -> dict[str, Estimate]:
+def of_humans(study: StudyResults) -> dict[str, Estimate]:
     """Return the humans by measure, over all conditions."""
     both = Both(study.human, study.human)
     return {name: statistic.human(both) for name, statistic in STATISTICS.items()}
@@ -286,7 +286,7 @@ def _held(both: Both) -> Estimate | None:
     return replace(likeness, p=p)
 
 
-def _likeness(study: Study, group: Group) -> Estimate:
+def _likeness(study: StudyResults, group: Group) -> Estimate:
     likeness = less_humans(study, group) if len(group.finished) else None
     if likeness is not None and likeness.value is not None:
         return likeness

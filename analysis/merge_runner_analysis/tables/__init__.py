@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from merge_runner.errors import unknown_name
 from merge_runner.registry import in_use_for, using
-from merge_runner_analysis.cache import finished, keep_finished, present_state
+from merge_runner_analysis.cache import cache_finished, finished, present_state
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.tables.formats import names_of, value_rows
 from merge_runner_analysis.tables.model import Row, Table, from_text, to_text
@@ -17,7 +17,7 @@ from merge_runner_analysis.tables.model import Row, Table, from_text, to_text
 if TYPE_CHECKING:
     import pandas as pd
 
-    from merge_runner_analysis.study import Study
+    from merge_runner_analysis.study import StudyResults
 
 
 class Listed(NamedTuple):
@@ -64,12 +64,12 @@ TABLES = {
 OF_ASKED = "first-action"
 
 
-def make_tables(study: Study, names: Sequence[str] = ()) -> list[Table]:
+def make_tables(study: StudyResults, names: Sequence[str] = ()) -> list[Table]:
     """Compute the named tables, or all of them; raises UsageError for an unknown name."""
     return [_made(name, study) for name in _valid(names)]
 
 
-def _made(name: str, study: Study) -> Table:
+def _made(name: str, study: StudyResults) -> Table:
     """Return a table with its notes, and a row with a note alone for each group not judged."""
     # Imported only here, so that a table that is kept is shown without waiting for pandas.
     from merge_runner_analysis.tables.makers import MAKERS
@@ -86,7 +86,7 @@ def _made(name: str, study: Study) -> Table:
             {"driver": group.label, "setting": group.setting} if of_drivers else {first: group.id},
             group.unjudged,
         )
-        for group in study.unjudged + (study.unjudged_asked if name == OF_ASKED else [])
+        for group in study.unjudged + (study.unjudged_probes if name == OF_ASKED else [])
         if group.id not in shown
     ]
     title, number = TABLES[name].title, TABLES[name].number
@@ -97,7 +97,7 @@ def _made(name: str, study: Study) -> Table:
 def finished_tables(
     db: Path,
     names: Sequence[str] = (),
-    study: Study | None = None,
+    study: StudyResults | None = None,
     selection: Selection | None = None,
 ) -> list[Table]:
     """Return a database's tables, cached or computed. Raises UsageError."""
@@ -108,17 +108,19 @@ def finished_tables(
     # A name may be given twice; the table is computed once.
     missing = [name for name in dict.fromkeys(chosen) if name not in tables]
     if missing:
-        from merge_runner_analysis.study import Study
+        from merge_runner_analysis.study import StudyResults
 
-        study = study or Study(db, selection)
+        study = study or StudyResults(db, selection)
         made = dict(zip(missing, make_tables(study, missing), strict=True))
         # The state is the one before the study was read: trials stored since then outdate it.
-        keep_finished(db, study.state, options, {name: to_text(made[name]) for name in missing})
+        cache_finished(db, study.state, options, {name: to_text(made[name]) for name in missing})
         tables |= made
     return [tables[name] for name in chosen]
 
 
-def table(study: Study | Path | str, name: str, selection: Selection | None = None) -> pd.DataFrame:
+def table(
+    study: StudyResults | Path | str, name: str, selection: Selection | None = None
+) -> pd.DataFrame:
     """Return a table of a study, or of a database's ``selection``, as its CSV has it.
 
     Values have full precision, and plug-ins of the study are in use. Raises UsageError.
@@ -126,10 +128,14 @@ def table(study: Study | Path | str, name: str, selection: Selection | None = No
     import pandas as pd
 
     from merge_runner.results.frames import TEXT
-    from merge_runner_analysis.study import Study
+    from merge_runner_analysis.study import StudyResults
 
-    with using(in_use_for(study.db if isinstance(study, Study) else Path(study))):
-        read = study if isinstance(study, Study) else Study(study, selection or Selection())
+    with using(in_use_for(study.db if isinstance(study, StudyResults) else Path(study))):
+        read = (
+            study
+            if isinstance(study, StudyResults)
+            else StudyResults(study, selection or Selection())
+        )
         (made,) = make_tables(read, [name])
         frame = pd.DataFrame(value_rows(made), columns=names_of(made)).set_index("row")
     # pandas cannot infer the type of a column without a value.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.stats.indicators import score
 from merge_runner_analysis.stats.measures import outcomes_note
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables.indicators import (
     NOTES,
     SCORE,
@@ -28,7 +28,7 @@ from merge_runner_analysis.tables.model import (
 from merge_runner_analysis.wording import INDICATORS
 
 
-def ablation_qualitative(study: Study) -> Table:
+def ablation_qualitative(study: StudyResults) -> Table:
     """Return Table VI: I1 to I5 of every driver and prompt."""
     columns = [*GROUP_COLUMNS, Column("n", "n", "count", "trials that ended")]
     for name, text in INDICATORS.items():
@@ -48,7 +48,7 @@ def ablation_qualitative(study: Study) -> Table:
     return Table("ablation-qualitative", columns, rows, NOTES)
 
 
-def _group_row(study: Study, group: Group) -> Row:
+def _group_row(study: StudyResults, group: Group) -> Row:
     judged = score(study, group)
     values: dict[str, Value] = {"n": len(group.ended_outcomes)}
     for name in INDICATORS:

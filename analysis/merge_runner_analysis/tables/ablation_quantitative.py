@@ -6,7 +6,7 @@ from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.metrics import INTERVALS, RULES_NOTE, Metric, shown_in
 from merge_runner_analysis.stats import measures
 from merge_runner_analysis.stats.estimate import Estimate
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables.model import (
     ENDED,
     GROUP_COLUMNS,
@@ -20,7 +20,7 @@ from merge_runner_analysis.tables.model import (
 )
 
 
-def ablation_quantitative(study: Study) -> Table:
+def ablation_quantitative(study: StudyResults) -> Table:
     """Return Table VII: collisions, gap, RMSE and joint rate of every driver and prompt."""
     ended = ", ".join(metric.heading for metric in shown_in("tables") if metric.trials == "ended")
     trials = f"{ended}: of all trials that ended; the rest: of the finished ones"

@@ -9,7 +9,7 @@ from merge_runner.drivers.registry import MOCKS
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.metrics import shown_in
 from merge_runner_analysis.published import HUMAN, citation, printed_value, published
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables.model import Optional, Row, Table, Value
 from merge_runner_analysis.wording import INDICATORS
 
@@ -27,7 +27,7 @@ FILES = {
 Key = tuple[str, str, str]
 
 
-def against(table: Table, study: Study) -> Table:
+def against(table: Table, study: StudyResults) -> Table:
     """Return a table with published values and differences, for drivers named as in the paper."""
     if table.name not in FILES:
         return replace(table, notes=(*table.notes, "the paper has no such table"))

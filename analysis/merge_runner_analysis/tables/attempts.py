@@ -6,7 +6,7 @@ from collections import Counter
 
 from merge_runner.records import NO_DECISION
 from merge_runner_analysis.provenance import tally
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables.model import GROUP_COLUMNS, STORED, Column, Table, row_of
 
 # Failures with a share of the answers beside their number; the others are malformed answers, and
@@ -32,7 +32,7 @@ MEANINGS = {
 SHARES = {"retried", "lost", *FAILURES, "invalid", NO_DECISION, "fallback"}
 
 
-def attempts(study: Study) -> Table:
+def attempts(study: StudyResults) -> Table:
     """Return a row per driver and variant: trials, calls, attempts, and failures."""
     tallies = {group: tally(study, group.stored) for group in study.played}
     known = {"answers", "decisions", *MEANINGS, *FAILURES.values()}

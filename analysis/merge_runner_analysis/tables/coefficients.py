@@ -8,7 +8,7 @@ from dataclasses import astuple
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.published import published
 from merge_runner_analysis.stats.regressions import Regression
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables.model import GROUP_COLUMNS, Column, Row, Value, row_of
 
 TERM_NAMES = {
@@ -61,7 +61,7 @@ def row_of_term(group: Group, term: str, fit: Fit, rests_on: str, note: object =
     return row_of(group, values, *remarks, note, item=item + term, rests_on=rests_on)
 
 
-def mixed_note(study: Study, table: str, model: str) -> Iterator[str]:
+def mixed_note(study: StudyResults, table: str, model: str) -> Iterator[str]:
     """Yield a note with the published mixed model, for comparison with the human rows."""
     if study.human in study.groups:
         values = "; ".join(

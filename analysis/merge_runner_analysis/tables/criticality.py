@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from merge_runner.scenarios.merge.measures import NO_CONFLICT_MPS
 from merge_runner_analysis.metrics import shown_in
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables.ablation_quantitative import metric_table
 from merge_runner_analysis.tables.model import Table
 
 
-def criticality(study: Study) -> Table:
+def criticality(study: StudyResults) -> Table:
     """Return surrogate measures of safety of every group whose traces are known."""
     note = (
         "a conflict is resolved when no vehicle, at its present speed, would meet the other at the "

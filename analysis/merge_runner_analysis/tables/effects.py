@@ -28,7 +28,7 @@ from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.levels import DRIVER, Level, copied_of_shared, levels_by_factor
 from merge_runner_analysis.stats.measures import undecided_note
 from merge_runner_analysis.stats.sides import cells_seen, level_estimate
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Value, interval
 from merge_runner_analysis.wording import (
     CORRECTED,
@@ -56,7 +56,7 @@ DIFFERENCE = (
 SIDES = ("", "_reference")  # of a comparison
 
 
-def effects_table(study: Study) -> Table:
+def effects_table(study: StudyResults) -> Table:
     """Return a row per factor, level, and measure, and per interaction of two factors."""
     by = study.selection.by or ""
     return Table(
@@ -80,7 +80,7 @@ def effects_table(study: Study) -> Table:
     )
 
 
-def comparison(study: Study, driver: str, reference: str) -> Table:
+def comparison(study: StudyResults, driver: str, reference: str) -> Table:
     """Return a driver with its prompt less another, by their groups' ids: a row per measure.
 
     Values are of the cells of both, or of all trials where nothing is compared.
@@ -101,7 +101,7 @@ def comparison(study: Study, driver: str, reference: str) -> Table:
     )
 
 
-def _compared_row(study: Study, effect: Effect) -> Row:
+def _compared_row(study: StudyResults, effect: Effect) -> Row:
     values: dict[str, Value] = {}
     sides = (effect.level, effect.at_level), (effect.reference, effect.at_reference)
     for of, (level, estimate) in zip(SIDES, sides, strict=True):
@@ -117,7 +117,7 @@ def _is_shown(effect: Effect) -> bool:
     return effect.metric.estimator != "median" and is_tested
 
 
-def _row(study: Study, effect: Effect, others: dict[str, Value] | None = None) -> Row:
+def _row(study: StudyResults, effect: Effect, others: dict[str, Value] | None = None) -> Row:
     """Return the row of an effect, with ``others`` beside or instead of its values."""
     difference = effect.difference
     level, reference = effect.level.name, effect.reference.name
@@ -154,7 +154,7 @@ def _row(study: Study, effect: Effect, others: dict[str, Value] | None = None) -
     )
 
 
-def _is_copied(study: Study, effect: Effect) -> bool:
+def _is_copied(study: StudyResults, effect: Effect) -> bool:
     """Return whether in all shared cells a level has the trials of another one."""
     copies, shared = copied_of_shared(study, *effect.levels)
     return 0 < copies == shared
@@ -166,7 +166,7 @@ def _place(level: Level, across: tuple[Level, Level] | None) -> str:
     return f"{at} - {across[0].at.partition('=')[2]}" if across else at
 
 
-def problem(study: Study, effect: Effect) -> str:
+def problem(study: StudyResults, effect: Effect) -> str:
     """Return why an effect has no test, or which cells its test leaves out."""
     copies, shared = copied_of_shared(study, *effect.levels)
     metric, difference = effect.metric, effect.difference
@@ -203,7 +203,7 @@ def _left_out(level: Level, metric: Metric) -> str:
     )
 
 
-def _notes(study: Study, by: str) -> Iterator[str]:
+def _notes(study: StudyResults, by: str) -> Iterator[str]:
     tested = any(effect.difference.p is not None for effect in effects(study, by))
     every = levels_by_factor(study)
     if failure := unreadable(study):
@@ -242,7 +242,7 @@ def _notes(study: Study, by: str) -> Iterator[str]:
     yield RULES_NOTE
 
 
-def _families(study: Study, by: str) -> tuple[list[str], int]:
+def _families(study: StudyResults, by: str) -> tuple[list[str], int]:
     """Return the factors of the tests of the primary measure, and the number of the others."""
     tested = [
         effect
@@ -255,7 +255,7 @@ def _families(study: Study, by: str) -> tuple[list[str], int]:
     return of_primary, len(tested) - len(of_primary)
 
 
-def _planted(study: Study) -> list[str]:
+def _planted(study: StudyResults) -> list[str]:
     """Return the effects of words that a study plants in the mock models that drove."""
     planted = []
     for factor, levels in texts_of(study).items() if any(g.scripted for g in study.models) else ():
@@ -271,7 +271,7 @@ def _planted(study: Study) -> list[str]:
     return planted
 
 
-def factors(study: Study) -> Table:
+def factors(study: StudyResults) -> Table:
     """Return the effects with a row for every level, also the references."""
     by = study.selection.by or ""
     rows: dict[str, Row] = {}
@@ -314,7 +314,7 @@ def factors(study: Study) -> Table:
     )
 
 
-def _level_row(study: Study, name: str, effect: Effect, level: Level) -> Row:
+def _level_row(study: StudyResults, name: str, effect: Effect, level: Level) -> Row:
     estimate = Estimate() if effect.across else level_estimate(study, level, effect.metric)
     values: dict[str, Value] = {
         "at": _place(level, effect.across),
@@ -331,7 +331,7 @@ def _level_row(study: Study, name: str, effect: Effect, level: Level) -> Row:
     return Row(name, level.groups, values, note, effect.metric.column, copies=level.copies)
 
 
-def contrasts(study: Study) -> Table:
+def contrasts(study: StudyResults) -> Table:
     """Return the effects of prompts, driver by driver."""
     known = {group.id: group for group in study.models}
     shown = {LEFT_FIRST, *shown_in("tables")}
@@ -376,7 +376,7 @@ def contrasts(study: Study) -> Table:
     )
 
 
-def _same_as_reference(study: Study) -> Iterator[str]:
+def _same_as_reference(study: StudyResults) -> Iterator[str]:
     """Yield a note on prompts without a row, since programs do not read them."""
     every = [effect for effect in effects(study, DRIVER) if effect.level.factor == PROMPT]
     same = [
@@ -388,7 +388,7 @@ def _same_as_reference(study: Study) -> Iterator[str]:
         yield f"{', '.join(dict.fromkeys(same))}, beside {study.reference}: {SAME_TRIALS}"
 
 
-def balance(study: Study, levels: list[Level]) -> str:
+def balance(study: StudyResults, levels: list[Level]) -> str:
     """Return whether all levels of a factor have the same cells."""
     cells_of = {level.name: cells_seen(study, level) for level in levels}
     every = set().union(*cells_of.values())

@@ -12,7 +12,7 @@ from merge_runner_analysis.published import citation, published
 from merge_runner_analysis.stats import first_action as first
 from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.first_action import HOLD_MPS2, human_exchange_rate
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables.model import (
     ENDED,
     GROUP_COLUMNS,
@@ -48,9 +48,9 @@ FIRST_ACTIONS = (
 )
 
 
-def first_action(study: Study) -> Table:
+def first_action(study: StudyResults) -> Table:
     """Make the table: a row per driver and prompt, two for a mixed pair."""
-    groups = (*study.groups, *study.asked)
+    groups = (*study.groups, *study.probes)
     return Table(
         "first-action",
         (*GROUP_COLUMNS, *FIRST_ACTIONS),
@@ -75,14 +75,14 @@ def first_action(study: Study) -> Table:
     )
 
 
-def _first_rows(study: Study, group: Group) -> Iterator[Row]:
+def _first_rows(study: StudyResults, group: Group) -> Iterator[Row]:
     if group is study.human and not study.complete:
         yield _published_row(group)
         return
-    for seat in first.seats(group):
-        rows = first.first_actions(study, seat)
+    for driver in first.drivers_of(group):
+        rows = first.first_actions(study, driver)
         rate = human_exchange_rate() if group is study.human else first.exchange_rate(rows)
-        values: dict[str, Value] = {"driver": seat.name, "n": len(rows)}
+        values: dict[str, Value] = {"driver": driver.name, "n": len(rows)}
         if len(rows):
             action, sign = rows["first_mps2"], np.sign(rows["velocity_mps"].round(6))
             means, fitted = action.groupby(sign).mean(), first.slope(rows)
@@ -96,21 +96,21 @@ def _first_rows(study: Study, group: Group) -> Iterator[Row]:
                 **_estimate("exchange_rate", rate),
             }
         remarks = [] if len(rows) else [NO_ACTION]
-        if first.repeats_itself(study, seat):
+        if first.repeats_itself(study, driver):
             remarks.append(
-                f"{seat.name} is deterministic, and its first action is the same in all "
+                f"{driver.name} is deterministic, and its first action is the same in all "
                 "repetitions of a condition: each condition counts once"
             )
         if len(rows) and rate and rate.low is None:
             remarks.append(
                 "exchange rate: no finite interval, as the slope on headway may be 0 (Fieller 1954)"
             )
-        if group in study.asked:
+        if group in study.probes:
             remarks.append(
                 f"asked without the loop (`merge-runner sweep --first`), in {len(group.ended)} "
                 "trials that end before a second decision"
             )
-        yield row_of(group, values, *remarks, item=seat.side, rests_on=ENDED)
+        yield row_of(group, values, *remarks, item=driver.side, rests_on=ENDED)
 
 
 def _published_row(group: Group) -> Row:

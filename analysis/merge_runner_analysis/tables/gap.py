@@ -7,7 +7,7 @@ from merge_runner_analysis.metrics import GAP
 from merge_runner_analysis.published import citation, printed_value, published
 from merge_runner_analysis.stats.indicators import fits
 from merge_runner_analysis.stats.regressions import GAP_MARGIN_M, GAP_TERMS, by_pairs, gap_ols
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables.coefficients import (
     BY_PAIR,
     KEYS,
@@ -21,7 +21,7 @@ from merge_runner_analysis.tables.coefficients import (
 from merge_runner_analysis.tables.model import Column, Optional, Row, Table, row_of
 
 
-def gap(study: Study) -> Table:
+def gap(study: StudyResults) -> Table:
     """Return Table IV: linear regression of the gap (m) on |h|, |dv| and h*dv."""
     mean100 = "random intercept per pair, gap where the mean position reaches 100 m"
     fitted = {group: _fits(group) for group in study.measured}

@@ -8,7 +8,7 @@ from merge_runner_analysis.published import HUMAN_GAP_SD_M
 from merge_runner_analysis.stats.indicators import Score, disagree, gains, mean_gain, score, total
 from merge_runner_analysis.stats.measures import outcomes_note
 from merge_runner_analysis.stats.regressions import GAP_MARGIN_M
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables.ablation_quantitative import measured
 from merge_runner_analysis.tables.model import (
     FINISHED,
@@ -43,7 +43,7 @@ NOTES = (
 )
 
 
-def indicators(study: Study) -> Table:
+def indicators(study: StudyResults) -> Table:
     """Return Table V: I1 to I5 and the quantitative measures, each with a row per driver."""
     groups = study.baselines
     return Table(
@@ -79,7 +79,7 @@ def ceiling_columns(paper: str, robust: str) -> list[Column]:
     ]
 
 
-def _verdict_row(study: Study, group: Group, name: str) -> Row:
+def _verdict_row(study: StudyResults, group: Group, name: str) -> Row:
     judged = score(study, group)
     trials = group.outcomes if name in OF_OUTCOMES else group.trials
     values: dict[str, Value] = {

@@ -11,7 +11,7 @@ from merge_runner_analysis.stats.effects import primary
 from merge_runner_analysis.stats.levels import Level, crossing, levels_by_factor
 from merge_runner_analysis.stats.measures import counts, estimate
 from merge_runner_analysis.stats.sides import level_estimate, one_sided
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables.model import ENDED, Column, Optional, Row, Table, Value, interval
 from merge_runner_analysis.wording import EGO, HALVES, LEFT, TIMES
 
@@ -19,7 +19,7 @@ from merge_runner_analysis.wording import EGO, HALVES, LEFT, TIMES
 MOST_CROSSINGS = 8
 
 
-def levels(study: Study) -> Table:
+def levels(study: StudyResults) -> Table:
     """Return a row per level and per crossing of factors, of all drivers and of each."""
     metric = primary(study)
     hits = metric.column if metric.rate else ""
@@ -49,7 +49,7 @@ def levels(study: Study) -> Table:
     )  # fmt: skip
 
 
-def _counted_driver(study: Study) -> str:
+def _counted_driver(study: StudyResults) -> str:
     trials = [group.trials for group in study.models]
     is_equal = all((of["model_left"] == of["model_right"]).all() for of in trials)
     if is_equal and all(of["focal"].isna().all() for of in trials):
@@ -57,7 +57,7 @@ def _counted_driver(study: Study) -> str:
     return f"{EGO[1]}. {HALVES}" if one_sided(study) else EGO[1]
 
 
-def varied(study: Study) -> tuple[str, ...]:
+def varied(study: StudyResults) -> tuple[str, ...]:
     """Return the factors that a study varies, apart from the driver and its opponent."""
     named = {
         levels[0].factor: len(levels)
@@ -73,7 +73,7 @@ def varied(study: Study) -> tuple[str, ...]:
     return tuple(kept)
 
 
-def _every(study: Study) -> Iterator[tuple[str, Level]]:
+def _every(study: StudyResults) -> Iterator[tuple[str, Level]]:
     """Yield each level of all drivers, then of each driver, then each crossing of each driver."""
     levels = [group.levels for group in study.models]
     drivers = [*dict.fromkeys(named[MODEL] for named in levels if MODEL in named)]
@@ -90,7 +90,7 @@ def _every(study: Study) -> Iterator[tuple[str, Level]]:
         yield from ((driver, level) for level in crossing(study, factors, chosen))
 
 
-def _names(study: Study, factors: tuple[str, ...]) -> list[list[str]]:
+def _names(study: StudyResults, factors: tuple[str, ...]) -> list[list[str]]:
     names: dict[str, dict[str, None]] = {factor: {} for factor in factors}
     for of_factor in levels_by_factor(study):
         if of_factor[0].factor in names:
@@ -98,7 +98,7 @@ def _names(study: Study, factors: tuple[str, ...]) -> list[list[str]]:
     return [[*known] for known in names.values()]
 
 
-def _row(study: Study, level: Level, driver: str, metric: Metric) -> Row:
+def _row(study: StudyResults, level: Level, driver: str, metric: Metric) -> Row:
     group, shown = level.pooled, level_estimate(study, level, metric)
     crashed, ended = counts(group, COLLISIONS)
     values: dict[str, Value] = {
@@ -119,7 +119,7 @@ def _row(study: Study, level: Level, driver: str, metric: Metric) -> Row:
     return Row(name, level.groups, values, "", metric.column, copies=level.copies)
 
 
-def _repeated(study: Study, level: Level, driver: str, ended: int) -> int | None:
+def _repeated(study: StudyResults, level: Level, driver: str, ended: int) -> int | None:
     """Return the number of a level's ended trials that are left out as copies."""
     if TIMES in level.factor:
         return None

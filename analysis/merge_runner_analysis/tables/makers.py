@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables.ablation_qualitative import ablation_qualitative
 from merge_runner_analysis.tables.ablation_quantitative import ablation_quantitative
 from merge_runner_analysis.tables.attempts import attempts
@@ -18,7 +18,7 @@ from merge_runner_analysis.tables.model import Table
 from merge_runner_analysis.tables.verdicts import verdicts
 from merge_runner_analysis.tables.who_first import who_first
 
-MAKERS: dict[str, Callable[[Study], Table]] = {
+MAKERS: dict[str, Callable[[StudyResults], Table]] = {
     "verdicts": verdicts,
     "who-first": who_first,
     "gap": gap,

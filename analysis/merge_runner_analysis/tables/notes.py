@@ -10,13 +10,13 @@ from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.published import HUMAN_DOI, HUMAN_TRIALS
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables.model import Table
 
 
-def footnoted(table: Table, study: Study) -> Table:
+def footnoted(table: Table, study: StudyResults) -> Table:
     """Return the table with notes on its trials, and ``*`` for remarks on drivers."""
-    drivers = (*study.groups, *study.asked, *study.unjudged, *study.unjudged_asked)
+    drivers = (*study.groups, *study.probes, *study.unjudged, *study.unjudged_probes)
     remarks = {text for group in drivers for text in (group.posing, group.remark)}
     whose: dict[str, dict[str, None]] = {}
     rows = []
@@ -30,9 +30,9 @@ def footnoted(table: Table, study: Study) -> Table:
     return replace(table, rows=rows, notes=(*table.notes, *_of_trials(table, study), *marked))
 
 
-def _of_trials(table: Table, study: Study) -> Iterator[str]:
+def _of_trials(table: Table, study: StudyResults) -> Iterator[str]:
     ids = {name for row in table.rows for name in row.groups}
-    groups = [group for group in (*study.groups, *study.asked) if group.id in ids]
+    groups = [group for group in (*study.groups, *study.probes) if group.id in ids]
     if study.empty:
         yield f"{study.db} holds no trial of a model; `merge-runner sweep baseline` plays some"
     if left_out := [f"{g.id} {g.left_out}" for g in groups if g.left_out != "none"]:
@@ -69,7 +69,7 @@ def _of_trials(table: Table, study: Study) -> Iterator[str]:
             f"{', '.join(counts)} trials of language models are as an earlier one to the last "
             "state: each is a sample, and counts"
         )
-    if pairs := [f"{group.id}: {_seats(group)}" for group in groups if len(group.models) > 1]:
+    if pairs := [f"{group.id}: {_ego_sides(group)}" for group in groups if len(group.models) > 1]:
         yield (
             "of two different drivers left stands for the one that is named first, wherever it "
             f"sat: odds that it goes first. {'; '.join(pairs)}"
@@ -77,7 +77,7 @@ def _of_trials(table: Table, study: Study) -> Iterator[str]:
 
 
 @remembered
-def _studies_of(study: Study, group: Group) -> Counter[str]:
+def _studies_of(study: StudyResults, group: Group) -> Counter[str]:
     known = study.frames.studies
     return +Counter({name: int(known.holds(name, group.trials).sum()) for name in known.orders})
 
@@ -89,7 +89,7 @@ def _without_humans(group: Group) -> Counter[str]:
     return Counter(sorted(conditions[~conditions.isin(HUMAN_CONDITIONS)]))
 
 
-def _human_notes(study: Study, table: Table) -> Iterator[str]:
+def _human_notes(study: StudyResults, table: Table) -> Iterator[str]:
     if not study.human.measured:
         yield (
             f"human: the published outcomes of {HUMAN_TRIALS} trials; for the rest `merge-runner "
@@ -104,12 +104,12 @@ def _human_notes(study: Study, table: Table) -> Iterator[str]:
         )
 
 
-def _seats(group: Group) -> str:
-    left, right = group.seats
-    sat = f"{group.models[0]} sat on the left in {left} trials, and on the right in {right}"
+def _ego_sides(group: Group) -> str:
+    left, right = group.ego_sides
+    drove = f"{group.models[0]} drove on the left in {left} trials, and on the right in {right}"
     if left and right:
-        return f"{sat}, mirrored"
+        return f"{drove}, mirrored"
     return (
-        f"{sat}: what is its doing cannot be told from what is its side's; `mirror = true` in the "
-        "study, or --mirror, plays both ways round"
+        f"{drove}: driver and side cannot be separated; `mirror = true` in the study, or --mirror, "
+        "counterbalances the positions"
     )

@@ -18,7 +18,7 @@ from merge_runner_analysis.published import HUMAN, HUMAN_TRIALS
 from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.levels import distinct
 from merge_runner_analysis.stats.verdicts import Comparison, compared, of_humans
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables.model import (
     COUNTED,
     Column,
@@ -74,7 +74,7 @@ VERDICT_COLUMNS = (
 )
 
 
-def verdicts(study: Study) -> Table:
+def verdicts(study: StudyResults) -> Table:
     """Return every judged driver and prompt by every measure, the humans first."""
     rows = [] if study.human not in study.groups else [*_human_rows(study)]
     for group in (*(group for group in study.models if not group.caution), *study.unjudged):
@@ -123,7 +123,7 @@ def _driver(group: Group, kind: str) -> dict[str, Value]:
     return {"driver": group.label, "setting": group.setting, "kind": kind}
 
 
-def _driver_rows(study: Study, group: Group) -> Iterator[Row]:
+def _driver_rows(study: StudyResults, group: Group) -> Iterator[Row]:
     spec = study.frames.specs.get(group.spec_hash, {})
     driver = _driver(group, _kind(group, spec))
     if group.unjudged:
@@ -141,7 +141,7 @@ def _driver_rows(study: Study, group: Group) -> Iterator[Row]:
 
 
 @remembered
-def _copies(study: Study, group: Group) -> tuple[tuple[str, str], ...]:
+def _copies(study: StudyResults, group: Group) -> tuple[tuple[str, str], ...]:
     """Return a mock model's trials that are copies of others, with words that it does not read."""
     once = distinct(study, group).trials
     if len(once) == len(group.trials):
@@ -181,7 +181,7 @@ def _compared(
     return Row(row_id, (group.id,), values, note, measure.rests_on, conditions)
 
 
-def _human_rows(study: Study) -> Iterator[Row]:
+def _human_rows(study: StudyResults) -> Iterator[Row]:
     for name, estimate in of_humans(study).items():
         values = _driver(study.human, HUMANS) | {"measure": name, **_known(estimate)}
         # Published values rest on no trials here.

@@ -7,7 +7,7 @@ from merge_runner_analysis.metrics import LEFT_FIRST
 from merge_runner_analysis.stats.indicators import fits
 from merge_runner_analysis.stats.measures import outcomes_note
 from merge_runner_analysis.stats.regressions import WHO_FIRST_TERMS, by_pairs, who_first_logit
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables.coefficients import (
     BY_PAIR,
     KEYS,
@@ -20,7 +20,7 @@ from merge_runner_analysis.tables.coefficients import (
 from merge_runner_analysis.tables.model import Column, Optional, Table
 
 
-def who_first(study: Study) -> Table:
+def who_first(study: StudyResults) -> Table:
     """Return Table III: logistic regression of left-first on h (m) and dv (m/s)."""
     fitted = {group: _fits(group) for group in study.groups}
     return Table(

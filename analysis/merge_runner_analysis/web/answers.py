@@ -14,18 +14,18 @@ import duckdb
 from merge_runner.errors import UsageError
 from merge_runner.results.database import read_database
 from merge_runner.text_safety import first_line
-from merge_runner_analysis.cache import digest_of, finished, kept, present_state, stamp_of
+from merge_runner_analysis.cache import cached, digest_of, finished, present_state, stamp_of
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.tables.model import from_text, to_text
 
 if TYPE_CHECKING:
-    from merge_runner_analysis.study import Study
+    from merge_runner_analysis.study import StudyResults
 
 OF = " of"  # behind a column that counts: all of which it counts some
 FOUND = 3  # findings of a run that its page shows
-COUNT = "trials"  # by this name the number of trials is kept
-TABLES = {"table": 1, "comparison": 2}  # requests of tables, and how many names they have
+COUNT = "trials"  # by this name the number of trials is cached
+TABLE_REQUESTS = {"table": 1, "comparison": 2}  # requests of tables, and how many names they have
 Request = tuple[str, ...]
 """``table NAME [SWEEP CONDITION]``, ``comparison GROUP GROUP SWEEP CONDITION``,
 ``cell TABLE ROW COLUMN SWEEP CONDITION``, ``figure NAME FORM``, ``digest``, ``audit``."""
@@ -43,11 +43,11 @@ def answer(db: Path, request: Request) -> dict[str, Any]:
         raise UsageError(f"{db} cannot be read: {first_line(exc)}") from exc
 
 
-def kept_answer(db: Path, request: Request) -> dict[str, Any] | None:
+def cached_answer(db: Path, request: Request) -> dict[str, Any] | None:
     """Return a table that is kept beside the database, at once; None where it is not."""
-    if request[0] not in TABLES:
+    if request[0] not in TABLE_REQUESTS:
         return None
-    (name, selection), state = _kept_as(*request), present_state(db)
+    (name, selection), state = _cache_key(*request), present_state(db)
     tables = finished(db, state, selection.key(db), [name])
     counts = finished(db, state, "", [COUNT])
     if not tables or not counts:
@@ -55,9 +55,9 @@ def kept_answer(db: Path, request: Request) -> dict[str, Any] | None:
     return {"counted": int(counts[COUNT]), "table": tables[name]}
 
 
-def _kept_as(kind: str, *named: str) -> tuple[str, Selection]:
+def _cache_key(kind: str, *named: str) -> tuple[str, Selection]:
     """Return the name of a requested table in the file of finished ones, and its trials."""
-    names, part = named[: TABLES[kind]], named[TABLES[kind] :]
+    names, part = named[: TABLE_REQUESTS[kind]], named[TABLE_REQUESTS[kind] :]
     name = names[0] if kind == "table" else " ".join((kind, *names))
     return name, _selected(*part)
 
@@ -87,10 +87,10 @@ class Numbers:
             case ["digest"]:
                 result = {"digest": self._digest}
             case ["audit"]:
-                result = {"notes": json.loads(self._kept("audit", self._audit))}
+                result = {"notes": json.loads(self._cached("audit", self._audit))}
             case _:
                 raise UsageError(f"nothing answers {request!r}")
-        return {"counted": int(kept(self.db, self._state, "", COUNT, self._count)), **result}
+        return {"counted": int(cached(self.db, self._state, "", COUNT, self._count)), **result}
 
     def _count(self) -> str:
         with read_database(self.db) as connection:
@@ -100,11 +100,11 @@ class Numbers:
             return str(counted.fetchall()[0][0])
 
     @cached_property
-    def study(self) -> Study:
+    def study(self) -> StudyResults:
         """The study, once it is read."""
-        from merge_runner_analysis.study import Study
+        from merge_runner_analysis.study import StudyResults
 
-        return Study(self.db)
+        return StudyResults(self.db)
 
     @cached_property
     def _state(self) -> str:
@@ -114,12 +114,12 @@ class Numbers:
     def _digest(self) -> str:
         return digest_of(self.db, self._state)
 
-    def _kept(self, name: str, make: Callable[[], str], options: str = "") -> str:
-        return kept(self.db, self._state, options or Selection().key(self.db), name, make)
+    def _cached(self, name: str, make: Callable[[], str], options: str = "") -> str:
+        return cached(self.db, self._state, options or Selection().key(self.db), name, make)
 
     def _table(self, kind: str, *named: str) -> str:
         """Return a table, or a comparison of two drivers, each with its prompt."""
-        name, selection = _kept_as(kind, *named)
+        name, selection = _cache_key(kind, *named)
 
         def make() -> str:
             from merge_runner_analysis.tables.effects import comparison
@@ -129,12 +129,12 @@ class Numbers:
                 return to_text(comparison(study, *named[:2]))
             return to_text(make_tables(study, [name])[0])
 
-        return self._kept(name, make, selection.key(self.db))
+        return self._cached(name, make, selection.key(self.db))
 
-    def _part(self, selection: Selection) -> Study:
-        from merge_runner_analysis.study import Study
+    def _part(self, selection: Selection) -> StudyResults:
+        from merge_runner_analysis.study import StudyResults
 
-        return self.study if selection == Selection() else Study(self.db, selection)
+        return self.study if selection == Selection() else StudyResults(self.db, selection)
 
     def _figure(self, name: str, form: Literal["svg", "png"]) -> bytes:
         """Return a figure as a file, the report's if a report has drawn it."""
@@ -144,7 +144,7 @@ class Numbers:
 
             return base64.b64encode(rendered(self.study, name, form)).decode()
 
-        return base64.b64decode(self._kept(f"{name}.{form}", draw))
+        return base64.b64decode(self._cached(f"{name}.{form}", draw))
 
     def _audit(self) -> str:
         """Return findings and notes of the audit by run id, as JSON; nothing is replayed."""
@@ -174,7 +174,7 @@ class Numbers:
         counts = not of and any(shown.counts for shown in table.columns if shown.name == column)
         specs = {
             group.id: dict(zip(trials["trial_id"], trials["spec_hash"], strict=True))
-            for group in (*study.measured, *study.asked, *study.unjudged, *study.unjudged_asked)
+            for group in (*study.measured, *study.probes, *study.unjudged, *study.unjudged_probes)
             for trials in [group.stored.trials]
         }
         trials = [

@@ -24,7 +24,7 @@ from merge_runner.errors import MergeRunnerError
 from merge_runner.registry import in_use, use
 from merge_runner.study.file import StudyFile
 from merge_runner.study.parts import catalogue_of
-from merge_runner_analysis.web.answers import Request, answer, kept_answer
+from merge_runner_analysis.web.answers import Request, answer, cached_answer
 
 REMEMBERED = 100
 # While a run goes on the database changes all the time: an answer stands for some seconds.
@@ -80,7 +80,7 @@ class Computing:
         db: Path,
         compute: Callable[[Path, Request], dict[str, Any]] = answer,
         start: Callable[[], Executor] | None = None,
-        look_up: Callable[[Path, Request], dict[str, Any] | None] = kept_answer,
+        look_up: Callable[[Path, Request], dict[str, Any] | None] = cached_answer,
     ) -> None:
         """Compute by a function, in what ``start`` begins, unless ``look_up`` has the answer."""
         self.db = db

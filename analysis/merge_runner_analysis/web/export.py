@@ -22,7 +22,7 @@ import httpx
 from markupsafe import Markup
 
 from merge_runner.errors import UsageError
-from merge_runner.paths import refuse_another_kind
+from merge_runner.paths import check_kind
 from merge_runner_analysis.cache import stamp_of
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.tables import TABLES
@@ -30,7 +30,7 @@ from merge_runner_analysis.web.app import explorer
 from merge_runner_analysis.web.catalogue import FACETS
 from merge_runner_analysis.web.computing import processes
 from merge_runner_analysis.web.guard import LOOPBACK
-from merge_runner_analysis.web.leaks import refuse_leaks
+from merge_runner_analysis.web.leaks import check_leaks
 from merge_runner_analysis.web.listing import FACTOR
 from merge_runner_analysis.web.pages.trial import READ_AT_ONCE, trial_pages
 from merge_runner_analysis.web.reading import Row
@@ -83,7 +83,7 @@ def export_folder(
     index, files = folder / INDEX, folder / FILES
     if folder.is_file():
         raise UsageError(f"{folder} is a file: name a folder")
-    refuse_another_kind(index, OURS, "exported study")
+    check_kind(index, OURS, "exported study")
     if files.exists() and not index.exists():
         raise UsageError(f"{files} is there, and is no exported study's: name another folder")
     begin, heads = ("/trials", OF_TRIALS) if patterns else ("/", tuple(FOLLOWED))
@@ -105,7 +105,7 @@ def export_folder(
 
 def export_page(db: Path, file: Path, patterns: Sequence[str]) -> Path:
     """Write one page with the trials of these names; returns its path. Raises UsageError."""
-    refuse_another_kind(file, HTML, "page of HTML")
+    check_kind(file, HTML, "page of HTML")
     trials: set[tuple[str, str]] = set()
     site = _site_of_a_page(db, trials)
     with _opened(site, patterns) as rows, _staged(file.parent) as stage:
@@ -143,7 +143,7 @@ def _page_of_trials(site: Site, rows: Sequence[Row]) -> str:
         page = site.render(
             "several.html", view="trials", trials=list(trials), scripts=[*REPLAY, "single.js"]
         )
-    refuse_leaks(site.db, "the page", page)
+    check_leaks(site.db, "the page", page)
     return _linked(page)
 
 
@@ -181,13 +181,13 @@ async def _crawl(
         if file.is_error:
             files[page] = ""
         else:
-            refuse_leaks(site.db, name, file.text)
+            check_leaks(site.db, name, file.text)
             (stage / name).parent.mkdir(parents=True, exist_ok=True)
             (stage / name).write_bytes(file.content)
         return files[page]
 
     async def save(page: str, text: str) -> None:
-        refuse_leaks(site.db, files[page], text)
+        check_leaks(site.db, files[page], text)
         root = "" if page == begin else "../"
         parts = text.split(MARK)
         for place in range(1, len(parts), 2):

@@ -42,12 +42,12 @@ class Guard:
                     headers.setdefault(name, value)
             await send(message)
 
-        refusal = _refusal(scope["method"], scope["path"], Headers(scope=scope))
-        app = PlainTextResponse(f"{refusal}\n", 403) if refusal else self._app
+        problem = _problem(scope["method"], scope["path"], Headers(scope=scope))
+        app = PlainTextResponse(f"{problem}\n", 403) if problem else self._app
         await app(scope, receive, guarded)
 
 
-def _refusal(method: str, path: str, headers: Headers) -> str:
+def _problem(method: str, path: str, headers: Headers) -> str:
     origin = headers.get("origin")
     # Every browser that shows our pages says whether another site's page led here.
     from_elsewhere = headers.get("sec-fetch-site") in {"cross-site", "same-site"}

@@ -27,7 +27,7 @@ SHORTEST_SECRET = 8
 _HOMES = re.compile(r"(?<![\w.])(?:/home|/Users|[A-Z]:\\+Users)[/\\]+[\w.-]+[/\\]")
 
 
-def refuse_leaks(db: Path, where: str, text: str) -> None:
+def check_leaks(db: Path, where: str, text: str) -> None:
     """Raise UsageError where a text holds a key, or a path of this machine."""
     for name in filter(lambda name: name.endswith(_SECRET_NAMES), os.environ):
         if len(os.environ[name]) >= SHORTEST_SECRET and os.environ[name] in text:

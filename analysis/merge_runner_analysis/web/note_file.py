@@ -48,7 +48,7 @@ LINE = TypeAdapter(Note)
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
+class StoredNotes:
     """The notes of a file, the earliest first, and what could not be read."""
 
     notes: tuple[Note, ...] = ()
@@ -64,20 +64,20 @@ class Notes:
         self.path = db.with_name(f"{db.stem}.notes.jsonl")
         self.reader = reader
 
-    def kept(self) -> Kept:
+    def read(self) -> StoredNotes:
         """Return the content of the file: the same object while the file is the same."""
         try:
             stat = self.path.stat()
             return _parsed(self.path, (stat.st_ino, stat.st_mtime_ns, stat.st_size))
         except FileNotFoundError:
-            return Kept()
+            return StoredNotes()
         except OSError as exc:
-            return Kept(damage=(f"{self.path.name} cannot be read: {exc.strerror}",))
+            return StoredNotes(damage=(f"{self.path.name} cannot be read: {exc.strerror}",))
 
     def of(self, trial_id: str, spec_hash: str) -> list[Note]:
         """Return the notes of a trial."""
         at = trial_id, spec_hash
-        return [note for note in self.kept().notes if (note.trial_id, note.spec_hash) == at]
+        return [note for note in self.read().notes if (note.trial_id, note.spec_hash) == at]
 
     def add(
         self, trial_id: str, spec_hash: str, side: str, decision: int | None, text: str
@@ -105,7 +105,7 @@ class Notes:
 
 
 @lru_cache(1)
-def _parsed(path: Path, _: tuple[int, ...]) -> Kept:
+def _parsed(path: Path, _: tuple[int, ...]) -> StoredNotes:
     """Return the content of a file with this stamp; raises OSError."""
     notes, damage = [], []
     for number, line in enumerate(path.read_bytes().splitlines(), 1):
@@ -117,7 +117,7 @@ def _parsed(path: Path, _: tuple[int, ...]) -> Kept:
     tags = {
         (of.trial_id, of.spec_hash, tag) for of in notes for tag in TAG.findall(of.text.lower())
     }
-    return Kept(tuple(notes), tuple(damage), tuple(sorted(tags)))
+    return StoredNotes(tuple(notes), tuple(damage), tuple(sorted(tags)))
 
 
 def reader_of(given: str | None) -> str:

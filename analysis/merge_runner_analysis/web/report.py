@@ -22,7 +22,7 @@ from merge_runner.prompts.blocks import BASELINE, title_of
 from merge_runner.records import NO_DECISION
 from merge_runner.results.database import read_database
 from merge_runner.results.provenance import program
-from merge_runner_analysis.cache import digest_of, kept
+from merge_runner_analysis.cache import cached, digest_of
 from merge_runner_analysis.explain import Source, sources_of, sql_command
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.figures.gallery import rendered, write_figures
@@ -30,7 +30,7 @@ from merge_runner_analysis.frames import KEYS, load
 from merge_runner_analysis.grouping import levels_of
 from merge_runner_analysis.provenance import Provenance, provenance, tally
 from merge_runner_analysis.published import published
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import finished_tables
 from merge_runner_analysis.tables.against import FILES, against
@@ -86,7 +86,7 @@ LIBRARIES = ("statsmodels", "scipy", "numpy", "pandas", "matplotlib")
 
 
 def write_report(
-    study: Study, out: Path, files: Path | None, say: Callable[[str], object] = str
+    study: StudyResults, out: Path, files: Path | None, say: Callable[[str], object] = str
 ) -> Iterator[Path]:
     """Write the report, and every table and figure into the folder ``files``; yields the paths.
 
@@ -110,7 +110,7 @@ def write_report(
     yield out
 
 
-def finished_figures(study: Study, say: Callable[[str], object] = str) -> dict[str, str]:
+def finished_figures(study: StudyResults, say: Callable[[str], object] = str) -> dict[str, str]:
     """Return every figure by name as SVG in Base64: the stored one, else a new drawing."""
 
     def draw(name: str) -> str:
@@ -119,12 +119,12 @@ def finished_figures(study: Study, say: Callable[[str], object] = str) -> dict[s
 
     return {
         # A table may have the name alone.
-        name: kept(study.db, study.state, study.options, f"{name}.svg", partial(draw, name))
+        name: cached(study.db, study.state, study.options, f"{name}.svg", partial(draw, name))
         for name in FIGURES
     }
 
 
-def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> str:
+def report_html(study: StudyResults, tables: list[Table], figures: dict[str, str]) -> str:
     """Return the report as one HTML document; ``figures`` maps names to SVG in Base64."""
     # Rows with equal sources share a number.
     numbers: dict[tuple[Source, ...], int] = {}
@@ -192,7 +192,7 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
     )
 
 
-def _apart(study: Study) -> Comparison | None:
+def _apart(study: StudyResults) -> Comparison | None:
     """Return the comparison of two drivers, where just two had the reference prompt."""
     groups = [group for group in study.models if group.setting == study.reference]
     if len(groups) != 2:
@@ -218,7 +218,7 @@ def _once(tables: Iterable[Mapping[str, Any]]) -> dict[str, list[str]]:
     return notes
 
 
-def design(study: Study) -> tuple[list[str], dict[str, list[str]], dict[str, str]]:
+def design(study: StudyResults) -> tuple[list[str], dict[str, list[str]], dict[str, str]]:
     """Read the design of a study from what was played: descriptions, levels, prompts.
 
     Levels are by factor, then conditions and trials; prompts have by title the
@@ -281,7 +281,7 @@ def _shown(value: object) -> str:
     return str(value)
 
 
-def alarms(study: Study, origin: Provenance) -> dict[str, tuple[list[str], str]]:
+def alarms(study: StudyResults, origin: Provenance) -> dict[str, tuple[list[str], str]]:
     """Return the reasons to doubt the results of a study by title, the worst first.
 
     Each has its findings, one for each group or run, and their meaning.
@@ -292,7 +292,7 @@ def alarms(study: Study, origin: Provenance) -> dict[str, tuple[list[str], str]]
     return {title: (texts, MEANINGS[title]) for title, texts in findings.items() if texts}
 
 
-def crashes(study: Study) -> dict[str, dict[str, int]]:
+def crashes(study: StudyResults) -> dict[str, dict[str, int]]:
     """Return the number of collisions of each driver and prompt by cause, the most first."""
     with read_database(study.db) as connection:
         causes = {(name, spec): cause for name, spec, cause in judged_collisions(connection)}
@@ -306,7 +306,7 @@ def crashes(study: Study) -> dict[str, dict[str, int]]:
     return counted
 
 
-def _repeats(study: Study) -> Iterator[str]:
+def _repeats(study: StudyResults) -> Iterator[str]:
     """Yield findings on identical trials, at one level of a driver's factors or at several."""
     by_name: dict[str, list[pd.DataFrame]] = {}
     for group in study.played:
@@ -333,12 +333,12 @@ def _repeats(study: Study) -> Iterator[str]:
             )
 
 
-def _found(study: Study, origin: Provenance) -> Iterator[tuple[str, str]]:
+def _found(study: StudyResults, origin: Provenance) -> Iterator[tuple[str, str]]:
     for pair in origin.mismatches.itertuples():
         answers = f"{pair.answers} answer{'s' * (pair.answers != 1)}"
         asked = f"{pair.requested} was asked for, {pair.served} answered"
         yield "Another model answered", f"{asked}: {answers}, in {pair.sweeps}"
-    for group in (*study.unjudged, *study.unjudged_asked):
+    for group in (*study.unjudged, *study.unjudged_probes):
         yield "Too few valid decisions", f"{group.id}: {group.unjudged}"
     names: dict[str, dict[str, None]] = {}
     for group in study.played:

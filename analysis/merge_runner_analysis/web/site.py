@@ -144,7 +144,7 @@ class Site:
             return
         if self.catalogue.refresh():
             self._conditions = {}
-        self.catalogue.tag(self.notes.kept().tags)
+        self.catalogue.tag(self.notes.read().tags)
 
     def trial(self, trial_id: str, spec_hash: str) -> Row:
         """Return the trial of this name, of several specs of this one; raises NotThere."""

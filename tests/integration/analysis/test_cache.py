@@ -11,10 +11,10 @@ import pytest
 
 from merge_runner.errors import UsageError
 from merge_runner_analysis import cache
-from merge_runner_analysis.cache import finished, keep_finished, present_state
+from merge_runner_analysis.cache import cache_finished, finished, present_state
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.selection import Selection
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import TABLES, finished_tables
 from merge_runner_analysis.tables.formats import render
@@ -62,7 +62,7 @@ def mark(db, name="attempts"):
     assert to_text(kept) == to_text(table)
     kept.notes.append("kept")
     db.with_name(f"{db.name}.derived").unlink()
-    keep_finished(db, state, Selection().key(db), {name: to_text(kept)})
+    cache_finished(db, state, Selection().key(db), {name: to_text(kept)})
     return state
 
 
@@ -100,7 +100,7 @@ def test_tables_are_made_once_beside_the_database_and_then_read(db):
 
 def test_after_any_change_of_the_results_tables_are_made_anew(db):
     states = [mark(db)]
-    study = Study(db)
+    study = StudyResults(db)
     assert present_state(db) == states[0]
     for change in CHANGES.values():
         damage(db, change)
@@ -140,9 +140,9 @@ def test_what_cannot_be_kept_is_made_and_said_once(db, caplog):
 
 
 def test_figures_that_are_kept_are_not_taken_for_tables_and_not_drawn_again(db):
-    study = Study(db)
+    study = StudyResults(db)
     kept = {f"{name}.svg": "PHN2Zy8+" for name in FIGURES}
-    keep_finished(db, study.state, study.options, kept)
+    cache_finished(db, study.state, study.options, kept)
     assert finished_figures(study) == dict.fromkeys(FIGURES, "PHN2Zy8+")
     assert finished_tables(db, ["first-action"])[0].rows
 

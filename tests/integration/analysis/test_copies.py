@@ -7,7 +7,7 @@ import pytest
 
 from merge_runner_analysis.explain import explain, sources_of
 from merge_runner_analysis.selection import Selection
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from tests.support.harness import environment
 from tests.support.program import invoke
 from tests.support.studies import changed, write_study, yielding
@@ -44,11 +44,11 @@ def db(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def factors(db):
-    return made(Study(db), "factors")
+    return made(StudyResults(db), "factors")
 
 
 def rows(name, db, *args, **options):
-    return by_id(made(Study(db, Selection(*args, **options)), name))
+    return by_id(made(StudyResults(db, Selection(*args, **options)), name))
 
 
 def test_a_level_counts_each_trial_of_a_program_once(db, factors):
@@ -56,7 +56,7 @@ def test_a_level_counts_each_trial_of_a_program_once(db, factors):
         row = by_id(factors)[f"model={model}/left_first_percent"].values
         assert (row["trials"], row["n"]) == (n, n)
         # Each prompt is a cell of its own only to the model, but where all are compared.
-        sources = explain(Study(db), factors, f"model={model}/left_first_percent:n").sources
+        sources = explain(StudyResults(db), factors, f"model={model}/left_first_percent:n").sources
         assert sum(len(source.trials) for source in sources) == n
     (note,) = notes_with(factors, "went as others of the level to the last state")
     assert "model=one: 44 of 88, model=two: 44 of 88" in note
@@ -65,7 +65,7 @@ def test_a_level_counts_each_trial_of_a_program_once(db, factors):
 
 def test_a_row_with_copies_and_no_other_trial_has_none(db, factors):
     row = by_id(factors)["model=one/left_first_percent"]
-    study, copies = Study(db), (("one/A1", "one-A1"),)
+    study, copies = StudyResults(db), (("one/A1", "one-A1"),)
     sources = sources_of(study, factors, replace(row, conditions=("none",), copies=copies))
     assert {source.trials for source in sources} == {()}
 
@@ -87,7 +87,7 @@ def test_two_programs_are_compared_by_distinct_trials(db):
 
 
 def test_what_a_prompt_changes_rests_on_who_reads_it(db, factors):
-    contrasts = made(Study(db), "contrasts")
+    contrasts = made(StudyResults(db), "contrasts")
     assert {name.partition("/")[0] for name in by_id(contrasts)} == {"o3"}
     assert notes_with(contrasts, SAME)[0].startswith("one/A1, two/A1, beside baseline: ")
     every, alone = by_id(factors)["prompt=A1/gap_m"], rows("factors", db, ["o3"])["prompt=A1/gap_m"]
@@ -148,7 +148,7 @@ def test_verdicts_count_a_trial_once_whichever_side_has_words_that_nobody_reads(
     (tmp_path / "study.toml").write_text(UNREAD)
     asked = ("sweep", "study.toml", "--db", "t.duckdb", "--quiet")
     assert invoke(asked, cwd=tmp_path, env=environment()).code == 0
-    study = Study(tmp_path / "t.duckdb")
+    study = StudyResults(tmp_path / "t.duckdb")
     table = made(study, "verdicts")
     verdicts, stored = by_id(table), {group.id: len(group.trials) for group in study.models}
     assert (stored["emulator/baseline"], stored["emulator/persona=taxi"]) == (6, 12)

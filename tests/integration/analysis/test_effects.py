@@ -15,7 +15,7 @@ from merge_runner_analysis.frames import load
 from merge_runner_analysis.metrics import COLLISIONS, LEFT_FIRST, METRICS
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.stats.effects import driver_effects, effects, primary
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from tests.support.harness import FAST
 from tests.support.studies import changed, write_study, yielding
 from tests.support.tables import made, values_of
@@ -36,7 +36,7 @@ def braking(driver, share, crashes=()):
 def two(tmp_path_factory):
     """Two models of one prompt, the second of which brakes less and collides more."""
     drives = [*braking("one", 1.0, {5}), *braking("two", 0.8, {3, 4, 5})]
-    return Study(write_study(tmp_path_factory.mktemp("two") / "t.duckdb", drives))
+    return StudyResults(write_study(tmp_path_factory.mktemp("two") / "t.duckdb", drives))
 
 
 def test_two_models_differ_by_an_independent_test_with_one_p_on_every_page(two):
@@ -66,13 +66,13 @@ def test_two_models_differ_by_an_independent_test_with_one_p_on_every_page(two):
 
 
 def test_the_driver_that_is_named_first_is_the_reference(two):
-    turned = values_of(Study(two.db, Selection(["two", "one"])), "effects")
+    turned = values_of(StudyResults(two.db, Selection(["two", "one"])), "effects")
     row, same = turned["model=one/gap_m"], values_of(two, "effects")["model=two/gap_m"]
     assert (row["reference"], row["difference"]) == ("two", pytest.approx(-same["difference"]))
 
 
 def test_every_interval_leaves_0_out_exactly_where_its_p_is_below_5_percent(two, played):
-    for study in (two, Study(played.db)):
+    for study in (two, StudyResults(played.db)):
         tested = [one.difference for one in effects(study) if one.difference.p is not None]
         assert tested
         for one in tested:
@@ -80,7 +80,7 @@ def test_every_interval_leaves_0_out_exactly_where_its_p_is_below_5_percent(two,
 
 
 def test_a_primary_measure_is_a_family_of_its_own(played):
-    found = effects(Study(played.db))
+    found = effects(StudyResults(played.db))
     for own in (True, False):
         family = [
             one for one in found
@@ -102,14 +102,14 @@ def test_a_study_names_its_primary_measure(played, tmp_path):
     assert sorted(expected) == sorted(MEASURES)
     for named in ("gap_m", "goes_first", "collided"):
         file.write_text(f'primary = "{named}"\n' + text)
-        assert primary(Study(played.db, Selection(file=str(file)))) is expected[named]
+        assert primary(StudyResults(played.db, Selection(file=str(file)))) is expected[named]
         with using(Catalogue(file.read_text())):  # as in the explorer, which chooses no study
-            assert primary(Study(played.db)) is expected[named]
+            assert primary(StudyResults(played.db)) is expected[named]
     file.write_text('primary = "duration_s"\n' + text)  # the plug-in's own
     assert make_plan(str(file), trust=True).study.file.primary == "duration_s"
     file.write_text('primary = "mood"\n' + text)
     with pytest.raises(UsageError, match="unknown measure 'mood'; valid: goes_first"):
-        primary(Study(played.db, Selection(file=str(file))))
+        primary(StudyResults(played.db, Selection(file=str(file))))
 
 
 def test_a_plugins_metric_has_effects_too(played):
@@ -169,7 +169,7 @@ def test_the_one_in_a_hurry_is_compared_with_the_one_on_the_same_side(prepare, t
     done = prepare(tmp_path, "sweep", "hurry.toml", "--db", "t.duckdb", *FAST, code=0)
     # What is planted makes several clients of one model, which share what they asked.
     assert "from the cache" not in done.out
-    study = Study(tmp_path / "t.duckdb")
+    study = StudyResults(tmp_path / "t.duckdb")
     (found,) = [one for one in effects(study) if one.primary]
     counts = load(SHARES, study.db).fillna({"focal": ""}).set_index(["focal", "condition"])
     apart, weights = [], []
@@ -191,6 +191,6 @@ def test_the_one_in_a_hurry_is_compared_with_the_one_on_the_same_side(prepare, t
 
 
 def test_a_study_without_factors_says_so(tmp_path):
-    study = Study(write_study(tmp_path / "t.duckdb", yielding("o3", reps=1)))
+    study = StudyResults(write_study(tmp_path / "t.duckdb", yielding("o3", reps=1)))
     table = made(study, "effects")
     assert (table.rows, table.notes[0]) == ([], "the trials of judged drivers differ in no factor")

@@ -12,7 +12,7 @@ from merge_runner_analysis.commands import drivers
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.stats.levels import levels_by_factor
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from tests.support.crossed_study import PLUGIN
 from tests.support.studies import changed, write_study, yielding
 from tests.support.tables import by_id, made, notes_with, values_of
@@ -82,7 +82,7 @@ def test_two_mean_speeds_of_one_condition_are_never_pooled(copy):
 
 
 def test_where_keeps_the_trials_of_these_levels_and_names_the_valid_ones(played):
-    kept = Study(played.db, Selection(where={"temperature": ["0.2"], "model": ["cheap"]}))
+    kept = StudyResults(played.db, Selection(where={"temperature": ["0.2"], "model": ["cheap"]}))
     assert [group.driver for group in kept.models] == ["cheap [temperature=0.2]", CHEAP_COLD]
     assert kept.groups[0].id == "human"
     for where, says in (
@@ -91,7 +91,7 @@ def test_where_keeps_the_trials_of_these_levels_and_names_the_valid_ones(played)
         ({"model": ["dear"], "opponent": ["sleepy"]}, "no trial with model=dear and opponent="),
     ):
         with pytest.raises(UsageError, match=says):
-            Study(played.db, Selection(where=where))
+            StudyResults(played.db, Selection(where=where))
     for level, other in (("0.2", "1.0"), ("1.0", "0.2")):  # the first is kept, and not shown
         out = played.run("tables", "ablation-quantitative", "--where", f"temperature={level}").out
         assert f"cheap [temperature={level}]" in out
@@ -128,7 +128,7 @@ def test_a_level_is_compared_with_the_reference_of_the_study(played, study, rows
     (tmp_path / "mine.py").write_text(PLUGIN)
     file = tmp_path / "mine.toml"
     file.write_text('reference = { temperature = 0.2, model = "dear" }\n' + text)
-    chosen = values_of(Study(study.db, Selection(file=str(file))), "factors")
+    chosen = values_of(StudyResults(study.db, Selection(file=str(file))), "factors")
     assert rows["temperature=0.2/gap_m"]["difference"] == pytest.approx(
         -chosen["temperature=1.0/gap_m"]["difference"]
     )
@@ -146,7 +146,7 @@ def test_a_comparison_has_one_corrected_p_wherever_it_is_printed(tmp_path):
             for d in drives[:12]
             if (variant, d.condition) != ("A2", "N_0_0")
         ]
-    study = Study(write_study(tmp_path / "t.duckdb", drives))
+    study = StudyResults(write_study(tmp_path / "t.duckdb", drives))
     levels, families = made(study, "factors"), {}
     for name, row in values_of(study, "contrasts").items():
         _, variant, _, measure = name.split("/")
@@ -171,7 +171,7 @@ def test_a_comparison_has_one_corrected_p_wherever_it_is_printed(tmp_path):
 
 
 def test_factors_are_shown_at_each_level_of_another_one_with_interactions(played, study):
-    study = Study(study.db, Selection(by="opponent"))
+    study = StudyResults(study.db, Selection(by="opponent"))
     table = made(study, "factors")
     rows = {row.id: row.values for row in table.rows}
     at_self, at_sleepy = (rows[f"opponent={n}/temperature=0.2/gap_m"] for n in ("self", "sleepy"))
@@ -196,7 +196,7 @@ def test_an_interaction_is_the_difference_of_the_differences_in_shared_cells(tmp
         "INSERT INTO trial_factors SELECT trial_id, spec_hash, 'mood', "
         "if(rep % 2 = 0, 'late', 'early'), false FROM trials",
     )
-    rows = values_of(Study(moody.db, Selection(by="mood")), "factors")
+    rows = values_of(StudyResults(moody.db, Selection(by="mood")), "factors")
     late, early = (rows[f"mood={m}/prompt=A1/gap_m"]["difference"] for m in ("late", "early"))
     found = rows["mood=late/prompt=A1/interaction/gap_m"]
     assert found["difference"] == pytest.approx(late - early)
@@ -205,7 +205,7 @@ def test_an_interaction_is_the_difference_of_the_differences_in_shared_cells(tmp
     assert low < found["difference"] < high
     assert (found["p"] < 0.05) == (low > 0 or high < 0)
     # By the other factor it is the same.
-    turned = values_of(Study(moody.db, Selection(by="prompt")), "factors")
+    turned = values_of(StudyResults(moody.db, Selection(by="prompt")), "factors")
     same = turned["prompt=A1/mood=late/interaction/gap_m"]["difference"]
     assert same == pytest.approx(found["difference"])
 

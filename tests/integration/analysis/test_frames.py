@@ -12,7 +12,7 @@ import pandas as pd
 import merge_runner_analysis
 from merge_runner.results.database import read_database
 from merge_runner.results.store import Store
-from merge_runner_analysis import Study, load, load_trials, table
+from merge_runner_analysis import StudyResults, load, load_trials, table
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.figures.gallery import rendered
 from merge_runner_analysis.frames import TRIALS
@@ -22,7 +22,8 @@ from merge_runner_analysis.trials import with_metrics
 
 
 def test_the_menu_is_small_and_loads_nothing_before_it_is_used():
-    assert merge_runner_analysis.__all__ == ["TABLES", "Study", "load", "load_trials", "table"]
+    names = ["TABLES", "StudyResults", "load", "load_trials", "table"]
+    assert merge_runner_analysis.__all__ == names
     assert all(hasattr(merge_runner_analysis, name) for name in merge_runner_analysis.__all__)
     modules = {module.name for module in iter_modules(merge_runner_analysis.__path__)}
     assert not modules & {*merge_runner_analysis.__all__}, (
@@ -67,7 +68,7 @@ def test_metrics_that_need_more_memory_than_is_asked_for_first_get_it(small):
 
 def used(db):
     """References to a study and to its groups, after all of its tables have been made."""
-    study = Study(db)
+    study = StudyResults(db)
     for name in TABLES:
         table(study, name)
     for made in make_tables(study, ["who-first", "gap", "attempts", "verdicts"]):
@@ -77,7 +78,7 @@ def used(db):
     (group,) = study.models
     assert fits(group) is fits(group), "what is computed of a group is computed once"
     assert fits(group) is not fits(study.human)
-    return [weakref.ref(one) for one in (study, group, *study.asked)]
+    return [weakref.ref(one) for one in (study, group, *study.probes)]
 
 
 def test_a_study_is_remembered_while_it_is_used_and_then_freed(small):

@@ -9,7 +9,7 @@ from merge_runner_analysis.explain import explain
 from merge_runner_analysis.frames import load
 from merge_runner_analysis.provenance import provenance
 from merge_runner_analysis.selection import Selection
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.tables.formats import value_rows
 from merge_runner_analysis.web.report import alarms
@@ -52,9 +52,9 @@ def test_a_driver_is_named_by_its_endpoint_unless_that_is_the_providers_own(tmp_
         asked = {"endpoint": url, "body": {"model": name}}
         spec = json.dumps({"left": asked, "right": asked})
         changed(db, f"UPDATE specs SET spec = '{spec}' WHERE spec_hash = '{name}-baseline'")
-    names = {group.driver for group in Study(db).models}
+    names = {group.driver for group in StudyResults(db).models}
     assert names == {"o3", "a at localhost:8080", "b at gateway.example"}
-    (chosen,) = Study(db, Selection(["a at localhost:8080"])).models
+    (chosen,) = StudyResults(db, Selection(["a at localhost:8080"])).models
     assert chosen.id == "a at localhost:8080/baseline"
 
 

@@ -13,7 +13,7 @@ from merge_runner.driver_names import ego_side
 from merge_runner_analysis.frames import load, load_trials
 from merge_runner_analysis.stats.indicators import fits
 from merge_runner_analysis.stats.regressions import who_first_logit
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables import make_tables
 from tests.support.cases import table
 from tests.support.studies import changed, write_study, yielding
@@ -54,7 +54,7 @@ def play(prepare, tmp_path_factory):
         (folder / f"{name}.toml").write_text(STUDY.format(head=head))
         sweep = ("sweep", f"{name}.toml", "--yes", "--trust", "--db", f"{name}.duckdb")
         assert prepare(folder, *sweep).code == 0
-        return Study(folder / f"{name}.duckdb")
+        return StudyResults(folder / f"{name}.duckdb")
 
     return play
 
@@ -111,12 +111,12 @@ def test_a_study_and_its_mirror_image_give_the_same_rows(both, tmp_path):
     assert len(load("FROM trials", both.db)) == 44
     assert pooled(one_way) == pooled(other_way)
     assert values(one_way) == values(other_way) == values(both)
-    assert [(g.id, g.seats, g.repeated, g.levels["model"]) for g in both.models] == [
+    assert [(g.id, g.ego_sides, g.repeated, g.levels["model"]) for g in both.models] == [
         ("goes+brakes/baseline", (11, 11), 11, "goes"),
         ("goes+follows/baseline", (11, 11), 11, "goes"),
     ]
     # One way alone is confounded.
-    says = "goes sat on the left in 11 trials, and on the right in 0: what is its doing cannot"
+    says = "goes drove on the left in 11 trials, and on the right in 0: driver and side cannot"
     (note,) = notes_with(made(one_way, "gap"), says)
     assert "`mirror = true`" in note
     assert not notes_with(made(both, "gap"), "in 0: what")
@@ -131,7 +131,7 @@ def test_who_goes_first_is_told_of_the_ego_on_either_side(both):
     (group,) = (group for group in both.models if group.driver == "goes+brakes")
     assert str(fits(group).logit.problem).startswith("who merged first is the same in all")
     (note,) = notes_with(made(both, "who-first"), "of two different drivers left")
-    says = f"{group.id}: goes sat on the left in 11 trials, and on the right in 11, mirrored"
+    says = f"{group.id}: goes drove on the left in 11 trials, and on the right in 11, mirrored"
     assert says in note
 
 

@@ -12,7 +12,7 @@ from merge_runner.errors import UsageError
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.frames import load
 from merge_runner_analysis.selection import Selection
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.web.report import design
 from tests.support.studies import changed
 from tests.support.tables import by_id, made, notes_with, values_of
@@ -56,7 +56,7 @@ def copy(db, tmp_path):
 
 
 def test_a_study_that_is_named_is_shown_by_its_own_trials_alone(db, folder):
-    study = Study(db, Selection(file=str(folder / "mood.toml")))
+    study = StudyResults(db, Selection(file=str(folder / "mood.toml")))
     table = made(study, "factors")
     rows = by_id(table)
     assert rows["prompt=baseline/left_first_percent"].values["trials"] == 8
@@ -73,7 +73,7 @@ def test_a_study_that_is_named_is_shown_by_its_own_trials_alone(db, folder):
 
 
 def test_without_a_choice_tables_say_what_they_pool_and_test_nothing_across_studies(db):
-    study = Study(db)
+    study = StudyResults(db)
     table = made(study, "factors")
     rows = {name: row.values for name, row in by_id(table).items()}
     level = rows["prompt=A1/left_first_percent"]
@@ -118,14 +118,14 @@ def test_a_second_study_changes_no_reference(copy):
 
 def test_a_study_that_was_not_played_is_named_beside_those_that_were(db):
     with pytest.raises(UsageError, match="no trial of the study ablations; its studies: "):
-        Study(db, Selection(file="ablations"))
+        StudyResults(db, Selection(file="ablations"))
 
 
 def test_a_run_of_the_same_study_is_no_other_study(copy, prepare, tmp_path):
     (tmp_path / "mood.toml").write_text(MOOD.replace('"A1"]', '"A1", "A2"]'))
     sweep = ("sweep", "mood.toml", "--only", "prompt=A2", "--db", copy)
     assert prepare(tmp_path, *sweep).code == 0
-    known = values_of(Study(copy, Selection(file=str(tmp_path / "mood.toml"))), "factors")
+    known = values_of(StudyResults(copy, Selection(file=str(tmp_path / "mood.toml"))), "factors")
     assert [known[f"prompt={name}/gap_m"]["trials"] for name in ("baseline", "A1", "A2")] == [8] * 3
 
 

@@ -8,7 +8,7 @@ from merge_runner.audit.checks import not_judged
 from merge_runner.run.stored_replay import audit_database
 from merge_runner_analysis.provenance import provenance
 from merge_runner_analysis.selection import Selection
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.web.pages.prompts import differences
 from merge_runner_analysis.web.report import alarms
@@ -40,9 +40,9 @@ def test_more_than_a_fifth_is_too_much_and_a_fifth_is_not():
 
 
 def test_tables_show_it_without_a_value_and_the_rest_as_if_it_were_not_there(mixed, tmp_path):
-    alone = Study(write_study(tmp_path / "alone.duckdb", DRIVES))
+    alone = StudyResults(write_study(tmp_path / "alone.duckdb", DRIVES))
     for table, expected in zip(
-        *(make_tables(study, QUICK) for study in (Study(mixed), alone)), strict=True
+        *(make_tables(study, QUICK) for study in (StudyResults(mixed), alone)), strict=True
     ):
         unjudged = [row for row in table.rows if {"o3/A1", "bad/baseline"} & {*row.groups}]
         assert len(unjudged) == 2, table.name
@@ -65,9 +65,9 @@ def test_tables_show_it_without_a_value_and_the_rest_as_if_it_were_not_there(mix
 
 
 def test_report_and_audit_say_that_it_is_not_judged_and_conclude_nothing(mixed):
-    table = made(Study(mixed, Selection(where={"prompt": ["baseline", "A1"]})), "verdicts")
+    table = made(StudyResults(mixed, Selection(where={"prompt": ["baseline", "A1"]})), "verdicts")
     assert "bad" not in table.notes[0]
-    ((title, (texts, _)),) = alarms(Study(mixed), provenance(mixed)).items()
+    ((title, (texts, _)),) = alarms(StudyResults(mixed), provenance(mixed)).items()
     assert title == "Too few valid decisions"
     notes = [note for audit in audit_database(mixed) for note in audit.notes]
     for group in ("bad/baseline", "o3/A1"):
@@ -77,7 +77,7 @@ def test_report_and_audit_say_that_it_is_not_judged_and_conclude_nothing(mixed):
 
 
 def test_where_no_driver_is_judged_nothing_is_concluded(tmp_path):
-    study = Study(write_study(tmp_path / "t.duckdb", failing(yielding("bad", reps=1))))
+    study = StudyResults(write_study(tmp_path / "t.duckdb", failing(yielding("bad", reps=1))))
     table = made(study, "verdicts")
     assert table.notes[0] == "No language model is judged here."
     (row,) = (row for row in table.rows if row.groups != ("human",))

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from merge_runner.errors import MergeRunnerError, RecordingError, UsageError
 from merge_runner.llm import templates
 from merge_runner.llm.cache import ResponseCache, import_folder
-from merge_runner.llm.cache_file import TABLES, TextDisk
+from merge_runner.llm.cache_file import CREATE_TABLES, TextDisk
 from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.store import CachedCall
 from merge_runner.records import Attempt, ChatRequest, Slot, Usage, make_request
@@ -408,7 +408,7 @@ def test_a_folder_of_the_format_before_goes_on_with_its_replies_and_its_money(fo
         for table in ("spent", "open"):
             database.execute(f"DROP TABLE {table}")
     with contextlib.closing(sqlite3.connect(before / "ledger.db")) as database, database:
-        for statement in TABLES:
+        for statement in CREATE_TABLES:
             database.execute(statement)
         database.execute("INSERT INTO spent VALUES ('a study', 'm', 0.5, 0, 0)")
         database.execute("INSERT INTO open (scope, call, usd) VALUES ('a study', 'key', 0.25)")

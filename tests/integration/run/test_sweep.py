@@ -289,4 +289,4 @@ async def test_a_mirrored_pair_replays_to_itself_and_is_one_driver_in_tables_and
     assert "emulator+projected-order/baseline" in tables.out
     assert "projected-order+emulator" not in tables.out
     notes = " ".join((await merge_runner("tables", "who-first")).out.split())
-    assert "emulator sat on the left in 3 trials, and on the right in 3, mirrored" in notes
+    assert "emulator drove on the left in 3 trials, and on the right in 3, mirrored" in notes

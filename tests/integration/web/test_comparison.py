@@ -8,7 +8,7 @@ import pytest
 
 from merge_runner.study.file import read_study
 from merge_runner_analysis.selection import Selection
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.web.report import report_html
 from merge_runner_analysis.web.site import Site
@@ -47,7 +47,7 @@ def client(db):
 
 def test_a_less_b_is_the_table_of_effects_with_its_interval_and_both_p(db, client):
     page = words_of(client.get(f"/drivers/{A}?with={B}").text)
-    rows = values_of(Study(db, Selection([B, A])), "effects")
+    rows = values_of(StudyResults(db, Selection([B, A])), "effects")
     tested = [
         row for name, row in rows.items() if name.startswith("model=") and row["p"] is not None
     ]
@@ -77,7 +77,7 @@ def test_the_headline_says_crashes_in_counts_then_points_interval_and_p(client):
 
 
 def test_two_models_without_factors_are_what_the_first_page_and_the_report_answer(db, client):
-    study = Study(db)
+    study = StudyResults(db)
     table = make_tables(study, ["verdicts"])
     claim = f"{A} collided in 11 of 54 trials, {B} in 33 of 55. "
     answer = re.search(r'<p class="answer">(.*?)</p>', client.get("/").text, re.S)[1]
@@ -117,7 +117,7 @@ def test_the_measure_that_a_study_of_models_asks_about_is_tested_by_itself(db, t
     (tmp_path / "study.toml").write_text(
         f'models = ["{A}", "{B}"]\nrepetitions = 1\nprimary = "collided"'
     )
-    together, study = values_of(Study(db), "effects"), Study(db)
+    together, study = values_of(StudyResults(db), "effects"), StudyResults(db)
     study.source = read_study(str(tmp_path / "study.toml"))
     alone = values_of(study, "effects")
     name = f"model={B}/collided_percent"
@@ -134,7 +134,7 @@ def test_the_measure_that_a_study_of_models_asks_about_is_tested_by_itself(db, t
 def test_a_database_of_one_study_says_what_it_asks(drives, tmp_path, asked, found):
     text = f'models = ["{A}"]\nrepetitions = 1\n' + (f'primary = "{asked}"' if asked else "")
     db = write_study(tmp_path / "t.duckdb", drives, config={"study": {"text": text}})
-    rows = values_of(Study(db), "effects")
+    rows = values_of(StudyResults(db), "effects")
     primary = [name for name, row in rows.items() if row["primary"]]
     assert primary == ([f"model={B}/{found}"] if found else [])
 
@@ -153,7 +153,7 @@ def test_a_stored_study_that_cannot_be_read_is_said_in_a_line_and_the_pages_work
     drives = [*drives, *(replace(drive, variant="A1") for drive in drives)]
     text = 'models = ["o3"]\nrepetitions = 1\nof_a_later_version = 1\n'
     db = write_study(tmp_path / "t.duckdb", drives, config={"study": {"text": text}})
-    notes = make_tables(Study(db), ["effects"])[0].notes
+    notes = make_tables(StudyResults(db), ["effects"])[0].notes
     (said,) = [note for note in notes if note.startswith(UNREADABLE)]
     assert "of_a_later_version" in said
     assert "\n" not in said

@@ -11,7 +11,7 @@ import pytest
 
 from merge_runner_analysis import table as table_of
 from merge_runner_analysis.metrics import DECIMALS
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import TABLES, make_tables
 from merge_runner_analysis.tables.formats import names_of, render, shown_columns, shown_rows
@@ -24,7 +24,7 @@ NUMBERS = {"number", "percent", "interval", "p"}
 
 @pytest.fixture(scope="module")
 def study(golden):
-    return Study(golden / "golden.duckdb")
+    return StudyResults(golden / "golden.duckdb")
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from merge_runner.results.store import query, results_digest
 from merge_runner_analysis.figures.figure2 import figure2
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.stats.verdicts import human_gap
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from tests.support.gate import HANGS_S
 from tests.support.harness import PROGRAM, environment
 from tests.support.serving import Page, client_of, listed, served
@@ -90,7 +90,7 @@ def outcomes(db):
 
 
 def test_levels_and_effects_have_the_counts_and_shares_of_the_trials(db, outcomes):
-    study = Study(db)
+    study = StudyResults(db)
     levels, effects = values_of(study, "levels"), values_of(study, "effects")
     for factor in ("persona", "hurry", "opponent"):
         for level, rows in outcomes.groupby(factor):
@@ -113,7 +113,7 @@ def test_where_sides_are_counterbalanced_who_goes_first_is_said_of_the_ego(db):
     """
     with duckdb.connect(str(db), read_only=True) as connection:
         (left, right) = connection.execute(counts).fetchall()
-    study = Study(db)
+    study = StudyResults(db)
     figure = figure2(study, study.baselines)
     assert "ego first" in figure.axes[0].get_title()
     with client_of(db) as client:
@@ -161,7 +161,7 @@ def test_likeness_to_people_is_said_in_counts_that_lead_to_their_trials(db):
 
 
 def test_the_gap_of_people_is_that_of_the_situations_that_were_played(db):
-    study = Study(db, Selection(condition="L_4_8"))
+    study = StudyResults(db, Selection(condition="L_4_8"))
     group = next(group for group in study.baselines if group.driver == "emulator")
     there, every = human_gap(study.human, group), human_gap(study.human, study.human)
     assert abs(there.value - every.value) > 0.05

@@ -13,7 +13,7 @@ from merge_runner_analysis.figures.gallery import rendered, write_figures
 from merge_runner_analysis.figures.style import PAGE_IN
 from merge_runner_analysis.provenance import provenance, tally
 from merge_runner_analysis.published import published
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables import TABLES, make_tables
 from merge_runner_analysis.web.report import report_html, write_report
 from tests.integration.analysis.test_groups import alarms_of
@@ -79,7 +79,7 @@ def test_a_report_begins_with_the_description_the_design_the_prompts_and_the_fac
 def asking(folder, said, *, variant="baseline"):
     """A study of o3 in which the first six trials had this said at their first decision."""
     drives = [replace(d, said={0: said}) for d in yielding("o3", variant, reps=1)[:6]]
-    return Study(write_study(folder / "t.duckdb", drives))
+    return StudyResults(write_study(folder / "t.duckdb", drives))
 
 
 def test_what_went_wrong_stands_at_the_top_before_any_number(page):
@@ -147,7 +147,7 @@ def test_a_call_that_several_trials_used_was_made_and_paid_once(tmp_path):
 
 
 def test_the_report_writes_all_its_parts_as_files(tmp_path):
-    study = Study(write_study(tmp_path / "t.duckdb", yielding("o3", reps=1)[:4]))
+    study = StudyResults(write_study(tmp_path / "t.duckdb", yielding("o3", reps=1)[:4]))
     out, files = tmp_path / "r/report.html", tmp_path / "r/files"
     written = {*write_report(study, out, files)}
     parts = {f"{name}.{form}" for name in FIGURES for form in ("pdf", "svg", "png")}
@@ -161,7 +161,7 @@ def test_the_report_writes_all_its_parts_as_files(tmp_path):
     width, _ = struct.unpack(">II", (files / "figure2.png").read_bytes()[16:24])
     assert width == round(300 * PAGE_IN)
     for form in ("pdf", "svg", "png"):  # equal results give equal files
-        again = rendered(Study(study.db), "first-action", form)
+        again = rendered(StudyResults(study.db), "first-action", form)
         assert again == (files / f"first-action.{form}").read_bytes()
     with pytest.raises(UsageError, match="cannot be made"):
         list(write_figures(study, out))

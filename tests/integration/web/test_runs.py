@@ -20,7 +20,7 @@ from merge_runner.run.progress_file import remove_snapshot, write_snapshot
 from merge_runner.run.stored_replay import audit_database
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.selection import Selection
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.web.pages.sweep import sweep_page
 from merge_runner_analysis.web.runs import list_runs, numbers_of, standing_of
 from merge_runner_analysis.web.scope import filter_of, scope_of
@@ -327,10 +327,10 @@ def test_a_run_with_a_name_is_called_by_it_in_the_list(study):
     assert facets["run"] == [("the second", sum(n for _, n in facets["sweep"]))]
     assert site.catalogue.counts({"run": "the second"}) == site.catalogue.counts({"who": "drivers"})
     assert scope_of(site, {}).sweeps[0][1].startswith("the second (")
-    whole, named = (Study(study, Selection(sweep=name)) for name in ("", "the second"))
+    whole, named = (StudyResults(study, Selection(sweep=name)) for name in ("", "the second"))
     assert [len(each.trials) for each in named.played] == [len(e.trials) for e in whole.played]
     with pytest.raises(UsageError, match=r"unknown run 'a third'; valid: the second, sweep-1"):
-        Study(study, Selection(sweep="a third"))
+        StudyResults(study, Selection(sweep="a third"))
 
 
 def test_a_refused_run_is_news_until_its_model_was_asked_in_a_later_run_of_the_study(study):

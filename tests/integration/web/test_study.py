@@ -13,7 +13,7 @@ import pytest
 from merge_runner.errors import UsageError
 from merge_runner.results.store import query
 from merge_runner_analysis.selection import Selection
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import formats, make_tables
 from merge_runner_analysis.tables.model import from_text
@@ -123,7 +123,10 @@ def test_a_drivers_page_has_the_numbers_of_the_table_with_the_trials_behind_them
 
 
 def test_a_table_comes_as_a_file_and_the_page_of_prompts_leads_to_discordant_trials(client, db):
-    page, tables = Page(client.get("/tables/attempts").text), make_tables(Study(db), ["attempts"])
+    page, tables = (
+        Page(client.get("/tables/attempts").text),
+        make_tables(StudyResults(db), ["attempts"]),
+    )
     for form, suffix in ((TableFormat.CSV, "csv"), (TableFormat.LATEX, "tex")):
         reply = client.get(f"/tables/attempts.{suffix}")
         assert reply.text == formats.render(tables, form) + "\n"
@@ -145,10 +148,10 @@ def test_the_scope_is_in_the_address_and_every_number_obeys_it(client, db):
     collisions = rows["o3/baseline"]["collisions"]
     assert collisions["n"] + (collisions["undecided"] or 0) == 2
     assert rows["human"]["collisions"]["n"] == 90
-    played = Study(db, Selection(sweep="sweep-1")).played
+    played = StudyResults(db, Selection(sweep="sweep-1")).played
     assert [len(group.trials) for group in played] == [21, 11, 11]
     with pytest.raises(UsageError, match="unknown run 'no'; valid: sweep-1"):
-        Study(db, Selection(sweep="no"))
+        StudyResults(db, Selection(sweep="no"))
 
 
 def test_links_take_the_scope_to_every_page(client):

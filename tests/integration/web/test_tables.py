@@ -24,7 +24,7 @@ from merge_runner_analysis.cache import stamp_of
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.figures.gallery import MAKERS
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables.model import from_text
 from merge_runner_analysis.web import computing as computing_module
 from merge_runner_analysis.web.answers import answer, numbers
@@ -87,7 +87,7 @@ def answering(db, *answers):
 
 @pytest.mark.parametrize(("name", "every"), [("ablation-quantitative", 9), ("contrasts", 25)])
 def test_every_number_leads_to_the_trials_that_explain_names(ask, db, name, every):
-    study, table = Study(db), from_text(answer(db, ("table", name))["table"])
+    study, table = StudyResults(db), from_text(answer(db, ("table", name))["table"])
     links = cells(ask(f"/tables/{name}"))
     assert len(links) > 20
     for link in links[::every]:

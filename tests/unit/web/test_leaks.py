@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from merge_runner.errors import UsageError
-from merge_runner_analysis.web.leaks import refuse_leaks
+from merge_runner_analysis.web.leaks import check_leaks
 from tests.support.cases import cases
 
 DB = Path("/data/study/t.duckdb")
@@ -23,11 +23,11 @@ def test_a_key_and_a_path_of_this_machine_are_refused_and_no_key_is_repeated(
     monkeypatch.setenv("MY_PASSWORD", "hunter22")
     said, told = ("".join(case[of]).replace("{cwd}", str(cwd)) for of in ("said", "told"))
     with pytest.raises(UsageError, match=f"a page .*{re.escape(told)}") as refused:
-        refuse_leaks(DB, "a page", f"It said {said} and more")
+        check_leaks(DB, "a page", f"It said {said} and more")
     assert "names the path" in told or said not in str(refused.value)
 
 
 def test_words_that_only_look_like_a_secret_are_let_out(monkeypatch):
     monkeypatch.setenv("OPENAI_API_KEY", "short")
     for said in ("a short key", "task-proj-abcdefghijklmnop0123", "sk-8", "see /home and Users"):
-        refuse_leaks(DB, "a page", said)
+        check_leaks(DB, "a page", said)

@@ -10,7 +10,7 @@ from scipy.special import expit
 from scipy.stats import binom
 
 from merge_runner_analysis.metrics import LEFT_FIRST, METRICS
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.web.question import answered
 from tests.integration.study.test_words_study import EXAMPLE
@@ -25,7 +25,7 @@ def scientists(prepare, tmp_path_factory):
     folder = tmp_path_factory.mktemp("scientists")
     (folder / "study.toml").write_text(EXAMPLE)
     prepare(folder, "sweep", "study.toml", "--db", "t.duckdb", *FAST, code=0)
-    return Study(folder / "t.duckdb")
+    return StudyResults(folder / "t.duckdb")
 
 
 def simulated(study, rng, hurried):

@@ -7,7 +7,7 @@ import pytest
 from playwright.sync_api import expect
 
 from merge_runner.results.store import Store
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.web.report import report_html
 from tests.support.harness import PROGRAM, environment
@@ -107,7 +107,7 @@ def test_the_report_of_the_tutorials_study_is_at_most_so_high(page, tmp_path):
 
 
 def test_a_report_breaks_no_number_and_cuts_no_table_on_a_screen_and_on_paper(page, db, tmp_path):
-    study = in_a_thread(Study, db)
+    study = in_a_thread(StudyResults, db)
     html = in_a_thread(lambda: report_html(study, make_tables(study), {}))
     (tmp_path / "report.html").write_text(html)
     page.goto((tmp_path / "report.html").as_uri())

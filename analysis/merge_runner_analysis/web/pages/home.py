@@ -24,7 +24,7 @@ from merge_runner_analysis.web.scope import Bar, Scope, descriptions_of, scope_o
 from merge_runner_analysis.web.site import Site, news_of
 from merge_runner_analysis.wording import HEADINGS, LANGUAGE_MODEL, MOCK, headline
 
-TABLES = ("effects", "levels")  # of what a study's factors change
+FACTOR_TABLES = ("effects", "levels")  # of what a study's factors change
 Jobs = list[Job]
 
 
@@ -36,7 +36,7 @@ def _question(site: Site, bar: Bar) -> tuple[Jobs, Jobs, Answer | None]:
     if len(bar.prompts) < 2 and not site.catalogue.factors():
         return [], [], None
     part = bar.scope.sweep, bar.scope.condition
-    computed = [site.table(name, *part) for name in TABLES]
+    computed = [site.table(name, *part) for name in FACTOR_TABLES]
     jobs, tables = zip(*computed, strict=True)
     return [*jobs], [job for job, table in computed if table is None], answer_of(*tables)
 

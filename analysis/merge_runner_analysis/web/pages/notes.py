@@ -14,12 +14,12 @@ def notes_page(site: Site, _: Mapping[str, str]) -> str:
 
     It has none where the trial is not in this database.
     """
-    kept, shown = site.notes.kept(), []
-    for note in reversed(kept.notes):
+    stored, shown = site.notes.read(), []
+    for note in reversed(stored.notes):
         row = site.catalogue.find(note.trial_id, note.spec_hash)
         at = {"side": note.side, "decision": note.decision}
         shown.append((note, row and site.at.trial(row, **at)))
-    return site.render("notes.html", view="notes", kept=kept, shown=shown)
+    return site.render("notes.html", view="notes", stored=stored, shown=shown)
 
 
 def add_note(site: Site, given: Mapping[str, str]) -> Row:

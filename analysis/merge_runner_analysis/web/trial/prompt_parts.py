@@ -17,7 +17,7 @@ from merge_runner.records import Side
 Change = Literal["same", "new", "gone"]
 _WORDS = re.compile(r"[^\s\[\](),]+\s*|[\[\](),]\s*|\s+")
 # Prompts are taken apart once: each is first the later and then the earlier one.
-KEPT = 256
+CACHED = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ def words_of(prompt: str, digests: Mapping[str, str]) -> list[tuple[str, str]]:
     ]
 
 
-@lru_cache(KEPT)
+@lru_cache(CACHED)
 def _blocks(prompt: str, digests: tuple[tuple[str, str], ...]) -> list[tuple[str, str]]:
     """Return the name and text of each block; text of no block that is known here has no name.
 
@@ -129,7 +129,7 @@ def _begun(template: str) -> list[str]:
     return [paragraph.partition("{")[0] for paragraph in template.split("\n\n")]
 
 
-@lru_cache(KEPT)
+@lru_cache(CACHED)
 def _words(text: str) -> list[str]:
     return _WORDS.findall(text)
 

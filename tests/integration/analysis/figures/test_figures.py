@@ -23,7 +23,7 @@ from merge_runner_analysis.figures.gallery import MAKERS, rendered
 from merge_runner_analysis.figures.style import SETTINGS
 from merge_runner_analysis.frames import load
 from merge_runner_analysis.stats.intervals import mean, proportion
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from tests.support.studies import Drive, changed, write_study, yielding
 from tests.support.tables import values_of
 
@@ -88,7 +88,7 @@ def ticks(rows):
 
 def test_conditions_that_no_human_drove_have_no_human_line_and_their_own_look(tmp_path):
     drives = [d for d in yielding("o3", reps=7) if d.rep == 1 or d.condition == "L_4_8"]
-    study = Study(write_study(tmp_path / "t.duckdb", drives))
+    study = StudyResults(write_study(tmp_path / "t.duckdb", drives))
     assert ticks(drawn(study)[0]) == {(-4, 0, 4)}
     rows, keys = drawn(changed(study.db, OWN))
     assert dashed(rows[0][3]) == 3
@@ -102,13 +102,13 @@ def test_conditions_that_no_human_drove_have_no_human_line_and_their_own_look(tm
 
 def test_conditions_that_were_not_played_are_not_drawn(tmp_path):
     drives = [d for d in yielding(r"a$\b$", reps=1) if d.condition in {"N_0_0", "L_4_0"}]
-    study = Study(write_study(tmp_path / "t.duckdb", drives))
+    study = StudyResults(write_study(tmp_path / "t.duckdb", drives))
     assert {*study.conditions} == {"N_0_0", "L_4_0"}
     (human, _), keys = drawn(study)
     assert len(keys) == 1 + 2, "one relative velocity, and how humans are shown"
     assert sorted({round(x) for line in human[2].lines for x in line.get_xdata()}) == [0, 4]
     assert rendered(study, "figure2", "svg").startswith(b"<?xml"), "a dollar is no formula"
-    humans = Study(write_study(tmp_path / "h.duckdb", []))
+    humans = StudyResults(write_study(tmp_path / "h.duckdb", []))
     assert {*humans.conditions} == {*HUMAN_CONDITIONS}
 
 
@@ -189,7 +189,7 @@ def test_each_group_has_a_row_of_its_own_by_the_same_scales(study):
     "drives", [[], [yielding("o3", "A1", reps=1)[0], Drive("crash", "A1", "N_0_0", 1, (0,), (0,))]]
 )
 def test_figures_of_next_to_nothing_are_drawn_all_the_same(drives, tmp_path, recwarn):
-    study = Study(write_study(tmp_path / "t.duckdb", drives))
+    study = StudyResults(write_study(tmp_path / "t.duckdb", drives))
     for draw in MAKERS.values():
         draw(study).draw_without_rendering()
     assert [str(w.message) for w in recwarn.list] == []
@@ -200,7 +200,7 @@ def test_the_axis_of_speed_deviation_begins_at_0_where_two_trials_make_wide_inte
     drives = [
         replace(d, right=tuple(0.2 * x for x in d.right)) if d.rep == 2 else d for d in drives
     ]
-    study = Study(write_study(tmp_path / "t.duckdb", drives))
+    study = StudyResults(write_study(tmp_path / "t.duckdb", drives))
     wide = mean(study.models[0].finished.query("condition == 'N_0_0'")["rmse_mps"])
     assert wide.low < 0
     rows, _ = drawn(study)
@@ -211,7 +211,7 @@ def test_the_axis_of_speed_deviation_begins_at_0_where_two_trials_make_wide_inte
 
 def test_levels_are_drawn_as_the_table_of_effects_has_them(tmp_path):
     drives = [*yielding("o3", reps=2), *yielding("o3", "A1", 2), *yielding("o1", reps=2)]
-    study = Study(write_study(tmp_path / "t.duckdb", drives))
+    study = StudyResults(write_study(tmp_path / "t.duckdb", drives))
     panels = {axis.get_xlabel(): axis for axis in MAKERS["effects"](study).axes}
     first, *_ = panels.values()
     lines = [text.get_text() for text in first.get_yticklabels()]

@@ -3,7 +3,7 @@
 import pytest
 
 from merge_runner.results.store import query
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from tests.support.pages import velocity_page
 from tests.support.recordings import drive, write_folder, write_zip
 
@@ -101,6 +101,6 @@ def test_the_source_of_a_trial_is_told_and_none_is_stored_twice(human, tmp_path)
     assert says in run.err
     assert says in human("status").out
     assert human("import", folder).out.startswith("0 trials added, 3 there already, ")
-    study = Study(tmp_path / "results/merge.duckdb")
+    study = StudyResults(tmp_path / "results/merge.duckdb")
     assert len(study.human.trials) == 2
     assert any(said.startswith(says) for said in study.findings)

@@ -14,7 +14,7 @@ from merge_runner_analysis.humans.imported import by_condition, counted, finding
 from merge_runner_analysis.metrics import BOXES, COLLISIONS
 from merge_runner_analysis.published import PAIRS, human_outcomes
 from merge_runner_analysis.stats.measures import counts, known
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from tests.support.tables import made, notes_with
 
 LEFT, RIGHT, CRASH = ("finished", "left"), ("finished", "right"), ("collided", None)
@@ -86,7 +86,7 @@ def stored(tmp_path):
 
 
 def test_a_complete_import_leads_to_the_trials_behind_the_published_outcomes(stored):
-    study = Study(stored(PUBLISHED))
+    study = StudyResults(stored(PUBLISHED))
     trials = human_trials(study.db)
     assert list(findings(trials)) == []
     assert list(by_condition(trials).index) == list(CONDITIONS)
@@ -98,13 +98,13 @@ def test_a_complete_import_leads_to_the_trials_behind_the_published_outcomes(sto
 
 
 def test_another_data_set_is_named_under_every_table_with_humans(stored):
-    study = Study(stored(changed("N_0_0", LEFT, CRASH, 8)))
+    study = StudyResults(stored(changed("N_0_0", LEFT, CRASH, 8)))
     for name in ("who-first", "ablation-quantitative"):
         assert notes_with(made(study, name), "more of an outcome in N_0_0")
 
 
 def test_trials_of_other_pairs_are_in_no_row_and_in_no_query(stored):
-    study = Study(stored(moved(5)))
+    study = StudyResults(stored(moved(5)))
     assert len(study.human.trials) == by_condition(moved(5))["trials"].sum() == 985
     assert counted(moved(5), "pair")["trials"]["experiment_7"] == 5
     (source,) = explain(study, made(study, "who-first"), "human/intercept").sources

@@ -24,7 +24,7 @@ from merge_runner_analysis.power import (
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.stats.effects import effects
 from merge_runner_analysis.stats.regressions import gap_ols, who_first_logit
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 
 PLANTED = """
 repetitions = 10
@@ -147,7 +147,7 @@ def test_a_row_for_each_test_of_the_primary_measure_and_none_for_mirrored_halves
 def test_rows_are_those_of_the_table_of_effects_whatever_is_planted(file, prepare, tmp_path):
     study = file(REHEARSED)
     assert prepare(tmp_path, "sweep", study, "--db", "r.duckdb").code == 0
-    played = Study(tmp_path / "r.duckdb", Selection(file=str(study)))
+    played = StudyResults(tmp_path / "r.duckdb", Selection(file=str(study)))
     tested = [one for one in effects(played) if one.primary]
     plan = make_plan(str(study))
     said = []

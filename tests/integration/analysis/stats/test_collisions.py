@@ -13,7 +13,7 @@ from merge_runner_analysis.metrics import BOXES, COLLISIONS
 from merge_runner_analysis.published import human_counts
 from merge_runner_analysis.stats.measures import counts
 from merge_runner_analysis.stats.score_interval import wilson
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables import make_tables
 from tests.support.studies import Drive, changed, write_study
 
@@ -37,7 +37,7 @@ HAND_MADE = [
 @pytest.fixture(scope="module")
 def study(tmp_path_factory):
     path = tmp_path_factory.mktemp("collisions") / "study.duckdb"
-    return Study(write_study(path, HAND_MADE, STRONG))
+    return StudyResults(write_study(path, HAND_MADE, STRONG))
 
 
 def test_each_trial_is_judged_by_both_rules(study):
@@ -79,7 +79,7 @@ def test_both_rates_stand_in_the_tables_with_what_is_left_out(study):
 
 def test_a_driver_is_compared_with_humans_by_the_rule_of_the_humans(study, tmp_path):
     by_boxes = STRONG.model_copy(update={"collision_rule": "rectangle"})
-    played = Study(write_study(tmp_path / "boxes.duckdb", HAND_MADE, by_boxes))
+    played = StudyResults(write_study(tmp_path / "boxes.duckdb", HAND_MADE, by_boxes))
     (table,) = make_tables(played, ["verdicts"])
     found = next(row.values for row in table.rows if row.id == "o3/baseline/collisions")
     assert (found["k"], found["n"], found["undecided"]) == (2, 5, None)

@@ -16,7 +16,7 @@ from merge_runner_analysis.stats.indicators import (
     profiles,
     score,
 )
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.wording import Fact, Why
 from tests.support.studies import SCENARIO, changed, write_study, yielding
 from tests.support.tables import by_id, made
@@ -32,10 +32,10 @@ control_start = "own_exit"
 """
 
 
-def driving(tmp_path, right=(), scenario=SCENARIO) -> Study:
+def driving(tmp_path, right=(), scenario=SCENARIO) -> StudyResults:
     """One trial in each condition in which the left vehicle slows for 3 s, the right as told."""
     drives = [replace(d, left=(-0.9, -0.6, -0.3), right=right) for d in yielding("o3", reps=1)]
-    return Study(write_study(tmp_path / "t.duckdb", drives, scenario))
+    return StudyResults(write_study(tmp_path / "t.duckdb", drives, scenario))
 
 
 def test_a_trial_has_the_mean_gain_of_the_vehicles_that_acted(tmp_path):
@@ -78,7 +78,7 @@ def test_a_trial_without_action_neither_passes_nor_fails_and_is_told(tmp_path):
 
 @pytest.fixture(scope="module")
 def programs(golden):
-    study = Study(golden / "golden.duckdb")
+    study = StudyResults(golden / "golden.duckdb")
     return study, {group.driver: group for group in study.models}
 
 
@@ -116,7 +116,7 @@ def test_i5_is_one_sided_the_mean_gain_is_above_0(programs):
 def test_neither_drag_nor_the_cruise_before_control_passes_for_an_action(prepare, tmp_path):
     (tmp_path / "drag.toml").write_text(DRAG)
     prepare(tmp_path, "sweep", "drag.toml", "--db", "t.db", code=0)
-    study = Study(tmp_path / "t.db")
+    study = StudyResults(tmp_path / "t.db")
     (group,) = study.models
     vehicles = profiles(study, group)
     constant = vehicles[vehicles["side"] == "left"]

@@ -14,7 +14,7 @@ from merge_runner_analysis.frames import load, load_trials
 from merge_runner_analysis.metrics import BOXES, RMSE, SURROGATES, register
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.stats.measures import counts, estimate
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from tests.support.studies import Drive, played, write_study, yielding
 from tests.support.tables import made, notes_with
 
@@ -148,7 +148,7 @@ def test_each_median_of_criticality_says_of_how_many_finished_trials_it_is(tmp_p
         Drive("hand", "baseline", "L_4_0", 2, (0.8, 0.8, 0, 0, -1, -1, -1), (-0.4, -0.4)),
         Drive("hand", "baseline", "N_0_0", 1, (0.0,), (0.0,)),
     ]
-    study = Study(write_study(tmp_path / "hand.duckdb", ends))
+    study = StudyResults(write_study(tmp_path / "hand.duckdb", ends))
     table = made(study, "criticality")
     (row,) = table.rows
     counts = {"min_ttc_s": 1, "conflict_resolution_s": 2, "max_acceleration_mps2": 2}
@@ -168,7 +168,7 @@ def test_vehicles_that_close_in_by_a_centimetre_a_second_are_in_no_conflict(
     """From 14 and 8 m/s the one ahead brakes for 4 s, until it is that much slower."""
     braking = (-(6 + closing_mps) / 10,) * 4
     drive = Drive("hand", "baseline", "L_4_0", 1, (0.8, 0.8, *braking), (-0.4, -0.4))
-    table = made(Study(write_study(tmp_path / "hand.duckdb", [drive])), "criticality")
+    table = made(StudyResults(write_study(tmp_path / "hand.duckdb", [drive])), "criticality")
     (row,) = table.rows
     assert notes_with(table, "never close in faster than 0.01 m/s are in no conflict")
     if in_conflict:
@@ -198,7 +198,7 @@ def test_the_trials_of_a_share_are_those_that_it_is_found_in(added, imported):
     driven = added(
         name="driven_percent", estimator="proportion", trials="ended", value="end_time_s > 0"
     )
-    human = Study(imported.db, Selection(["human"])).human
+    human = StudyResults(imported.db, Selection(["human"])).human
     assert counts(human, driven) == (66, 66)
     assert counts(human, BOXES) == (28, 990)
 
@@ -215,7 +215,7 @@ def test_trials_whose_value_is_missing_or_no_finite_number_do_not_count(added, d
         trials="ended",
         value="if(condition = 'N_0_0', NULL, condition LIKE 'L%')",
     )
-    (group, _) = Study(db).models
+    (group, _) = StudyResults(db).models
     assert estimate(group, odd).n == 11 - 3
     assert counts(group, slow) == (5, 10)
 
@@ -223,6 +223,6 @@ def test_trials_whose_value_is_missing_or_no_finite_number_do_not_count(added, d
 def test_a_rate_is_compared_and_a_median_is_not(added, db):
     added(name="a_percent", label="a", estimator="proportion", value="joint")
     added(name="c_mps", label="c", estimator="median")
-    rows = {row.id for row in made(Study(db), "contrasts").rows}
+    rows = {row.id for row in made(StudyResults(db), "contrasts").rows}
     assert "o3/A1/baseline/a_percent" in rows
     assert not any(name.endswith("c_mps") for name in rows)

@@ -9,7 +9,7 @@ from scipy import stats
 from merge_runner.config import ScenarioConfig
 from merge_runner_analysis.published import human_counts
 from merge_runner_analysis.stats.verdicts import compared, human_fit, human_gap
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.wording import DIFFERS, MEASURES
 from tests.support.studies import Drive, write_study, yielding
 from tests.support.tables import by_id, made, notes_with, values_of
@@ -28,7 +28,7 @@ def study(tmp_path_factory):
     drives = [*yielding("o3", reps=5), *yielding("wild", reps=2), *crashes]
     drives = {(one.driver, one.condition, one.rep): one for one in drives}
     path = tmp_path_factory.mktemp("verdicts") / "t.duckdb"
-    return Study(write_study(path, drives.values(), BOXES))
+    return StudyResults(write_study(path, drives.values(), BOXES))
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def test_few_collisions_are_tested_exactly_as_by_fisher(tmp_path):
         Drive("o3", "baseline", "N_0_0", rep, *(together if rep <= collided else apart))
         for rep in range(1, n + 1)
     ]
-    study = Study(write_study(tmp_path / "t.duckdb", drives, BOXES))
+    study = StudyResults(write_study(tmp_path / "t.duckdb", drives, BOXES))
     found = values_of(study, "verdicts")["o3/baseline/collisions"]
     humans = human_counts()["N_0_0"]
     table = [[collided, n - collided], [humans.collided, sum(humans) - humans.collided]]
@@ -132,7 +132,7 @@ def test_with_undecided_trials_there_is_no_p_and_n_is_that_of_the_decided_ones(t
         for name in ("N_0_0", "L_4_0")
         for rep in range(1, 4)
     ]
-    study = Study(write_study(tmp_path / "t.duckdb", drives))
+    study = StudyResults(write_study(tmp_path / "t.duckdb", drives))
     table = made(study, "verdicts")
     row = by_id(table)["o3/baseline/collisions"]
     beside = values_of(study, "indicators")["o3/baseline/collided_boxes_percent"]
@@ -147,6 +147,6 @@ def test_with_undecided_trials_there_is_no_p_and_n_is_that_of_the_decided_ones(t
 def test_a_replayed_human_is_not_judged(tmp_path):
     asked = {"program": "human-replay", "data": "a hash"}
     drives = yielding("human-replay", reps=1)
-    table = made(Study(write_study(tmp_path / "t.duckdb", drives, asked=asked)), "verdicts")
+    table = made(StudyResults(write_study(tmp_path / "t.duckdb", drives, asked=asked)), "verdicts")
     assert {row.groups for row in table.rows} == {("human",)}
     assert notes_with(table, "both humans are replayed and do not react")

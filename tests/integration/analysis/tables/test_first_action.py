@@ -13,7 +13,7 @@ from merge_runner_analysis.explain import explain
 from merge_runner_analysis.figures.first_action import first_action
 from merge_runner_analysis.frames import load
 from merge_runner_analysis.selection import Selection
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.web.catalogue import Catalogue
 from tests.support.studies import Drive, changed, write_study
 from tests.support.tables import by_id, made, values_of
@@ -43,7 +43,7 @@ def db(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def rows(db):
-    return values_of(Study(db), "first-action")
+    return values_of(StudyResults(db), "first-action")
 
 
 def test_the_human_slope_stands_beside_each_drivers(rows):
@@ -80,7 +80,7 @@ def test_the_numbers_of_a_driver_are_those_of_the_states(db, rows):
 def test_drag_counts_as_it_was_realised(tmp_path):
     drives = [Drive("o3", "baseline", name, 1, (0.0,), (0.0,)) for name in CONDITIONS]
     db = write_study(tmp_path / "t.duckdb", drives, ScenarioConfig(resistance="human"))
-    row = values_of(Study(db), "first-action")["o3/baseline"]
+    row = values_of(StudyResults(db), "first-action")["o3/baseline"]
     assert row["mean_equal"] == pytest.approx(-1.0)
     assert row["brake_percent"] == 100
 
@@ -153,7 +153,7 @@ def asked(prepare, tmp_path_factory):
 
 
 def test_who_was_only_asked_has_rows_beside_who_drove_with_the_same_first_actions(asked):
-    study = Study(asked / "t.duckdb")
+    study = StudyResults(asked / "t.duckdb")
     table = made(study, "first-action")
     rows = by_id(table)
     alone = {name: row for name, row in rows.items() if " [asked]/" in name}
@@ -176,17 +176,17 @@ def test_who_was_only_asked_has_rows_beside_who_drove_with_the_same_first_action
 
 def test_drivers_and_levels_that_were_only_asked_can_be_chosen(asked):
     db = asked / "t.duckdb"
-    narrowed = made(Study(db, Selection(["emulator"])), "first-action").rows
+    narrowed = made(StudyResults(db, Selection(["emulator"])), "first-action").rows
     assert {row.groups[0] for row in narrowed} == {"emulator/baseline", "emulator [asked]/baseline"}
-    of_model = Study(asked / "grid.duckdb", Selection(where={"model": ["projected-order"]}))
-    assert [group.name for group in of_model.asked] == ["projected-order [asked]"]
+    of_model = StudyResults(asked / "grid.duckdb", Selection(where={"model": ["projected-order"]}))
+    assert [group.name for group in of_model.probes] == ["projected-order [asked]"]
     assert of_model.models == []
     with pytest.raises(UsageError, match=r"valid: human, emulator, .*projected-order"):
-        Study(db, Selection(["idm"]))
+        StudyResults(db, Selection(["idm"]))
 
 
 def test_the_planted_exchange_rate_of_who_was_only_asked_is_found_beside_the_humans(asked):
-    rows = values_of(Study(asked / "grid.duckdb"), "first-action")
+    rows = values_of(StudyResults(asked / "grid.duckdb"), "first-action")
     own, program = (rows[f"{name} [asked]/baseline"] for name in ("emulator", "projected-order"))
     assert own["n"] == 7 * 5 * 2 * 2
     assert own["exchange_rate_ci"][0] < 3.30 / 1.11 < own["exchange_rate_ci"][1]
@@ -200,7 +200,7 @@ def test_the_explorer_and_the_figure_tell_who_was_only_asked(asked):
     assert [row["source"] for row in listed] == ["llm"]
     configs = catalogue.ask("SELECT config::VARCHAR AS config FROM sweeps")
     assert [bool(json.loads(sweep["config"])["seat"]) for sweep in configs] == [False]
-    figure = first_action(Study(asked / "t.duckdb"))
+    figure = first_action(StudyResults(asked / "t.duckdb"))
     (axis,), (legend,) = figure.axes, figure.legends
     names = [text.get_text() for text in legend.get_texts()]
     assert len(names) == len(axis.containers)
@@ -210,6 +210,6 @@ def test_the_explorer_and_the_figure_tell_who_was_only_asked(asked):
 def test_drivers_that_take_control_one_after_the_other_are_left_out_with_a_note(tmp_path):
     apart = ScenarioConfig(control_start="own_exit")
     db = write_study(tmp_path / "t.duckdb", following("alike", -0.34)[:8], apart)
-    row = by_id(made(Study(db), "first-action"))["alike/baseline"]
+    row = by_id(made(StudyResults(db), "first-action"))["alike/baseline"]
     assert row.values["n"] == 0
     assert '"own_exit" one driver acts while' in row.note

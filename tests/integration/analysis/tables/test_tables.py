@@ -15,7 +15,7 @@ from merge_runner_analysis.explain import explain
 from merge_runner_analysis.metrics import METRICS
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.stats.indicators import score
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import TABLES, make_tables
 from merge_runner_analysis.tables import table as table_of
@@ -163,7 +163,7 @@ def test_against_the_paper_stand_its_values_and_the_difference(study, tables, na
 def test_prompts_are_contrasted_without_one_that_is_called_baseline(tmp_path):
     drives = [*yielding("o3", "hurry"), *yielding("o3", "calm")]
     config = {"levels": {"model": ["o3"], "prompt": ["hurry", "calm"]}}
-    study = Study(write_study(tmp_path / "t.duckdb", drives, config=config))
+    study = StudyResults(write_study(tmp_path / "t.duckdb", drives, config=config))
     rows = {name: row.values for name, row in by_id(made(study, "contrasts")).items()}
     assert rows["o3/calm/hurry/gap_m"]["difference"] == pytest.approx(0, abs=1e-12)
     assert {values["reference"] for values in rows.values()} == {"hurry"}
@@ -190,7 +190,7 @@ TROUBLE = {
 )
 def test_trouble_gives_tables_with_a_stated_reason(names, trouble, tmp_path, recwarn):
     drives = [drive for drives in trouble.values() for drive in drives]
-    found = make_tables(Study(write_study(tmp_path / "t.duckdb", drives)), names)
+    found = make_tables(StudyResults(write_study(tmp_path / "t.duckdb", drives)), names)
     for form in TableFormat:
         text = render(found, form).replace("\\_", "_")
         assert not re.search(r"\b(nan|inf)\b", text, re.IGNORECASE)
@@ -217,7 +217,7 @@ def added(db, other, spec, *tables):
             connection.execute(
                 f"INSERT INTO {name} SELECT * REPLACE ('{spec}' AS spec_hash) FROM other.{name}"
             )
-    return Study(db)
+    return StudyResults(db)
 
 
 def test_another_task_leaves_a_baseline_and_its_variants_together(tmp_path):
@@ -236,12 +236,14 @@ def test_another_task_leaves_a_baseline_and_its_variants_together(tmp_path):
 def test_models_can_be_chosen_and_an_unknown_one_names_the_valid(tmp_path):
     drives = [yielding(name, reps=1)[0] for name in ("o3", "other")]
     db = write_study(tmp_path / "t.duckdb", drives)
-    assert [group.id for group in Study(db, Selection(["other"])).groups] == ["other/baseline"]
+    assert [group.id for group in StudyResults(db, Selection(["other"])).groups] == [
+        "other/baseline"
+    ]
     with pytest.raises(UsageError, match="valid: human, o3, other"):
-        Study(db, Selection(["gpt"]))
+        StudyResults(db, Selection(["gpt"]))
     with pytest.raises(UsageError, match="unknown driver"):
-        Study(db, Selection([]))
-    assert not notes_with(made(Study(db, Selection(["human"])), "gap"), "holds no trial")
+        StudyResults(db, Selection([]))
+    assert not notes_with(made(StudyResults(db, Selection(["human"])), "gap"), "holds no trial")
 
 
 # Explain

@@ -10,7 +10,7 @@ from merge_runner_analysis.explain import explain
 from merge_runner_analysis.frames import load
 from merge_runner_analysis.provenance import tally
 from merge_runner_analysis.selection import Selection
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from tests.support.studies import Drive, Said, changed, write_study, yielding
 from tests.support.tables import by_id, made, notes_with, values_of
 
@@ -53,7 +53,7 @@ def test_a_missing_decision_has_a_count_of_its_own_and_is_not_invalid(tmp_path):
         replace(drive, said=missing if n < 2 else {0: FAILED} if n == 2 else {})
         for n, drive in enumerate(yielding("o3", reps=1))
     ]
-    study = Study(write_study(tmp_path / "t.duckdb", drives))
+    study = StudyResults(write_study(tmp_path / "t.duckdb", drives))
     table = made(study, "attempts")
     row = by_id(table)["o3/baseline"].values
     counts = {"no_decision": 6, "invalid": 1, "no_array": 1, "fallback": 1}
@@ -62,7 +62,7 @@ def test_a_missing_decision_has_a_count_of_its_own_and_is_not_invalid(tmp_path):
     for column, trials in (("no_decision", 2), ("invalid", 1), ("fallback", 1)):
         (source,) = explain(study, table, f"o3/baseline:{column}").sources
         assert len(source.numerator) == trials, column
-    without = Study(study.db, Selection(without_fallbacks=True))
+    without = StudyResults(study.db, Selection(without_fallbacks=True))
     assert len(without.models[0].trials) == len(drives) - 1
     # One id may stand under several specs: the copy without the fallback stays.
     changed(
@@ -72,7 +72,7 @@ def test_a_missing_decision_has_a_count_of_its_own_and_is_not_invalid(tmp_path):
             for name in ("trials", "states")
         ),
     )
-    kept = Study(study.db, Selection(without_fallbacks=True)).models
+    kept = StudyResults(study.db, Selection(without_fallbacks=True)).models
     assert sorted(len(group.trials) for group in kept) == [len(drives) - 1, len(drives)]
 
 
@@ -93,7 +93,7 @@ def biased(tmp_path_factory):
 def test_failures_that_bias_the_outcomes_are_seen_without_them(biased):
     values = {}
     for without in (False, True):
-        study = Study(biased, Selection(without_fallbacks=without))
+        study = StudyResults(biased, Selection(without_fallbacks=without))
         indicators = made(study, "indicators")
         rows = by_id(indicators)
         collided = rows["o3/baseline/collided_percent"].values
@@ -107,7 +107,7 @@ def test_failures_that_bias_the_outcomes_are_seen_without_them(biased):
 
 
 def test_a_driver_whose_every_trial_had_a_fallback_has_a_row_that_says_so(study):
-    kept = Study(study.db, Selection(without_fallbacks=True))
+    kept = StudyResults(study.db, Selection(without_fallbacks=True))
     sizes = {group.id: len(group.trials) for group in kept.models}
     assert sizes == {"o3/baseline": 110, "o3/A1": 49, "other/baseline": 44}
     assert [group.id for group in kept.unjudged] == ["o3/A2"]
@@ -124,7 +124,7 @@ def test_the_option_is_that_of_the_tables_and_kept_apart(biased, prepare, tmp_pa
 def test_only_failed_trials_leave_nothing_to_compare_and_say_why(tmp_path):
     lost = Said(("timeout", "timeout"), lost=True)
     drives = [replace(drive, said={0: lost}) for drive in yielding("o3", reps=1)]
-    study = Study(write_study(tmp_path / "t.duckdb", drives))
+    study = StudyResults(write_study(tmp_path / "t.duckdb", drives))
     row = values_of(study, "attempts")["o3/baseline"]
     assert (row["failed"], row["lost"], row["calls"], row["lost_percent"]) == (11, 11, 22, 50)
     study = changed(study.db, "DELETE FROM decisions; DELETE FROM calls WHERE side = 'right'")

@@ -7,7 +7,7 @@ import pytest
 
 from merge_runner.errors import UsageError
 from merge_runner_analysis.humans import archive
-from merge_runner_analysis.humans.archive import Unreadable, open_files, refuse_bombs
+from merge_runner_analysis.humans.archive import Unreadable, check_sizes, open_files
 from tests.support.recordings import file, write_folder, write_zip
 
 FILES = {"a/experiment_4_iter_1.csv": b"first" * 50, "b/c/experiment_4_iter_2.csv": b"second"}
@@ -103,14 +103,14 @@ def test_a_compression_that_cannot_be_bounded_is_not_unpacked(tmp_path, compress
 
 
 def test_a_bomb_is_refused_by_its_declared_sizes():
-    refuse_bombs([file("small", bytes(1000)), file("empty", b"")])
+    check_sizes([file("small", bytes(1000)), file("empty", b"")])
     huge = archive.File("x.csv", archive.MAX_FILE_BYTES + 1, bytes)
     with pytest.raises(UsageError, match=r"x\.csv has 67108865 bytes unpacked"):
-        refuse_bombs([huge])
+        check_sizes([huge])
     big = archive.File("x.csv", archive.MAX_FILE_BYTES, bytes)
-    refuse_bombs([big] * 64)
+    check_sizes([big] * 64)
     with pytest.raises(UsageError, match="files up to it have 4362076160"):
-        refuse_bombs([big] * 65)
+        check_sizes([big] * 65)
 
 
 def test_a_file_that_cannot_be_read_says_why(tmp_path):

@@ -23,7 +23,7 @@ from merge_runner_analysis.power import (
     simulate,
 )
 from merge_runner_analysis.stats.regressions import gap_ols, who_first_firth
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from tests.support.emulator_fixtures import first_prompt
 
 REPS, STUDIES = 10, 20
@@ -82,7 +82,7 @@ def test_the_gaps_of_a_driver_as_played_scatter_as_those_that_it_left(prepare, t
     told = prepare(tmp_path, "power", *study, "--sims", 20)
     rows = json.loads(told.out)["chances"]
     assert {row["truth"] for row in rows} == {"human", "cei/baseline as played"}
-    (group,) = Study(tmp_path / "cei.duckdb").models
+    (group,) = StudyResults(tmp_path / "cei.duckdb").models
     again = simulate(played(group), list(HUMAN_CONDITIONS), REPS, np.random.default_rng(1))
     errors = [
         gap_ols(trials, robust=True).terms["abs_projected_headway"].se

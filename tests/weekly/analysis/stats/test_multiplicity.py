@@ -12,7 +12,7 @@ from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.published import HUMAN_GAP_SD_M, human_counts, published
 from merge_runner_analysis.stats import verdicts
 from merge_runner_analysis.stats.regressions import gap_design
-from merge_runner_analysis.study import Study
+from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.wording import DIFFERS
 from tests.support.studies import write_study
 
@@ -67,7 +67,7 @@ def drawn(rng: np.random.Generator, trials: int, *, pairs: bool, of_velocity: fl
 @pytest.fixture(scope="module")
 def humans(tmp_path_factory):
     """The humans as published."""
-    return Study(write_study(tmp_path_factory.mktemp("humans") / "t.duckdb", [])).human
+    return StudyResults(write_study(tmp_path_factory.mktemp("humans") / "t.duckdb", [])).human
 
 
 @np.errstate(divide="ignore")
