@@ -141,7 +141,7 @@ class Study:
         """Add a prompt, a condition, a metric, ... to this study, and return it.
 
         It replaces an earlier one of this name, so that a cell can be run again; a run under way
-        keeps the one that it started with. Raise UsageError if the name is taken elsewhere.
+        keeps the earlier one. Raise UsageError if the name is taken elsewhere.
         """
         self._added.parts.get(registry.kind, {}).pop(name, None)
         with collecting(self._added):

@@ -42,7 +42,7 @@ def unknown_name(
 
 
 class SweepStopped(MergeRunnerError):
-    """The sweep stops; finished trials and saved replies are kept."""
+    """The sweep stops; finished trials and replies stay stored."""
 
 
 class EndpointRefused(SweepStopped):
@@ -66,11 +66,11 @@ class NoValidDecision(SweepStopped):
 
 
 class CacheFailed(SweepStopped):
-    """The cache cannot be written or read, so that no reply could be kept."""
+    """The cache cannot be written or read, so that no reply could be stored."""
 
 
 class TrialSuspended(MergeRunnerError):
-    """The next call could exceed the cap; the trial's replies so far are kept."""
+    """The next call could exceed the cap; the trial's replies so far stay stored."""
 
     exit_code = 3
 

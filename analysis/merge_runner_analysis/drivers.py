@@ -31,7 +31,7 @@ def has_chance(spec: Mapping[str, Any], sides: Collection[Side] = SIDES) -> bool
 
 
 def unresponsive(spec: Mapping[str, Any]) -> str:
-    """Return what to say wherever trials of a spec are shown; empty where no human is replayed."""
+    """Return a warning that replayed humans do not react; empty if a spec replays none."""
     sides = [side for side in SIDES if "data" in (spec.get(side) or {})]
     if len(sides) == len(SIDES):
         return "both humans are replayed and do not react"

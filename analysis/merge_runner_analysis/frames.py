@@ -194,7 +194,7 @@ class Frames(NamedTuple):
 
 
 def read_frames(db: Path) -> Frames:
-    """Read what a study needs, in one opening of the file; raises UsageError."""
+    """Read the data frames of a study, in one opening of the file; raises UsageError."""
     with read_database(db) as connection:
         _limit(connection)
 

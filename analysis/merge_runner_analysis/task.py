@@ -1,4 +1,4 @@
-"""The settings of a driving task, as texts: what pages and the report say of it without pandas."""
+"""Settings of a driving task as texts, for pages and the report; needs no pandas."""
 
 from __future__ import annotations
 

@@ -552,7 +552,7 @@ def share(collisions: Values) -> str:
 
 
 def _suffice(trials: int, ended: int) -> bool:
-    """Return whether so many trials, of those that ended, are enough for a verdict."""
+    """Return whether this number of counted trials is enough for a verdict."""
     return trials >= ENOUGH and 2 * trials >= ended
 
 

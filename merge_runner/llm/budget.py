@@ -75,7 +75,7 @@ class Reservation:
         self.budget.queue.wake()
 
     def book(self, attempt: Attempt, keep: Callable[[Execute], ResultT]) -> Future[ResultT]:
-        """Keep what the attempt brought and book its cost, in one durable transaction."""
+        """Store the attempt's reply and its cost, in one durable transaction."""
         self.cost_usd, ledger = attempt.cost_usd, self.budget.ledger
         book = partial(ledger.book, self.key, attempt, self.label.driver)
         return ledger.store.write(partial(both, keep, book))
@@ -111,7 +111,7 @@ class Waiter:
 class MoneyQueue:
     """Priority queue: probes, calls of running trials, trials that wait for admission.
 
-    A call of a running trial has the place of the oldest one, whatever it waits for.
+    A call takes the place of the oldest running trial that needs it.
     """
 
     def __init__(self, ledger: Ledger, running: Mapping[int, float]) -> None:
@@ -287,5 +287,5 @@ class Budget:
             f"({spending.spent_usd:.4f} spent, {reserved_usd:.4f} reserved for "
             f"{spending.open_attempts} attempts whose cost is not known{elsewhere}: "
             "`merge-runner ledger`); "
-            f"{self._still_expected_usd():.4f} more are kept for the trials that have begun"
+            f"{self._still_expected_usd():.4f} more are reserved for the trials that have begun"
         )

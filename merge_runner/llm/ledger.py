@@ -237,7 +237,7 @@ class Ledger:
     ) -> tuple[str, float, float]:
         """Replace the reservation of an attempt by its cost. Runs in a transaction.
 
-        Returns the driver, the cost, and by how much it exceeds the worst case.
+        Returns the driver, the cost, and its excess over the worst case.
         """
         self._sum_once(execute)
         closed = execute(_CLOSE, (key, number)).fetchall()

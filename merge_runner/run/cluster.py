@@ -101,7 +101,7 @@ class Assignment:
 
         playing, booking = asyncio.create_task(play()), asyncio.create_task(book())
         await asyncio.wait([playing, booking], return_when=asyncio.FIRST_EXCEPTION)
-        if not playing.done():  # no attempt gets an answer any more; paid replies are kept
+        if not playing.done():  # no attempt gets an answer any more; paid replies are stored
             with contextlib.suppress(OSError):  # the scheduler is gone, as the result will say
                 await run(stop, setup.run, on_error="ignore")
         await asyncio.wait([playing, booking])

@@ -84,5 +84,5 @@ class FirstDecisions:
     def _check(self) -> None:
         for line in self.without_a_valid_one(self._most_invalid):
             raise NoValidDecision(
-                f"{line}. What was answered is kept; --keep-going goes on with such a model"
+                f"{line}. All replies are stored; --keep-going goes on with such a model"
             )

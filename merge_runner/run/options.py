@@ -15,8 +15,8 @@ class Options:
 
     ``rpm`` and ``tpm`` override the registry's. ``max_cost_usd`` also covers ``ledgers``, the
     names of other sweeps. ``dask`` names the cluster that plays the trials; None: this process. A
-    ``dry_run`` sends nothing, a ``quiet`` run shows no progress, and one that is to ``keep_going``
-    goes on with a model that gives no valid decision. In a ``batch`` run all trials ask together,
+    ``dry_run`` sends nothing, a ``quiet`` run shows no progress. With ``keep_going`` a model
+    without a valid decision does not stop the run. In a ``batch`` run all trials ask together,
     at a lower price. ``typed`` are the command's arguments, which resume the run. ``name`` is the
     user's name for the run.
     """

@@ -262,8 +262,8 @@ def _first_decision(arm: Arm) -> Arm:
 def _check_arms(arms: Sequence[Arm], parts: Parts, *, first: bool) -> None:
     """Check all crossings of arms and conditions.
 
-    Raises UsageError for a condition that an arm cannot be played in, or both drivers of which
-    cannot be asked ``first``.
+    Raises UsageError if an arm cannot be played in a condition, or if ``first`` decisions are asked
+    and one of its drivers cannot make any.
     """
     for arm, (name, condition) in product(arms, parts.conditions.items()):
         world = World(arm.scenario, condition, TRACK)

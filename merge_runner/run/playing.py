@@ -53,7 +53,7 @@ class Endings:
         self.session.fail(
             TrialSuspended.exit_code,
             f"{self.suspended.total()} trials wait for money{_unbalanced(waiting)}: "
-            f"{self.why_suspended}. Their replies are kept: raise --max-cost, or the study's "
+            f"{self.why_suspended}. Their replies stay stored: raise --max-cost, or the study's "
             "budget, and run the same command again",
         )
 
@@ -104,7 +104,7 @@ async def _play(endings: Endings, stopping: Stopping) -> bool:
 
     def interrupted() -> None:
         work.cancel()  # before anything is written: the terminal may be closed
-        session.say(f"Stopping: {player.unsaved} are saved first; Ctrl-C again drops them.")
+        session.say(f"Stopping: {player.unsaved} are stored first; Ctrl-C again drops them.")
 
     cancelled = False
     with stopping(interrupted, drain.cancel):

@@ -57,7 +57,7 @@ class ProgressSnapshot(BaseModel):
 def write_snapshot(db: Path, snapshot: ProgressSnapshot) -> None:
     """Replace a sweep's file as a whole: a reader sees the old state or the new one, never a part.
 
-    A sweep goes on where it cannot be written.
+    If it cannot be written, the sweep continues.
     """
     path = _path(db, snapshot.sweep_id)
     made = path.with_suffix(".tmp")

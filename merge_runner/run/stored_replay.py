@@ -203,7 +203,7 @@ def _replayable(
     audit: Audit,
     notes: Counter[str],
 ) -> list[TrialSpec]:
-    """Return the audited trials whose spec is stored as the plan has it today.
+    """Return the audited trials whose stored spec equals the planned one.
 
     A spec that differs in what follows from the sweep's configuration is a finding; trials that
     another version of the program made are a note.
@@ -259,7 +259,7 @@ class StoredReplies:
         return False
 
     def get(self, key: str, _: ChatRequest | None = None) -> CachedCall | None:
-        """Return the call with this key, each answer read anew; None where there is none.
+        """Return the call with this key, its replies read anew, or None.
 
         Raises RecordingError where its request does not have the key, and CallFailed where it
         ended without an answer.

@@ -160,10 +160,10 @@ def _outcomes(summary: dict[str, Any]) -> str:
 
 
 def calls_text(live: int, cached: int, shared: int, recorded: int) -> str:
-    """Return the numbers of calls that were sent, and that were answered without a request.
+    """Return the numbers of ``live`` calls, and of ``cached`` ones, which sent no request.
 
-    Of the latter ``shared`` were answered in this run, ``recorded`` by a recording that the user
-    named.
+    ``shared`` of the cached ones have a reply of this run, ``recorded`` a reply of a recording that
+    the user named.
     """
     parts = {
         "from recordings": recorded,

@@ -49,10 +49,10 @@ async def play(
 ) -> dict[str, Any]:
     """Play the trials of a plan that are not stored yet; return ``summary.as_dict``.
 
-    A replay without named recordings uses the one that ships with the program, if the cache has no
-    replies of the models. Unless ``whole``, it plays only the trials in its recordings. ``agree``
+    A replay without named recordings uses the shipped one, if the cache has no replies of the
+    models. Unless ``whole``, it plays only the trials in its recordings. ``agree``
     gets an estimate before money is spent, and raises to prevent that. ``stopping`` gives the
-    events that stop the run; a cancelled task saves paid replies first. Raises UsageError.
+    events that stop the run; a cancelled task stores paid replies first. Raises UsageError.
     """
     if options.replay:
         shipped = SHIPPED_RECORDINGS / f"{plan.model}-{plan.study.name}.parquet"

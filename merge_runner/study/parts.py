@@ -111,7 +111,7 @@ def _require_consent(study: StudySource, models: Iterable[str], *, trust: bool) 
     except OSError as exc:
         if not trust:  # --trust needs no record
             raise UsageError(
-                f"the agreement cannot be kept in {record}: {exc.strerror}; name another folder "
+                f"the agreement cannot be stored in {record}: {exc.strerror}; name another folder "
                 "with XDG_STATE_HOME, or add --trust"
             ) from exc
 

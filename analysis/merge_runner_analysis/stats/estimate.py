@@ -11,7 +11,7 @@ from merge_runner_analysis.wording import Fact
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A number with its interval, what it rests on and its test; what is not known is None.
+    """A number with its interval, counts and test; None stands for unknown values.
 
     ``ends_at`` finds the interval's ends at another ``level``, if it is not Student's t. A rate
     counts ``k`` of ``n`` trials and is as good as one of ``weight``; with ``undecided`` ones it has

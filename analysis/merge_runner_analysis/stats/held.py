@@ -3,7 +3,7 @@
 What the paper sees in its Figure 2 are speeds made of straight lines: the acceleration is held, and
 then jumps. A vehicle's speed under control, brought to 5 Hz, is therefore cut into pieces in two
 ways: into straight lines (held accelerations), and into cubics (accelerations that move). The
-*gain* is by how much the lines describe it better than cubics with as many numbers, per sample:
+*gain* is the advantage of lines over cubics per sample, at equal numbers of parameters:
 
     gain = (min BIC(cubics) - min BIC(lines)) / n
     BIC(k pieces) = n ln(RSS / RSS of one line + sigma^2) + numbers ln n

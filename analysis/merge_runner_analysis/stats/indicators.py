@@ -3,9 +3,9 @@
 The paper (arXiv 2604.09609, Table V) judges signs and p < 0.05 of Wald tests, I4 by the main effect
 of |dv| alone. Human data are nearly separable, where Wald tests lose their power, and a large p is
 no evidence of no effect. So I1 and I2 are judged again by likelihood-ratio tests of Firth's fit, I3
-by an HC3 test, and I4 by equivalence: of any two played conditions that differ in relative velocity
-alone, the predicted gaps are less than a margin apart, by two one-sided tests (Schuirmann 1987) of
-each, all of which must pass (Berger 1982).
+by an HC3 test, and I4 by equivalence. Two played conditions that differ in relative velocity alone
+have predicted gaps less than a margin apart, by two one-sided tests (Schuirmann 1987). All such
+pairs must pass (Berger 1982).
 
 I5 holds where the whole 95 % interval of the mean gain (see ``held``) of trials with control action
 lies above 0: accelerations are piecewise constant.

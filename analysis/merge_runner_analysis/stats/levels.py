@@ -184,7 +184,7 @@ def _with_copies(study: StudyResults, group: Group) -> Iterator[Iterable[Cell]]:
 
 @remembered
 def distinct(study: StudyResults, group: Group) -> Group:
-    """Return a group with each trial once, as a level has it; ``whole`` has the copies, too."""
+    """Return a group with identical trials counted once; ``whole`` has the copies, too."""
     every = Level(DRIVER, group.id, (group.id,), _with_cells([group], set()))
     (level,) = _distinct(study, [every])
     return level.pooled if level.copies else group

@@ -163,7 +163,7 @@ class Catalogue:
 
     @property
     def state(self) -> Row:
-        """State of the list, which differs wherever the listed ``trials`` or their values do."""
+        """State of the list, which changes with the listed ``trials`` or their values."""
         return self.listing.state
 
     @property

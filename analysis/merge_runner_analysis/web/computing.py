@@ -73,7 +73,7 @@ class Job:
 
 
 class Computing:
-    """Answers by request. One computation goes on at a time, the others wait for it."""
+    """Answers by request. Computations run one at a time."""
 
     def __init__(
         self,
@@ -132,7 +132,7 @@ class Computing:
         return self._executor.submit(self._compute, self.db, request)
 
     def close(self) -> None:
-        """Stop computing, whatever is under way: it could take minutes."""
+        """Stop computing at once: the present computation could take minutes."""
         if self._executor is None:
             return
         with suppress(BrokenProcessPool, ProcessLookupError):

@@ -75,10 +75,10 @@ def export_folder(
 ) -> Path:
     """Write the pages of a study into a folder; returns the first of them.
 
-    ``patterns`` are names of trials, in which * stands for anything: then their list and their
-    pages alone are written. ``progress`` gets the number of pages so far. An earlier export in the
-    folder goes. Raises UsageError; then, as where a page holds a key or a path of this machine, the
-    folder stays as it was.
+    ``patterns`` are names of trials, with * as a wildcard, that limit the list and the pages.
+    ``progress`` gets the number of written pages. An earlier export in the folder goes. Raises
+    UsageError; then, as where a page holds a key or a path of this machine, the folder stays as it
+    was.
     """
     index, files = folder / INDEX, folder / FILES
     if folder.is_file():
@@ -313,7 +313,7 @@ def _opened(site: Site, patterns: Sequence[str]) -> Iterator[list[Row]]:
 
 @contextmanager
 def _staged(folder: Path) -> Iterator[Path]:
-    """Give a temporary folder, of which all goes into this one in the end; raises UsageError."""
+    """Yield a temporary folder; its files move to this one at the end. Raises UsageError."""
     parent = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.is_dir())
     try:
         with tempfile.TemporaryDirectory(prefix=".merge-runner-", dir=parent) as stage:

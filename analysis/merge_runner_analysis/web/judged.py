@@ -162,8 +162,8 @@ def noted(
 def by_condition(site: Site, scope: Scope, drivers: Sequence[Driver]) -> dict[str, Any]:
     """Return counts by condition, of the drivers' trials and of the humans' as published.
 
-    ``crash`` says by which rule drivers collide.
-    None stands for a condition that somebody did not drive; without a driver they are the humans'.
+    ``crash`` is the drivers' collision rule in words. A count is None if a condition was not
+    driven. Without a driver the conditions are the humans'.
     """
     rows = site.catalogue.counts(scope.trials(), "model", "variant", "condition")
     counted = {(row["model"], row["variant"], row["condition"]): _merged(row) for row in rows}

@@ -164,8 +164,8 @@ STATE = "SELECT count(*) AS trials, bit_xor(hash(listed)) AS prints FROM listed"
 class Listing(NamedTuple):
     """The tables ``listed`` and ``several`` of one state of a database.
 
-    ``others`` are pairs of models of which another answered than was asked for; ``state`` differs
-    where other ``trials`` are listed, or the same otherwise.
+    ``others`` are pairs of models, requested and served, that differ; ``state`` changes with the
+    listed ``trials`` or their values.
     """
 
     connection: duckdb.DuckDBPyConnection

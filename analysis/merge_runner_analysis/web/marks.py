@@ -40,7 +40,7 @@ class Mark:
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """A verdict as a page shows it; ``words`` has it in full, with its note."""
+    """A verdict on a page; ``words`` is its full text, with its note."""
 
     measure: Measure
     values: Values

@@ -67,7 +67,7 @@ def names_mean(programs: Iterable[Mapping[str, Any]], drivers: Iterable[str]) ->
 
 
 def program_text(name: str, based_on: str | None = None, plugins: Iterable[str] = ()) -> str:
-    """Describe a program: as it is loaded here, else as the text of a run's ``plugins`` has it."""
+    """Describe a program by its loaded class, else by the source of a run's ``plugins``."""
     if (program := PROGRAMS.get(name)) is not None:
         doc = (getdoc(program.driver) or "").partition("\n")[0].rstrip(".")
         text = program.meaning or doc or "a driver of a plug-in, which does not say what it does"

@@ -278,9 +278,9 @@ def _seen(rows: Sequence[Row]) -> str:
 
 
 def _sizes(rows: Sequence[Row]) -> str:
-    """Return the detectable effect of each factor, or of more than FEW the largest.
+    """Return the detectable effect of each factor, or only the largest of more than FEW factors.
 
-    Of a factor with several levels it is the largest.
+    A factor with several levels has its largest one.
     """
     least: dict[str, Row] = {}
     for row in rows:
@@ -391,7 +391,7 @@ def _side(side: Side, counts: Row | None, is_own: bool, metric: str) -> Side:
 
 
 def _untested(effects: Sequence[Row]) -> set[str]:
-    """Return the factors of which every level has the trials of its reference."""
+    """Return the factors whose levels all have the same trials as their reference."""
     asked = [row for row in effects if row.values.get("primary")]
     return {*_factors(asked)} - {*_factors(row for row in asked if not is_copied(row))}
 

@@ -2,7 +2,7 @@
 
 The system frees a process's locks on a file when any part of the process closes it: a sweep could
 then write while another thread still reads. Pages and queries read a copy, so that a sweep can
-write meanwhile. It lasts as long as the file stays as it is.
+write meanwhile. The copy is replaced when the file changes.
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ class Links:
     def cell(self, table: str, row: str, column: str, /, **part: str) -> str:
         """Return the address of a cell's trials, of all trials or of a ``part``: see ``CELL``.
 
-        No table's name has a slash and no column's a colon, whatever is in the row's.
+        Names of tables have no slash and names of columns no colon; names of rows may have both.
         """
         return self.to("trials", cell=f"{table}/{row}:{column}", **part)
 

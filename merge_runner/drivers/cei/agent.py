@@ -1,4 +1,4 @@
-"""One driver of the model in a trial: agents of which there is one."""
+"""One driver of the CEI model in a trial, as a vector of one agent."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Lifecycle of a batch: submit it, or find it again; poll it; read its results.
 
-A batch is noted in the cache before its provider knows of it. So a process that is killed leaves
-what the next one needs: the batch to find, or to wait for, and the number of each call's attempt
-there.
+A batch is noted in the cache before its provider knows of it. So after a kill the
+next process knows the batch to find, or to wait for, and the number of each call's attempt in it.
 """
 
 from __future__ import annotations

@@ -178,7 +178,7 @@ class BatchSender:
         return is_new or call.pending_batch is not None
 
     def resume(self, call: Call) -> None:
-        """Take the attempt that goes on in a batch out of the recorded attempts of a call."""
+        """Remove a pending batch's attempt from the recorded attempts of a call."""
         if call.pending_batch is not None:
             end = call.pending_batch.note.lines[call.request.key]
             call.attempts = [a for a in call.attempts if a.number < end]

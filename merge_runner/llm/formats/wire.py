@@ -65,8 +65,8 @@ class Reading:
 class WireFormat(ABC):
     """A format of requests and replies.
 
-    ``meaning`` and ``delay_s`` return None for errors that are read alike for all formats: gateways
-    pass on the errors of others, whatever format they speak themselves.
+    ``meaning`` and ``delay_s`` return None for errors that all formats share: a gateway of one
+    format passes on errors of another.
     """
 
     parameters: ClassVar[Mapping[str, tuple[str, ...]]] = {}

@@ -416,7 +416,7 @@ async def test_a_suspended_trial_says_what_the_cap_is_needed_for(ledger):
     assert str(caught.value) == (
         "the next call may cost 5.0000 USD, and 1.0000 of 5 USD are spent or reserved (0.5000 "
         "spent, 0.5000 reserved for 1 attempts whose cost is not known: `merge-runner ledger`); "
-        "3.0000 more are kept for the trials that have begun"
+        "3.0000 more are reserved for the trials that have begun"
     )
 
 
@@ -452,5 +452,5 @@ async def test_however_an_attempt_ends_its_money_ends_in_the_right_place(
     spending = budget.ledger.read()
     assert (spending.reserved_usd, spending.spent_usd) == (reserved_usd, spent_usd)
     assert (budget.in_flight, budget.queued_usd) == (0, 0)
-    with pytest.raises(TrialSuspended, match=f"{kept_usd:.4f} more are kept for the trials"):
+    with pytest.raises(TrialSuspended, match=f"{kept_usd:.4f} more are reserved for the trials"):
         await set_aside(budget, 1, 5.0)

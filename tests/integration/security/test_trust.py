@@ -165,7 +165,7 @@ def test_a_script_may_agree_where_nothing_can_be_kept_but_a_person_is_told(
     monkeypatch.setenv("XDG_STATE_HOME", os.devnull)
     load_study(study, trust=True)
     terminal("y")
-    with pytest.raises(UsageError, match=r"the agreement cannot be kept in .*XDG_STATE_HOME"):
+    with pytest.raises(UsageError, match=r"the agreement cannot be stored in .*XDG_STATE_HOME"):
         load_study(study)
 
 

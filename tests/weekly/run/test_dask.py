@@ -154,11 +154,11 @@ async def test_ctrl_c_saves_what_the_workers_have_asked(merge_runner, started, t
         process.send_signal(signal.SIGINT)
         for worker in workers_of(process.pid):
             worker.send_signal(signal.SIGINT)  # as a terminal does
-        await process.said("are saved first")
+        await process.said("are stored first")
         gate.open()
         code, _, err = await ended(process)
         assert code == 130, err
-        assert "the replies of 2 tasks are saved first" in err
+        assert "the replies of 2 tasks are stored first" in err
         assert "Traceback" not in err
         run = await merge_runner(*SIX, **server.env)
     assert run.code == 0, run.err

@@ -120,8 +120,8 @@ def differences(
 ) -> tuple[dict[str, dict[str, dict[str, Any]]], dict[str, float]]:
     """Return each prompt's differences by driver, pair of prompts and measure, and axis ends.
 
-    Each difference is as it is printed, with its mark, filled where its corrected p is below 5 %,
-    and the names for a link to its trials. An axis ends at the same distance on both sides.
+    Each difference has its printed text, its mark (filled if its corrected p is below 5 %) and
+    the names for a link to its trials. An axis ends at the same distance on both sides.
     """
     # A driver that is not judged has none.
     rows = [row for row in table.rows if row.values.get("difference") is not None]

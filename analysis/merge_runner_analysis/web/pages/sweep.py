@@ -104,5 +104,5 @@ def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
 
 
 def audit_of(site: Site, runs: Sequence[Row]) -> Job | None:
-    """Return the audit's notes on each run; None while a run goes on, which ends with an audit."""
+    """Return the audit's notes on each run; None during a run, which ends with an audit."""
     return None if any(run["followed"] for run in runs) else site.computed(("audit",))

@@ -76,7 +76,7 @@ def trial_page(
 
 
 def trial_pages(site: Site, rows: Sequence[Row], template: str = "trial.html") -> Iterator[str]:
-    """Return the pages of trials, of which some are read at once."""
+    """Return the pages of trials, read READ_AT_ONCE at a time."""
     for begin in range(0, len(rows), READ_AT_ONCE):
         some = rows[begin : begin + READ_AT_ONCE]
         for row, trial in zip(some, read(site, some), strict=True):
@@ -166,7 +166,7 @@ def _older_s(decision: Row, trial: Trial) -> float | None:
 def others(site: Site, trial_id: str, asked: Mapping[str, str]) -> dict[str, Any] | str | None:
     """Return other trials for a trial's page: one to compare, one on offer, or several.
 
-    ``compare=KEY`` gives what a replay draws of it, ``offer=KIND`` a key; None where there is none.
+    ``compare=KEY`` gives that trial's drawing, ``offer=KIND`` a key or None.
     ``q=WORDS`` gives the first trials that have the words, in the same condition before
     others. Raises NotThere.
     """

@@ -74,8 +74,8 @@ class Course:
     def last_chance(self, side: Side, action: float, after: int = -1) -> int | None:
         """Return the last sample from which a side's hardest action still avoids the collision.
 
-        Of two moments the earlier one is always the better to begin at. None where no sample
-        ``after`` a given one will do.
+        An earlier beginning is always better than a later one. Return None if no sample ``after`` a
+        given one suffices.
         """
         exit_m = self.track.tunnel_exit_m - TICK_S  # from there on the driver has control
         under_control = (i for i, at_m in enumerate(self.positions_m[side]) if at_m > exit_m)
@@ -250,7 +250,7 @@ def _collision(course: Course, name: str) -> str:
 
 
 def _avoidable(course: Course, side: Side, chance: int | None) -> str:
-    """Return until when a driver could have avoided the collision, and by how much, rounded up."""
+    """Return a driver's last moment to avoid the collision, and the braking that it took."""
     if chance is None:
         return f"By braking alone the {side} driver could never have avoided it."
     done, _ = _braking(course, side, chance)

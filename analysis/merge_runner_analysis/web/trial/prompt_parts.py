@@ -70,10 +70,10 @@ def words_of(prompt: str, digests: Mapping[str, str]) -> list[tuple[str, str]]:
 
 @lru_cache(CACHED)
 def _blocks(prompt: str, digests: tuple[tuple[str, str], ...]) -> list[tuple[str, str]]:
-    """Return the name and text of each block; text of no block that is known here has no name.
+    """Return the name and text of each block; text of an unknown block has no name.
 
-    Of the blocks whose paragraphs begin like the next ones the one with the longest beginnings is
-    meant. ``digests`` are name and digest of all that the prompt has.
+    If several blocks begin like the next paragraphs, the one with the longest beginnings is
+    chosen. ``digests`` are name and digest of all that the prompt has.
     """
     known = [
         (name, _begun(template))
