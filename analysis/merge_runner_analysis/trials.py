@@ -25,7 +25,7 @@ from merge_runner.text_safety import first_line, quoted
 from merge_runner_analysis.metrics import JUDGED, LEFT_FIRST, METRICS, Metric
 from merge_runner_analysis.published import human_outcomes
 
-# The rule of the human experiment is boxes that overlap, looked for so often.
+# The rule of the human experiment is boxes that overlap, checked at this rate.
 LOOKS_HZ = 20
 # Samples at or next to which boxes can overlap: with centres closer in the plane than the diagonal
 # of a box and the way that they can come nearer within a step.

@@ -91,7 +91,7 @@ def verdicts(study: StudyResults) -> Table:
             ),
             f"{VERDICT_RULE}. The interval of the difference has the level at which Holm tests it, "
             "so that it leaves 0 out where the verdict says so",
-            "collisions: by the rule of the human experiment, outlines that overlap, looked for at "
+            "collisions: by the rule of the human experiment, outlines that overlap, checked at "
             "20 Hz; Fisher's exact test within conditions, and the melded interval that agrees "
             "with it; without p where trials are undecided. The humans' share weighs conditions as "
             "the driver's trials do, and so does their mean gap as its trials with a gap do",
