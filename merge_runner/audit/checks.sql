@@ -65,7 +65,7 @@ CREATE OR REPLACE TEMP VIEW served_findings AS
 SELECT 'served' AS kind, arg_min(trial_id, (trial_id, decision, side)) AS trial_id,
     arg_min(side, (trial_id, decision, side)) AS side,
     arg_min(decision, (trial_id, decision, side)) AS decision,
-    format('{} -> {}: another model answered than was asked for ({} answers)',
+    format('{} -> {}: another model answered than was asked for ({} replies)',
         model_requested, model_served, count(*)) AS text
 FROM calls SEMI JOIN audited USING (trial_id, spec_hash)
 SEMI JOIN other_models USING (model_requested, model_served)
@@ -78,7 +78,7 @@ SELECT 'attempt' AS kind, trial_id, side, decision, text FROM (
         WHEN list(attempt ORDER BY attempt) <> range(1, count(*) + 1)
             THEN format('its attempts are numbered {}', list(attempt ORDER BY attempt)::VARCHAR)
         WHEN min(attempt) FILTER (outcome IN ('ok', 'refusal', 'truncated')) < max(attempt)
-            THEN 'an answer was followed by another attempt' END AS text
+            THEN 'a reply was followed by another attempt' END AS text
     FROM calls SEMI JOIN audited USING (trial_id, spec_hash)
     GROUP BY trial_id, spec_hash, side, decision, call_key
 ) WHERE text IS NOT NULL;
@@ -86,7 +86,7 @@ SELECT 'attempt' AS kind, trial_id, side, decision, text FROM (
 -- Each reply of the emulator names the request that it answers.
 CREATE OR REPLACE TEMP VIEW exchanged_findings AS
 SELECT 'exchanged' AS kind, trial_id, side, decision,
-    'its reply is, as the server says in it, the answer to another request' AS text
+    'its reply names another request' AS text
 FROM (
     SELECT trial_id, calls.side, calls.decision, condition, rep, sample_set, request, answered
     FROM calls SEMI JOIN audited USING (trial_id, spec_hash)
@@ -127,7 +127,7 @@ SELECT 'its call is also that of' AS text,
     list(DISTINCT (trial_id, spec_hash)) AS trials
 FROM decisions JOIN trial_drivers USING (trial_id, spec_hash)
 WHERE call_key IS NOT NULL GROUP BY spec_hash, driver, call_key HAVING count(*) > 1
-UNION ALL SELECT 'its answer, with the provider''s id of it, is also that of',
+UNION ALL SELECT 'its reply, with the provider''s id of it, is also that of',
     list(place ORDER BY place), list(DISTINCT trial)
 FROM (
     SELECT endpoint, model_requested, reply_id, min((trial_id, side, decision)) AS place,
@@ -227,12 +227,12 @@ FROM linked SEMI JOIN done USING (trial_id, spec_hash) ANTI JOIN (
     JOIN subject ON subject.sweep_id = own.sweep_id
 ) USING (trial_id, spec_hash) HAVING count(*) > 0
 UNION ALL SELECT format('{} replies of {} at {} have an id that the server gave more than once: its ids '
-    'do not tell whether an answer was given twice', count(DISTINCT call_key), model_requested,
+    'do not tell whether a reply was given twice', count(DISTINCT call_key), model_requested,
     coalesce(nullif(endpoint, ''), 'its endpoint'))
 FROM reply_ids SEMI JOIN audited USING (trial_id, spec_hash)
 JOIN repeated_ids USING (endpoint, model_requested, reply_id)
 WHERE NOT telling GROUP BY model_requested, endpoint
 -- Without replies of the emulator, which has only a few phrases.
-UNION ALL SELECT format('all {} answers to prompts that were asked before are word for word as before: '
+UNION ALL SELECT format('all {} replies to prompts that were asked before are word for word as before: '
     'are they samples?', answers)
 FROM alike, counts WHERE answers > 0 AND "attempts answered by a mock model" = 0;

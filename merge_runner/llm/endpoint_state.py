@@ -71,7 +71,7 @@ class EndpointState:
             return self.failed(call, "nothing that is asked again would help")
         self.verified = self.has_answered = True
         if outcome.name == "empty" and self.wire.retries_empty and call.empty <= MAX_EMPTY_RETRIES:
-            return TryAgain("empty answer")
+            return TryAgain("empty reply")
         return None
 
     def _why_closed(self, outcome: AttemptOutcome) -> str:
@@ -92,7 +92,7 @@ class EndpointState:
 
     def out_of_time(self, call: Call, delay_s: float) -> MergeRunnerError:
         """Return the error of a call whose deadline would pass before the next attempt."""
-        why = f"no answer within {self.entry.deadline_s:.0f} s"
+        why = f"no reply within {self.entry.deadline_s:.0f} s"
         if delay_s >= self.entry.deadline_s:
             why = (
                 f"the server asks to wait {delay_s:.0f} s, longer than a call's deadline of "

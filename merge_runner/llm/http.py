@@ -156,7 +156,7 @@ class HttpTransport:
                 echoed = part.strip()
                 self._echoes_ids |= echoed.startswith(self._id_prefix)
                 if echoed.startswith(self._id_prefix) and echoed != request_id:
-                    why = "the server sent the answer to another request"
+                    why = "the server sent the reply to another request"
                     raise TransportFailure("wrong_answer", why)
 
     async def _read(self, reply: httpx.Response, most_bytes: int) -> str:

@@ -207,7 +207,7 @@ def judge(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
         return AttemptOutcome("accept", reading.outcome, reading=reading, raw=raw)
     has_error = is_error(body.get("error")) or is_error(at(body, "choices.0.error"))
     if reading.outcome == "error" and not has_error and reading.finish_reason in BROKEN_OFF:
-        why = f"the server broke its answer off (finish reason {reading.finish_reason})"
+        why = f"the server broke its reply off (finish reason {reading.finish_reason})"
         return AttemptOutcome("retry", "server_error", why, reading, raw=raw)
     is_nothing = reading.outcome == "empty" and not any(body.get(name) for name in wire.members)
     # Also an error in another format's form, or in MiniMax's.
@@ -217,7 +217,7 @@ def judge(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
         reading = replace(reading, outcome="error")
         return replace(judge_error(error, wire), reading=reading, raw=raw)
     if is_nothing:
-        why = f"the body has nothing of an answer: {raw.excerpt}"
+        why = f"the body has nothing of a reply: {raw.excerpt}"
         return AttemptOutcome("retry", "bad_body", why, reading, raw=raw)
     return AttemptOutcome("accept", reading.outcome, reading=reading, raw=raw)
 

@@ -32,7 +32,7 @@ class Probe:
     @asynccontextmanager
     async def turn(self, call: Call) -> AsyncIterator[None]:
         """Wait until no other call probes; a run that stops lets no further call probe."""
-        self.calls.wait(call, Wait(f"for the first answer of {self.endpoint.driver}"))
+        self.calls.wait(call, Wait(f"for the first reply of {self.endpoint.driver}"))
         await self._alone.acquire()
         call.wait = None
         if self.endpoint.verified:
@@ -57,6 +57,6 @@ class Probe:
         left = timedelta(seconds=entry.deadline_s - LONG_WAIT_S)
         last = f"after {call.last_failure}" if call.own_attempts else "nothing has come yet"
         self.meter.notes.append(
-            f"{driver}: {call.label.slot}: the first call of this run waits for its answer "
+            f"{driver}: {call.label.slot}: the first call of this run waits for its reply "
             f"until {datetime.now(UTC) + left:%H:%M:%S} UTC, {last}"
         )

@@ -23,7 +23,7 @@ REASONS = {
     "allow the host, or name the host in NO_PROXY",
     "request": "the request is refused: look at {place}",
     "other_format": "what answers there does not speak {format}: {base_url}",
-    "other_error": "the endpoint sends an error in the place of an answer: {base_url}",
+    "other_error": "the endpoint sends an error in place of a reply: {base_url}",
     "stream": "the endpoint sends a stream of events (SSE), though none is asked for: switch "
     "streaming off at the server or at the gateway before it, take `stream` out of `parameters` of "
     "{place}, or {base_url}",

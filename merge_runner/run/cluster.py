@@ -294,7 +294,9 @@ class ClusterRunner:
                 if asked[row.side] in plan.entries:
                     self.first.count(asked[row.side], row.decision)
         if played.exit_code:
-            stopped = SweepStopped(f"{played.error} (told by the Dask worker {assignment.address})")
+            stopped = SweepStopped(
+                f"{played.error} (reported by the Dask worker {assignment.address})"
+            )
             stopped.exit_code = played.exit_code
             raise stopped
 

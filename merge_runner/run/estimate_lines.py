@@ -89,8 +89,8 @@ def estimate_lines(expected: Estimate) -> Iterator[str]:
         yield from _by_cap(expected)
         yield f"time    about {expected.minutes} minutes"
         return
-    singly = f"{usd_text(expected.singly_usd)} and {expected.minutes} minutes if asked singly"
-    yield f"cost    {usd_text(expected.cost_usd)} in batches; {singly}"
+    single = f"{usd_text(expected.singly_usd)} and {expected.minutes} minutes by normal requests"
+    yield f"cost    {usd_text(expected.cost_usd)} in batches; {single}"
     yield from _by_model(expected)
     yield from _by_cap(expected)
     yield (

@@ -203,7 +203,7 @@ def _costs(summary: dict[str, Any]) -> Iterator[str]:
 def _faults(summary: dict[str, Any]) -> Iterator[str]:
     """Yield the models that answered for others, the audit, and the failed trials."""
     for pair, answers in summary["model_mismatches"].items():
-        yield f"WARNING: another model answered than was asked for: {pair} ({answers} answers)"
+        yield f"WARNING: another model answered than was asked for: {pair} ({answers} replies)"
     for driver, model, provider in summary["stand_ins"]:
         if provider == EMULATOR:
             yield f"The model `{model}` is a mock model, no language model."

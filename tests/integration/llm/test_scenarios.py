@@ -151,6 +151,6 @@ async def test_what_does_not_pass_fails_at_the_deadline(cache, case, wire):
     assert DEADLINE_S - max(case.wait_s, LONGEST_BACKOFF_S) - 1 <= waited_s <= DEADLINE_S
     assert caught.value.exit_code == 1
     message = str(caught.value)
-    for said in (f"no answer within {DEADLINE_S} s", case.says, f"{len(attempts)} attempts"):
+    for said in (f"no reply within {DEADLINE_S} s", case.says, f"{len(attempts)} attempts"):
         assert said in message
     assert "\n" not in message

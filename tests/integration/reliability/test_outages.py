@@ -51,7 +51,7 @@ async def test_one_trial_fails_with_a_reason_and_the_rest_go_on(merge_runner, tm
         assert run.summary["trials"]["finished"] == 2
         ((trial, error),) = run.summary["failed"].items()
         assert trial == "patient/baseline/L_4_8/rep01"
-        assert "no answer within 1 s (HTTP 503: The engine is down.), 2 attempts" in error
+        assert "no reply within 1 s (HTTP 503: The engine is down.), 2 attempts" in error
         before = server.requests
         mended = True
         again = await merge_runner(*sweep, code=0, **server.env)

@@ -149,7 +149,7 @@ async def test_workers_of_another_scheduler_play_with_their_own_keys(merge_runne
         run = await merge_runner(*SMALL, "--model", "o3", "--yes", *dask, **env)
         assert (run.code, server.requests) == (2, 0)
     assert "o3 needs a key: set OPENAI_API_KEY" in run.err
-    assert "(told by the Dask worker tcp://127.0.0.1:" in run.err
+    assert "(reported by the Dask worker tcp://127.0.0.1:" in run.err
     assert "Traceback" not in run.err
 
 
@@ -178,7 +178,9 @@ async def test_a_driver_that_raises_ends_the_run_once_and_what_is_paid_is_kept(
     assert kept >= 3
     (told,) = [line for line in run.err.splitlines() if line.startswith("error:")]
     assert "Raising.decide of " in told
-    assert "mine.py raised ValueError('no plan') (told by the Dask worker tcp://127.0.0.1:" in told
+    assert (
+        "mine.py raised ValueError('no plan') (reported by the Dask worker tcp://127.0.0.1:" in told
+    )
     assert "Traceback" not in run.err
 
     def names(dask_worker):

@@ -80,8 +80,8 @@ def test_each_trial_says_which_driver_was_told_which_words(db):
         page = Page(client.get(trial).text).text
     assert re.search(r'<th scope="col"[^>]*>ego</th>', listing)
     assert listing.count("<td>left</td>") == 15  # the baseline tells both the same
-    assert "The left driver, the ego, was told persona=taxi: You are a taxi driver." in page
-    assert "The right driver was told hurry=yes: You are late." in page
+    assert "The left driver, the ego, read persona=taxi: You are a taxi driver." in page
+    assert "The right driver read hurry=yes: You are late." in page
 
 
 def test_pairs_are_found_although_an_effect_is_planted_with_the_prompt(db):

@@ -49,7 +49,7 @@ async def test_the_others_wait_until_the_first_call_is_answered(begin):
     asked = ask_all(client)
     await ticks()
     assert len(client.direct.transport.sent) == 1
-    assert [wait.what for wait in client.calls.waits] == ["for the first answer of my-model"] * 4
+    assert [wait.what for wait in client.calls.waits] == ["for the first reply of my-model"] * 4
     client.direct.transport.open.set()
     await asyncio.gather(*asked)
     assert len(client.direct.transport.sent) == 5
@@ -146,7 +146,7 @@ async def test_no_answer_to_the_first_call_within_its_deadline_ends_the_run(begi
     client = begin(error(503, "down"), deadline_s=60)
     tasks = ask_all(client)
     with pytest.raises(
-        ProviderDown, match=r"the first call of this run: no answer within 60 s.*down"
+        ProviderDown, match=r"the first call of this run: no reply within 60 s.*down"
     ):
         await tasks[0]
     sent = len(client.direct.transport.sent)

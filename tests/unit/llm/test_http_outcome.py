@@ -95,7 +95,7 @@ def test_a_path_that_stands_twice_in_a_url_is_no_unknown_model(url, reason):
 def test_a_finish_reason_that_says_so_names_the_server_that_broke_off(word):
     choice = {"message": {"content": "M\nI am"}, "finish_reason": word}
     found = judged("openai-chat", 200, {"choices": [choice]})
-    assert found.message == f"the server broke its answer off (finish reason {word})"
+    assert found.message == f"the server broke its reply off (finish reason {word})"
     assert (found.reading.finish_reason, found.delay_s) == (word, None)
 
 

@@ -46,7 +46,7 @@ async def test_the_delay_that_a_server_asks_for_is_slept_and_cannot_shorten_the_
 
 async def test_attempts_and_waits_count_against_the_deadline(make):
     client = make(error(503, "no room", retry_after="30"), deadline_s=100.0, timeout_s=60)
-    with pytest.raises(CallFailed, match=r"no answer within 100 s.*no room") as caught:
+    with pytest.raises(CallFailed, match=r"no reply within 100 s.*no room") as caught:
         await client.ask("prompt", slot())
     assert client.direct.transport.timeouts == pytest.approx([60, 60, 40, 10], abs=0.01)
     assert [attempt.outcome for attempt in caught.value.attempts] == ["overloaded"] * 4

@@ -68,13 +68,11 @@ def study_words(row: Row, trial: Trial) -> list[tuple[str, list[tuple[str, str]]
         for side, decisions in trial.by_side.items()
     }
     if len(words) == len(SIDES) and words["left"] == words["right"]:
-        return [("Both drivers were told", words["left"])] if words["left"] else []
+        return [("Both drivers read", words["left"])] if words["left"] else []
     if not any(words.values()):
         return []
     role = {row["focal"]: ", the ego,"}
-    return [
-        (f"The {side} driver{role.get(side, '')} was told", words.get(side, [])) for side in SIDES
-    ]
+    return [(f"The {side} driver{role.get(side, '')} read", words.get(side, [])) for side in SIDES]
 
 
 def summary(trial: Trial) -> list[str]:
