@@ -20,8 +20,8 @@ TOP = 2**31
 class NoisyObserver:
     """Noisy observer of one driver in one trial.
 
-    ``true_observation`` returns the noise-free observation at a step of the world. ``seed`` is that
-    of the driver's context: a slot has the same errors whoever drives.
+    ``true_observation`` returns the noise-free observation at a step of the world. ``seed`` comes
+    from the driver's context: a slot has the same errors whoever drives.
     """
 
     def __init__(

@@ -38,7 +38,7 @@ FROM sweeps SEMI JOIN subject USING (sweep_id)
 WHERE json_valid(config) AND sweep_id <> concat_ws(
     '-', name, config->>'$.model', strftime(started_at, '%Y%m%dT%H%M%S%f'));
 
--- Orphan rows of the whole database; the hash of a spec is that of its text.
+-- Orphan rows of the whole database; a spec's hash is the hash of its text.
 CREATE OR REPLACE TEMP VIEW orphans AS
 SELECT 'orphan' AS kind, trial_id, 'no sweep has this trial' AS text FROM trials
 ANTI JOIN sweep_trials USING (trial_id, spec_hash) WHERE source <> 'human'
@@ -122,12 +122,12 @@ FROM (
 -- answers a repetition, or a new sample set, with an old reply. Drivers of a study may make the same
 -- request in the same slot: that is no finding.
 CREATE OR REPLACE TEMP VIEW shared AS
-SELECT 'its call is also that of' AS text,
+SELECT 'shares its call with' AS text,
     list(DISTINCT (trial_id, side, decision) ORDER BY (trial_id, side, decision)) AS places,
     list(DISTINCT (trial_id, spec_hash)) AS trials
 FROM decisions JOIN trial_drivers USING (trial_id, spec_hash)
 WHERE call_key IS NOT NULL GROUP BY spec_hash, driver, call_key HAVING count(*) > 1
-UNION ALL SELECT 'its reply, with the provider''s id of it, is also that of',
+UNION ALL SELECT 'shares its reply, and the provider''s id of it, with',
     list(place ORDER BY place), list(DISTINCT trial)
 FROM (
     SELECT endpoint, model_requested, reply_id, min((trial_id, side, decision)) AS place,
@@ -194,8 +194,8 @@ FROM (SELECT count(*) AS stored FROM linked SEMI JOIN trials USING (trial_id, sp
     (SELECT count(DISTINCT reply_id) AS "reply ids"
     FROM reply_ids SEMI JOIN audited USING (trial_id, spec_hash));
 
--- Trials of a run that earlier runs played: those of the same name and drivers, which it resumes, or
--- those of other sweeps.
+-- Trials of a run that earlier runs played: runs of the same name and drivers, which it resumes, or
+-- other sweeps.
 CREATE OR REPLACE TEMP VIEW played_before AS
 SELECT DISTINCT trial_id, spec_hash, own.sweep_id, earlier.sweep_id AS earlier,
     earlier.started_at AS began_at,

@@ -69,7 +69,7 @@ SELECT count(*) AS decisions, count(*) FILTER (NOT valid) AS invalid,
 FROM decisions SEMI JOIN played USING (trial_id, spec_hash);
 
 -- First decisions without the closed loop. The velocity is the driver's minus the other's. The action
--- is the net acceleration over the first step, that of the fallback for an invalid reply. The share of
+-- is the net acceleration over the first step, for an invalid reply the fallback's. The share of
 -- M is that among replies with a tactical decision.
 CREATE OR REPLACE TEMP VIEW first_looks AS
 WITH asked AS (FROM played WHERE source = 'first_decision' AND status <> 'failed')

@@ -73,7 +73,7 @@ CREATE TABLE trials (
 COMMENT ON TABLE trials IS 'One row per trial. One trial_id may occur with two specs: join and '
     'group by (trial_id, spec_hash).';
 COMMENT ON COLUMN trials.trial_id IS 'drivers/variant/condition/repetition, then the sample set; '
-    'levels of factors follow; that of a first decision begins with seat/';
+    'levels of factors follow; a first decision''s begins with seat/';
 COMMENT ON COLUMN trials.spec_hash IS 'hash of all that determines the result, except condition '
     'and rep';
 COMMENT ON COLUMN trials.pair IS 'the human pair; NULL: no human trial';
@@ -318,7 +318,7 @@ FROM (
     FROM own GROUP BY ALL
 ) USING (trial_id, spec_hash)
 WHERE source <> 'human';
-COMMENT ON VIEW trial_levels IS 'One row per driven trial and factor: those of trial_factors '
+COMMENT ON VIEW trial_levels IS 'One row per driven trial and factor: factors of trial_factors '
     'without text factors, and model and prompt. A driver that meets an opponent is the model; a '
     'pair without an opponent is one model, the ego first.';
 

@@ -46,8 +46,8 @@ SELECT
     merge_point_m - least(along2, contact) AS merge_low_m,
     merge_point_m + least(along, across / sin1) AS merge_high_m
 FROM reaches;
-COMMENT ON VIEW geometry IS 'One row per spec: size of the vehicles (of human recordings, that of '
-    'the experiment), the track, and where the vehicles'' boxes overlap (collision.py).';
+COMMENT ON VIEW geometry IS 'One row per spec: size of the vehicles (for human recordings '
+    'as in the experiment), the track, and where the vehicles'' boxes overlap (collision.py).';
 COMMENT ON COLUMN geometry.length_m IS 'length of both vehicles';
 COMMENT ON COLUMN geometry.width_m IS 'width of both vehicles';
 COMMENT ON COLUMN geometry.merge_point_m IS 'distance at which the branches meet, along either';
@@ -158,7 +158,7 @@ FROM speed_deviations_in('vehicle_pairs', 'merge_times');
 COMMENT ON VIEW speed_deviations IS 'One row per finished trial and time_window: RMSE of each '
     'vehicle''s speed from its initial speed, from the start of control to the first merge, to '
     'both merges, to the end, or in the whole recording, tunnel included. A window ends with the '
-    'first sample at which it is over. A human''s initial speed is that of the condition.';
+    'first sample at which it is over. A human''s initial speed is the condition''s.';
 COMMENT ON COLUMN speed_deviations.time_window IS 'first_merge, both_merges, end, whole';
 COMMENT ON COLUMN speed_deviations.rmse_left_mps IS 'RMSE of the left vehicle''s speed in the window';
 COMMENT ON COLUMN speed_deviations.rmse_right_mps IS 'RMSE of the right vehicle''s speed in the window';
@@ -236,7 +236,7 @@ LEFT JOIN (FROM speed_deviations_in('pairs', 'times') WHERE time_window = 'first
 LEFT JOIN collision_times USING (trial_id, spec_hash)
 LEFT JOIN resolutions USING (trial_id, spec_hash);
 COMMENT ON VIEW trial_metrics IS 'One row per trial. A measure without a value is NULL: gaps, '
-    'speed deviations and joint are those of finished trials (arXiv 2604.09609, sec. II-G).';
+    'speed deviations and joint cover finished trials only (arXiv 2604.09609, sec. II-G).';
 COMMENT ON COLUMN trial_metrics.gap_m IS 'net gap, |s_left - s_right| less the vehicle length of '
     'the trial''s spec, when the first vehicle reaches the merge point, interpolated linearly '
     'within the step; finished trials';

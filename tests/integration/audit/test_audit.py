@@ -327,7 +327,7 @@ def test_one_id_of_two_answers_does_not_hide_one_answer_of_two_samples(db):
     found = audit("--db", db, "--sweep", sweep_of(db, PAIR))
     (finding,) = (one for one in found.findings if one["kind"] == "shared")
     assert finding["decision"] == 0
-    assert f"is also that of {PAIR}, left, decision 2" in finding["text"]
+    assert f"with {PAIR}, left, decision 2" in finding["text"]
     assert "2 replies of scripted-driver at " in found.notes
 
 
@@ -445,12 +445,12 @@ RECORDINGS = {
     "a reply was given to two samples": (
         lambda e: [answered(e[0], reply=e[1].attempts[-1].reply), *e[1:]],
         "exchanged shared",
-        "with the provider's id of it, is also that of N_0_0/rep01, left, decision 1",
+        "and the provider's id of it, with N_0_0/rep01, left, decision 1",
     ),
     "two prompts of one slot share a reply": (
         lambda e: [*e, asked_anew(e[0])],
         "exchanged shared",
-        "is also that of N_0_0/rep01, left, decision 0",
+        "with N_0_0/rep01, left, decision 0",
     ),
     "the id of a reply is half a surrogate pair": (
         lambda e: [renamed(e[0], "\ud800"), *e[1:]], "", "",

@@ -42,7 +42,7 @@ replay.charts = (scene, ribbons, seek) => {
       "chart-v",
       both(({ t, v }) => t.map((time, i) => [time, v[i]])),
     );
-    // A sample's acceleration is that of the step before it.
+    // A sample's acceleration covers the step before it.
     const steps = ({ t, a }) => t.slice(1).flatMap((time, i) => [t[i], time].map((edge) => [edge, a[i + 1]]));
     chart("chart-a", both(steps), trial.track.hardest, -trial.track.hardest);
     const headways = runs
