@@ -457,7 +457,7 @@ RECORDINGS = {
     ),
     "another model answered": (
         lambda e: [answered(e[0], model_served="gpt-0"), *e[1:]],
-        "served", "scripted-driver -> gpt-0: another model answered than was asked for (1 ans",
+        "served", "scripted-driver -> gpt-0: another model answered than was asked for (1 rep",
     ),
     "an attempt is gone": (
         lambda e: [answered(e[0], number=2), *e[1:]], "attempt", "its attempts are numbered [2]",
