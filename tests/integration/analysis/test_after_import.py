@@ -59,7 +59,7 @@ def test_a_row_of_humans_names_their_trials_and_the_published_outcomes(
 ):
     (human,) = explain(imported, after[name], row).sources
     assert len(human.trials) == trials
-    assert "those of 990 published outcomes" in human.text
+    assert "come from 990 published outcomes" in human.text
 
 
 def test_the_ceiling_of_humans_is_left_out_where_their_indicators_rest_on_both(after):

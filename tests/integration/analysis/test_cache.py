@@ -135,7 +135,7 @@ def test_what_cannot_be_kept_is_made_and_said_once(db, caplog):
     db.with_name(f"{db.name}.derived").mkdir()
     for _ in range(2):
         assert finished_tables(db, ["criticality"])
-    assert caplog.text.count("is not kept for the next time") == 1
+    assert caplog.text.count("is not cached for the next time") == 1
     assert db.read_bytes() == before
 
 

@@ -53,7 +53,7 @@ def test_a_note_is_a_line_beside_the_database_and_shown_on_its_trial_in_lists_an
     assert (line.pop("spec_hash"), line.pop("at")) > ("", "")
     told = {"reader": "anna", "trial_id": TRIAL, "side": "left", "decision": 2, "text": text}
     assert line.items() >= told.items()
-    assert [tag for _, _, tag in Notes(db).kept().tags] == ["late"]
+    assert [tag for _, _, tag in Notes(db).read().tags] == ["late"]
     assert db.read_bytes() == before
     assert Notes(db).path == db.with_name("study.notes.jsonl")
     pages = [f"/trials/{TRIAL}", "/notes", f"/trials/{OTHER}"]
@@ -140,7 +140,7 @@ def test_two_explorers_that_write_at_once_lose_nothing(tmp_path):
     db = tmp_path / "t.duckdb"
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         list(pool.map(_write, [db, db], ["anna", "ben"]))
-    kept = Notes(db).kept()
+    kept = Notes(db).read()
     assert kept.damage == ()
     assert sorted((note.reader, note.text.split()[0]) for note in kept.notes) == sorted(
         (reader, f"#t{number}") for reader in ("anna", "ben") for number in range(30)
