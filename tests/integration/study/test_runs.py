@@ -57,7 +57,7 @@ def test_a_study_of_several_is_checked_exported_and_recorded_alone(both, prepare
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("digest", "--study", "third.toml"), "holds no trial of the study third; it holds those"),
+        (("digest", "--study", "third.toml"), "holds no trial of the study third; its studies: "),
         (("audit", *OF_ONE, "--sweep", "x"), "leave one of them out"),
         (("recording", "export", "x.parquet", *OF_ONE, "--sweep", "x"), "leave one of them out"),
         (("audit", *OF_ONE, "--recording", "x.parquet"), "without --sweep, --study and --cache"),
