@@ -33,74 +33,73 @@ SHOWN, WEAKER, STRONGER, UNLIKE, OPEN = "shown", "weaker", "stronger", "unlike",
 DIFFERS = frozenset({WEAKER, STRONGER, UNLIKE})
 ENOUGH = 20  # trials with an outcome; fewer, or fewer than half of those that ended, say nothing
 TOO_FEW = (
-    "Too few trials without a collision for a verdict "
-    f"(at least {ENOUGH}, and half of all, are needed)"
+    f"Too few trials without a crash for a verdict (at least {ENOUGH}, and half of all, are needed)"
 )
 ALPHA = 0.05  # of all tests; importing it would load pandas, which no page needs
-# So far from humans, in points and in m, a driver still is like them.
+# So far from people, in points and in m, a driver still is like them.
 MARGINS = {"collisions": 5.0, "gap": 1.0}
-# States in words, on every page and in every table for humans; of MARGINS with a direction.
+# States in words, on every page and in every table for people; of MARGINS with a direction.
 VERDICTS = {
-    SHOWN: "like humans",
-    WEAKER: "less than humans'",
-    STRONGER: "more than humans'",
-    UNLIKE: "unlike humans'",
+    SHOWN: "like people",
+    WEAKER: "less than people's",
+    STRONGER: "more than people's",
+    UNLIKE: "unlike people's",
     OPEN: "cannot tell",
 }
 DIRECTIONS = {
-    "collisions": {WEAKER: "fewer than humans'", STRONGER: "more than humans'"},
-    "gap": {WEAKER: "smaller than humans'", STRONGER: "larger than humans'"},
+    "collisions": {WEAKER: "fewer than people's", STRONGER: "more than people's"},
+    "gap": {WEAKER: "smaller than people's", STRONGER: "larger than people's"},
 }
 # The rule of a verdict, a line a state; ``{tests}`` is the number of a driver's tests, if known.
 VERDICT_RULES = (
-    "Like humans in collisions or gap: the whole interval of the difference lies within 5 points, "
+    "Like people in crashes or gap: the whole interval of the difference lies within 5 points, "
     "or 1 m",
-    "Like humans in who goes first: the one ahead or, side by side, the slower one goes first more "
-    "often, with p below .05 in a logistic regression (Firth) over all trials without a collision, "
-    "not by the counts shown",
+    "Like people in who goes first: the one ahead or, side by side, the slower one goes first more "
+    "often, with p below .05 in a logistic regression (Firth) over all trials without a crash, not "
+    "by the counts shown",
     "Fewer, more, smaller, larger, unlike: a difference is shown, with p below .05, corrected "
     "(Holm) for a driver's {tests}tests",
     f"Cannot tell: neither is shown. No verdict: fewer than {ENOUGH} trials are counted, or fewer "
     "than half of those that ended",
 )
 FITTED_RULE = (
-    "Like humans in the gap by headway: more headway, more gap, with p below .05 in a linear "
+    "Like people in the gap by headway: more headway, more gap, with p below .05 in a linear "
     "regression; by relative velocity: it moves the gap by less than 1 m; in accelerations held: "
-    "within half a standard deviation of humans"
+    "within half a standard deviation of people"
 )
 VERDICT_RULE = ". ".join((*VERDICT_RULES, FITTED_RULE)).format(tests="")
 # Measures that the first page shows, with its headings.
 HEADINGS = {
-    "collisions": "Collisions",
+    "collisions": "Crashes",
     "headway": "The one ahead goes first",
     "velocity": "Side by side, the slower goes first",
     "gap": "Gap at the merge point",
 }
-# What drivers that are like humans do in them, and what there is no verdict on.
+# What drivers that are like people do in them, and what there is no verdict on.
 LIKENESS = {
-    "collisions": ("collide as often as humans", "collisions"),
-    "headway": ("let the one ahead go first, as humans do", "who goes first with one ahead"),
-    "velocity": ("let the slower go first side by side, as humans do",
+    "collisions": ("crash as often as people", "crashes"),
+    "headway": ("let the one ahead go first, as people do", "who goes first with one ahead"),
+    "velocity": ("let the slower go first side by side, as people do",
                  "who goes first side by side"),
-    "gap": ("leave gaps like humans'", "the gap"),
+    "gap": ("leave gaps like people's", "the gap"),
 }  # fmt: skip
 # Names of metrics in sentences and pages; others keep the label of the table.
 METRIC_NAMES = {
     LEFT_FIRST.name: "goes first",
-    COLLISIONS.name: "collisions",
+    COLLISIONS.name: "crashes",
     GAP.name: "gap at the merge point",
     RMSE.name: "deviation from the initial speed",
-    BOXES.name: "collisions by the human rule",
+    BOXES.name: "crashes by people's rule",
     JOINT.name: "both change their speed by 0.5 m/s or more",
     COST.name: "cost of a trial",
 }
 # A change of the measure, as a claim names it; others are called as above.
 CHANGED = {
     LEFT_FIRST.name: "who goes first",
-    COLLISIONS.name: "how many trials end in a collision",
+    COLLISIONS.name: "how many trials end in a crash",
     GAP.name: "the gap at the merge point",
     RMSE.name: "the deviation from the initial speed",
-    BOXES.name: "how many trials end in a collision by the human rule",
+    BOXES.name: "how many trials end in a crash by people's rule",
     JOINT.name: "how often both change their speed",
     VALID.name: "how many replies are valid",
     COST.name: "the cost of a trial",
@@ -130,7 +129,7 @@ COMPARED = {
 # The collision rules that trials may be played by, as sentences name them, and their meaning.
 PLAYED_RULES = {
     "euclid2d": "the paper's rule",
-    "rectangle": "the human rule",
+    "rectangle": "people's rule",
     "shared_lane": "the rule of the shared lane",
 }
 RULES_MEAN = {
@@ -170,11 +169,11 @@ class Why(Enum):
     """Remarks on numbers, such as why one is missing, with placeholders for values."""
 
     # Fits; ``s`` makes a plural of the first value.
-    NO_FIRST = "no trial in which one went first without a collision"
+    NO_FIRST = "no trial in which one went first without a crash"
     NO_GAP = "no trial with a gap"
     FEW_FIRST = (
-        "{} trial{s} in which one went first without a collision: too few, or in too few "
-        "situations, to estimate effects of headway and speed"
+        "{} trial{s} in which one went first without a crash: too few, or in too few situations, "
+        "to estimate effects of headway and speed"
     )
     FEW_GAPS = (
         "{} trial{s} with a gap: too few, or in too few situations, to estimate effects of headway "
@@ -212,9 +211,9 @@ class Why(Enum):
         "and {} %"
     )
     UNDECIDED_BOXES = (
-        "by the human rule {0} to {1} of {2} trials collided: {0} surely did, and of {3} that "
-        "another collision rule ended it is not known. A study played by the human rule "
-        '(collision_rule = "rectangle") decides them'
+        "by people's rule {0} to {1} of {2} trials crashed: {0} surely did, and of {3} that "
+        "another crash rule ended it is not known. A study played by people's rule (collision_rule "
+        '= "rectangle") decides them'
     )
     # Comparisons with humans.
     OF_HUMANS = "humans: {}"
@@ -260,7 +259,7 @@ class Measure:
     ``trait`` names what humans do, ``label`` and ``unit`` head a column, ``rests_on`` is the column
     in which its trials have a value, or "finished", and ``rule`` says how its state is set.
     ``difference`` is a template of the headline, with the fields ``it`` (the driver's name),
-    ``driver`` and ``humans``: counts of trials, or values with their intervals. ``says`` has by
+    ``driver`` and ``people``: counts of trials, or values with their intervals. ``says`` has by
     state the driver's part of a sentence, with ``of``, ``humans`` and ``more`` or less. ``ends``
     are the limits of its axis. A driver is alike if it differs from the humans by less than
     ``margin``.
@@ -288,13 +287,13 @@ MEASURES = {
             "log-odds per m",
             LEFT_FIRST.column,
             "Firth's fit: above 0, likelihood-ratio test at 5 %",
-            "with {it} the one ahead went first in {driver} trials, with humans in {people}",
+            "with {it} the one ahead went first in {driver} trials, with people in {people}",
             (-0.25, 2.5),
             {
-                SHOWN: "the one ahead goes first, as with humans",
-                WEAKER: "who goes first depends less on who is ahead than with humans",
-                STRONGER: "who goes first depends more on who is ahead than with humans",
-                UNLIKE: "who is ahead does not decide who goes first, as it does with humans",
+                SHOWN: "the one ahead goes first, as with people",
+                WEAKER: "who goes first depends less on who is ahead than with people",
+                STRONGER: "who goes first depends more on who is ahead than with people",
+                UNLIKE: "who is ahead does not decide who goes first, as it does with people",
             },
         ),
         Measure(
@@ -304,24 +303,24 @@ MEASURES = {
             "log-odds per m/s",
             LEFT_FIRST.column,
             "Firth's fit: below 0, likelihood-ratio test at 5 %",
-            "with {it} the slower one went first in {driver} trials side by side, with humans in "
+            "with {it} the slower one went first in {driver} trials side by side, with people in "
             "{people}",
             (-6.5, 3.0),
             {
-                SHOWN: "the faster one yields, as with humans",
-                WEAKER: "who goes first depends less on who is slower than with humans",
-                STRONGER: "who goes first depends more on who is slower than with humans",
-                UNLIKE: "the faster one does not yield, as it does with humans",
+                SHOWN: "the faster one yields, as with people",
+                WEAKER: "who goes first depends less on who is slower than with people",
+                STRONGER: "who goes first depends more on who is slower than with people",
+                UNLIKE: "the faster one does not yield, as it does with people",
             },
         ),
         Measure(
             "collisions",
-            "Collisions by the human rule",
-            "collisions",
+            "Crashes by people's rule",
+            "crashes",
             "% of trials",
             BOXES.column,
             "difference within 5 points by its interval; else corrected p below .05",
-            "{it} collided in {driver} trials, humans in {people}",
+            "{it} crashed in {driver} trials, people in {people}",
             (0.0, 30.0),
         ),
         Measure(
@@ -331,12 +330,12 @@ MEASURES = {
             "m",
             GAP.column,
             "difference within 1 m by its interval; else corrected p below .05",
-            "{it} left a gap of {driver} m, humans of {people} m",
+            "{it} left a gap of {driver} m, people of {people} m",
             (0.0, 8.0),
             {
-                SHOWN: "leaves a gap of {of} m, like humans ({humans} m)",
-                WEAKER: "leaves a gap of {of} m, smaller than humans ({humans} m)",
-                STRONGER: "leaves a gap of {of} m, larger than humans ({humans} m)",
+                SHOWN: "leaves a gap of {of} m, like people ({humans} m)",
+                WEAKER: "leaves a gap of {of} m, smaller than people ({humans} m)",
+                STRONGER: "leaves a gap of {of} m, larger than people ({humans} m)",
             },
         ),
         Measure(
@@ -346,12 +345,12 @@ MEASURES = {
             "m per m",
             GAP.column,
             "HC3 errors: above 0 at 5 %",
-            "with {it} each metre of headway adds {driver} m to the gap, with humans {people} m",
+            "with {it} each metre of headway adds {driver} m to the gap, with people {people} m",
             (-0.6, 1.0),
             {
-                WEAKER: "each metre of headway adds less to its gap than to humans'",
-                STRONGER: "each metre of headway adds more to its gap than to humans'",
-                UNLIKE: "headway does not add to its gap as to humans'",
+                WEAKER: "each metre of headway adds less to its gap than to people's",
+                STRONGER: "each metre of headway adds more to its gap than to people's",
+                UNLIKE: "headway does not add to its gap as to people's",
             },
         ),
         Measure(
@@ -361,8 +360,8 @@ MEASURES = {
             "m at most",
             GAP.column,
             "HC3 errors: largest difference of predicted gaps within 1 m, two one-sided tests at "
-            "5 %; not as with humans: corrected p of being within below .05",
-            "with {it} who is faster moves the gap by up to {driver} m, with humans by {people} m",
+            "5 %; not as with people: corrected p of being within below .05",
+            "with {it} who is faster moves the gap by up to {driver} m, with people by {people} m",
             (0.0, 3.0),
             {UNLIKE: "who is faster moves its gap by {of} m"},
             margin=1.0,
@@ -373,11 +372,11 @@ MEASURES = {
             "accelerations held",
             "SD from humans",
             "finished",
-            "within 0.5 SD, two one-sided tests at 5 %; not as with humans: corrected p of being "
+            "within 0.5 SD, two one-sided tests at 5 %; not as with people: corrected p of being "
             "within below .05",
-            "{it} holds its accelerations otherwise than humans do, by {driver} of their SD",
+            "{it} holds its accelerations otherwise than people do, by {driver} of their SD",
             (-2.0, 3.0),
-            {UNLIKE: "holds accelerations {more} than humans"},
+            {UNLIKE: "holds accelerations {more} than people"},
             margin=0.5,
         ),
     )
@@ -424,7 +423,7 @@ def _models(drivers: Mapping[str, Mapping[str, Values]]) -> dict[str, Mapping[st
 
 
 def sentence(verdicts: Mapping[str, Values]) -> str:
-    """Return a few sentences that compare a driver with humans: collisions, then measures."""
+    """Return a few sentences that compare a driver with people: crashes, then measures."""
     if "" in verdicts:
         return f"{capital(verdicts['']['note'])}."
     parts = [crashes(verdicts["collisions"]), *map(_part, verdicts.values())]
@@ -436,7 +435,7 @@ def sentence(verdicts: Mapping[str, Values]) -> str:
     if unclear:
         parts.append(f"cannot tell: {'; '.join(unclear)}")
     text = ". ".join(capital(part) for part in parts if part)
-    return f"{text or 'Nothing can be compared with humans'}."
+    return f"{text or 'Nothing can be compared with people'}."
 
 
 def _part(values: Values) -> str:
@@ -447,7 +446,7 @@ def _part(values: Values) -> str:
     says = says.format(of=of, humans=humans, more=_more(values))
     if not (says and counted and people):
         return says
-    return f"{says} ({FIRST[str(values['measure'])]} in {counted} trials, humans in {people})"
+    return f"{says} ({FIRST[str(values['measure'])]} in {counted} trials, people in {people})"
 
 
 def _more(values: Values) -> str:
@@ -457,28 +456,28 @@ def _more(values: Values) -> str:
 
 
 def crashes(values: Values) -> str:
-    """Return the collisions by the rule that was played, then by the humans' where they differ.
+    """Return the crashes by the rule that was played, then by the humans' where they differ.
 
-    ``collided in 15 of 22 trials; humans in 28 of 990``, or empty where no trial ended.
+    ``crashed in 15 of 22 trials; people in 28 of 990``, or empty where no trial ended.
     """
     k, undecided = values.get("k") or 0, values.get("undecided") or 0
     ended = (values["n"] or 0) + undecided
     if not ended:
         return ""
     seen = values.get("counted") or f"{k} of {ended}"
-    text = f"collided in {seen} trials"
+    text = f"crashed in {seen} trials"
     if undecided:
         rule = values.get("counted_by") or PLAYED_RULES["shared_lane"]
-        text += f" by {rule}, in {k} to {k + undecided} by the human rule"
+        text += f" by {rule}, in {k} to {k + undecided} by people's rule"
     people = values.get("human_counted")
     if shown_state(values) in DIFFERS:
         than = f" ({people})" if people else ""
-        return f"{text}, {_more(values)} often than humans{than}"
-    return f"{text}; humans in {people}" if people else text
+        return f"{text}, {_more(values)} often than people{than}"
+    return f"{text}; people in {people}" if people else text
 
 
 def crash_text(rules: Sequence[tuple[str, Sequence[float]]]) -> str:
-    """Return the meaning of a collision by the rules that were played, with their steps."""
+    """Return the meaning of a crash by the collision rules that were played, with their steps."""
     return " or, by the scenario of the trial, ".join(
         f"{RULES_MEAN[rule]}, checked every {' or '.join(map('{:g}'.format, steps_s))} s"
         f"{'' if rule == 'rectangle' else f' ({PLAYED_RULES[rule]})'}"
@@ -494,9 +493,8 @@ def _percent(collisions: Values, count: int) -> float:
 def apart(driver: str, other: str, rows: Mapping[str, Values], *, of_left: bool) -> tuple[str, str]:
     """Return the headline of a driver less another, and other differences, of rows by their metric.
 
-    ``A collided in 12 of 110 trials, B in 33 of 110. In the same situations A collided less often,
-    by 19.09 points [8.41, 29.78]; corrected p = 0.004.``
-    Who goes first is said ``of_left`` vehicles.
+    ``A crashed in 12 of 110 trials, B in 33 of 110. In the same situations A crashed less often, by
+    19.09 points [8.41, 29.78]; corrected p = 0.004.`` Who goes first is said ``of_left`` vehicles.
     """
     crashed = rows.get(COLLISIONS.name, {})
     others = _others(driver, other, rows, of_left=of_left)
@@ -504,7 +502,7 @@ def apart(driver: str, other: str, rows: Mapping[str, Values], *, of_left: bool)
     if any(count is None for count in counts):
         return f"{driver} against {other}.", others
     k, n, k_other, n_other = counts
-    claim = f"{driver} collided in {k} of {n} trials, {other} in {k_other} of {n_other}"
+    claim = f"{driver} crashed in {k} of {n} trials, {other} in {k_other} of {n_other}"
     difference, p, ci = (crashed.get(name) for name in ("difference", "p_corrected", "ci"))
     if min(n or 0, n_other or 0) < ENOUGH:
         return f"{claim}: too few to say more.", ""
@@ -518,12 +516,12 @@ def apart(driver: str, other: str, rows: Mapping[str, Values], *, of_left: bool)
     ends = ci and sorted(end if difference > 0 else -end for end in ci)
     result = f"{number(abs(difference))} points {brackets(ends)}".rstrip()
     often = "more" if difference > 0 else "less"
-    same = f"In the same situations {driver} collided {often} often, by {result}"
+    same = f"In the same situations {driver} crashed {often} often, by {result}"
     return f"{claim}. {same}; {corrected}.", others
 
 
 def _others(driver: str, other: str, rows: Mapping[str, Values], *, of_left: bool) -> str:
-    """Return the other measures than collisions: those shown to differ, and the rest."""
+    """Return the measures besides crashes in which a driver is shown to differ, and the others."""
     shown, unshown = [], []
     for name, (more, less, what) in COMPARED.items():
         is_unasked = name == (LEFT_FIRST.name if of_left else LEFT_GOES_FIRST)
@@ -559,7 +557,7 @@ def _suffice(trials: int, ended: int) -> bool:
 def shown_state(values: Values) -> str:
     """Return a state as sentences and marks show it: too few trials are inconclusive.
 
-    One of MARGINS within which a difference surely lies is like humans', else it has a direction.
+    One of MARGINS within which a difference surely lies is like people's, else it has a direction.
     """
     state = str(values.get("state") or "")
     if state and not _suffice(values.get("n") or 0, values.get("ended") or 0):
@@ -572,7 +570,7 @@ def shown_state(values: Values) -> str:
 
 
 def _is_within(values: Values) -> bool:
-    """Return whether the interval of collisions or of a gap is within MARGINS of humans'."""
+    """Return whether the interval of crashes or of a gap is within MARGINS of people's."""
     margin, ci = MARGINS.get(str(values.get("measure"))), values.get("difference_ci")
     return margin is not None and ci is not None and max(-ci[0], ci[1]) <= margin
 
@@ -583,7 +581,7 @@ def differs(values: Values) -> bool:
 
 
 def headline(drivers: Mapping[str, Mapping[str, Values]]) -> tuple[str, str]:
-    """Return how drivers compare with humans: the claim, and what else is seen at once.
+    """Return how drivers compare with people: the claim, and what else is seen at once.
 
     It is of the language models that are judged or, without one, of all ``drivers``, by name.
     Drivers with too few outcomes get only counts.
@@ -593,7 +591,7 @@ def headline(drivers: Mapping[str, Mapping[str, Values]]) -> tuple[str, str]:
         return _without_models(drivers)
     compared = {name: of for name, of in models.items() if any(v.get("state") for v in of.values())}
     if not compared:
-        return "No language model can be compared with humans yet.", ""
+        return "No language model can be compared with people yet.", ""
     enough = {name: of for name, of in compared.items() if _enough(of)}
     few = {name: of for name, of in compared.items() if name not in enough}
     too_few = [_too_few(few, alone=len(models) == 1)] if few else []
@@ -605,7 +603,7 @@ def headline(drivers: Mapping[str, Mapping[str, Values]]) -> tuple[str, str]:
 
 
 def _without_models(drivers: Mapping[str, Mapping[str, Values]]) -> tuple[str, str]:
-    """Return how many drivers are like humans in each measure, and the extremes of several."""
+    """Return how many drivers are like people in each measure, and the extremes of several."""
     kinds = {_kind(of) for of in drivers.values()}
     who = f"No language model {'is judged' if LANGUAGE_MODEL in kinds else 'drove'} here."
     compared = {name: of for name, of in drivers.items() if "" not in of}
@@ -624,13 +622,13 @@ def _tally(drivers: Sequence[Mapping[str, Values]]) -> str:
             who = " drivers" * (not like)
             like.append(f"{states.count(SHOWN) or 'none'} of {len(drivers)}{who} {does}")
     if not like:
-        return f"For {len(drivers)} drivers no verdict on likeness to humans is possible."
+        return f"For {len(drivers)} drivers no verdict on likeness to people is possible."
     rest = f" No verdict is possible on {joined(unclear)}." if unclear else ""
     return f"{capital('; '.join(like))}.{rest}"
 
 
 def _extremes(drivers: Mapping[str, Mapping[str, Values]]) -> str:
-    """Return the fewest and most collisions, and the smallest and largest gap, of many drivers."""
+    """Return the fewest and most crashes, and the smallest and largest gap, of many drivers."""
     crashed, gaps = {}, {}
     for name, of in drivers.items():
         if counted := of.get("collisions", {}).get("counted"):
@@ -640,7 +638,7 @@ def _extremes(drivers: Mapping[str, Mapping[str, Values]]) -> str:
             gaps[f"{number(gap)} m ({name})"] = gap
     parts = [
         f"{what} from {min(of, key=lambda text: of[text])} to {max(of, key=lambda text: of[text])}"
-        for what, of in (("collisions range", crashed), ("mean gaps", gaps))
+        for what, of in (("crashes range", crashed), ("mean gaps", gaps))
         if len(of) > FEW and len({*of.values()}) > 1
     ]
     return f"{capital(', '.join(parts))}." if parts else ""
@@ -656,16 +654,16 @@ def _likeness(drivers: Mapping[str, Mapping[str, Values]], *, every: bool) -> tu
     ]
     alike = [name for name in drivers if name not in unlike]
     if not unlike:
-        return f"No difference from humans is shown for {joined(alike)}.", " ".join(untold)
+        return f"No difference from people is shown for {joined(alike)}.", " ".join(untold)
     name = min(unlike, key=lambda name: _seen_first(unlike[name][0]))
     worst = unlike[name][0]
     if len(drivers) == 1 or alike:
-        claim = f"{name} differs from humans: {difference_sentence(worst, 'it')}."
+        claim = f"{name} differs from people: {difference_sentence(worst, 'it')}."
     else:
         who = "All language models here" if every else joined([*drivers])
-        claim = f"{who} differ from humans: {difference_sentence(worst, name)}."
+        claim = f"{who} differ from people: {difference_sentence(worst, name)}."
     if alike:
-        untold.insert(0, f"No difference from humans is shown for {joined(alike)}.")
+        untold.insert(0, f"No difference from people is shown for {joined(alike)}.")
     return claim, " ".join(untold)
 
 
@@ -706,7 +704,7 @@ def _enough(verdicts: Mapping[str, Values]) -> bool:
 
 
 def _too_few(drivers: Mapping[str, Mapping[str, Values]], *, alone: bool) -> str:
-    """Return how many trials of each driver had no collision, of those that ended."""
+    """Return how many trials of each driver had no crash, of those that ended."""
     counts = [
         f"{'' if alone else name} {_finished(of)} of {_ended(of['collisions'])}".strip()
         for name, of in drivers.items()
@@ -715,7 +713,7 @@ def _too_few(drivers: Mapping[str, Mapping[str, Values]], *, alone: bool) -> str
 
 
 def difference_sentence(values: Values, it: str) -> str:
-    """Return a difference as ``it collided in 24 of 110 trials, humans in 28 of 990``.
+    """Return a difference as ``it crashed in 24 of 110 trials, people in 28 of 990``.
 
     Without counts of who goes first it is the sentence part of the state. A driver's interval
     beside a margin has the level of its row, which is named if not 95 %.
@@ -772,7 +770,7 @@ def verdict_word(values: Values) -> str:
     n = values.get("n") or 0
     is_few = values.get("state") and not _suffice(n, values.get("ended") or 0)
     if is_few and not values.get("undecided"):
-        return f"fewer than {ENOUGH} trials" if n < ENOUGH else "too few without a collision"
+        return f"fewer than {ENOUGH} trials" if n < ENOUGH else "too few without a crash"
     words = VERDICTS | DIRECTIONS.get(str(values.get("measure")), {})
     return words.get(shown_state(values), "not compared")
 

@@ -34,7 +34,7 @@ def levels(study: StudyResults) -> Table:
             Optional("value", metric.heading, "number", metric.meaning),
             interval("ci", f"of {metric.heading}"),
             Optional("repeated", "repeated", "count", "trials that repeat another one, left out"),
-            Column("crashed", "collided", "count", COLLISIONS.meaning, COLLISIONS.column,
+            Column("crashed", "crashed", "count", COLLISIONS.meaning, COLLISIONS.column,
                    rests_on=COLLISIONS.column),
             Column("ended", "of", "count", "trials that ended", rests_on=ENDED),
             Optional("gap_m", GAP.heading, "number", GAP.meaning, rests_on=GAP.column),

@@ -40,7 +40,7 @@ def _of_trials(table: Table, study: StudyResults) -> Iterator[str]:
     if study.selection.without_fallbacks:
         yield (
             "trials in which a decision had a fallback are left out (--without-fallbacks): long "
-            "ones more often than those that a collision ended early, so that collision rates rise"
+            "ones more often than those that a crash ended early, so that shares of crashes rise"
         )
     driven = [group for group in groups if group.setting]
     if driven and not study.file:

@@ -149,7 +149,7 @@ def trials_of(driver: Driver, scope: Scope) -> TrialsOf:
         field, more = named.get(what, ("trials", {}))
         if facts.get(field) == count:
             return every | more
-        # A finished trial has a gap, and an ended one is in the row of collisions.
+        # A finished trial has a gap, and an ended one is in the row of crashes.
         for cell in driver.cells.values():
             if what[:2] != "k " and cell.values["n"] == count and cell.measure.name == "gap":
                 return {"cell": f"verdicts/{cell.values['row']}:n", **scope.part}

@@ -20,7 +20,7 @@ USED = (
     ("p, corrected", "corrected p", "corrected"),
     ("prompt, Baseline", "prompt variant", "prompt"),
     ("ahead, side by side, headway", "projected headway", "ahead|side by side|headway"),
-    ("collision", "collision", "collision|collided"),
+    ("crash", "collision", "crash"),
     ("valid reply, plan", "plan", "valid|plan"),
     ("gap at the merge point", "gap", r"\bgap\b"),
     ("deviation from the initial speed", "RMSE", "initial speed"),

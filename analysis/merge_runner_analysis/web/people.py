@@ -1,4 +1,4 @@
-"""Likeness to humans in raw counts, as the verdicts have it: on the first page of a study."""
+"""Likeness to people in raw counts, as the verdicts have it: on the first page of a study."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ MARKS = {SHOWN: "●", STRONGER: "▲", WEAKER: "▼", UNLIKE: "✕", OPEN: "○
 
 # Notes on measures that no situation allows.
 UNPOSED = {
-    "headway": "In none of the situations that humans drove, too, would one driver be ahead",
-    "velocity": "In none of the situations that humans drove, too, are both side by side at "
+    "headway": "In none of the situations that people drove, too, would one driver be ahead",
+    "velocity": "In none of the situations that people drove, too, are both side by side at "
     "different speeds",
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Likeness:
-    """One measure of a driver beside humans: a mark with its word, and what was counted.
+    """One measure of a driver beside people's: a mark with its word, and what was counted.
 
     A count has ``k`` and ``n``, any other value a ``text``; ``row`` is the verdict's row.
     """
@@ -65,9 +65,9 @@ def counted(driver: Driver) -> int | None:
 
 
 def could_see(drivers: Sequence[Driver], short: Mapping[str, str]) -> str:
-    """Return the least differences from humans with 80 % power; empty without any."""
+    """Return the least differences from people with 80 % power; empty without any."""
     parts, unknown = [], ""
-    for name, unit in {"collisions": "points in collisions", "gap": "m in the gap"}.items():
+    for name, unit in {"collisions": "points in crashes", "gap": "m in the gap"}.items():
         values = [(short[of.name], of.cells[name].values) for of in drivers if name in of.cells]
         sizes = {
             driver: of["detectable"] for driver, of in values if of.get("detectable") is not None
@@ -81,12 +81,12 @@ def could_see(drivers: Sequence[Driver], short: Mapping[str, str]) -> str:
             ]
             parts.append(f"{' to '.join(shown)} {unit}")
         elif any(of.get("undecided") for _, of in values):
-            unknown = "; in collisions unknown, as another collision rule ended some trials"
+            unknown = "; in crashes unknown, as another crash rule ended some trials"
     return unbroken(", ".join(parts)) + unknown * bool(parts)
 
 
 def verdict_rules(drivers: Sequence[Driver], gap: Mapping[str, Any]) -> list[str]:
-    """Return the rule of a verdict, a line a state; ``gap`` is humans' value."""
+    """Return the rule of a verdict, a line a state; ``gap`` is people's value."""
     tests = {sum(c.values.get("p_holm") is not None for c in of.cells.values()) for of in drivers}
     numbers = " to ".join(map(str, dict.fromkeys((min(tests, default=0), max(tests, default=0)))))
     likeness, *others = (rule.format(tests=f"{numbers} ") for rule in VERDICT_RULES)
@@ -94,7 +94,7 @@ def verdict_rules(drivers: Sequence[Driver], gap: Mapping[str, Any]) -> list[str
         half = (ends[1] - ends[0]) / 2
         if half > MARGINS["gap"] / 2:
             likeness += (
-                f" (humans' gap is known to ± {number(half)} m, by nine pairs: more trials hardly "
+                f" (people's gap is known to ± {number(half)} m, by nine pairs: more trials hardly "
                 "help)"
             )
     return [likeness, *others]
@@ -107,11 +107,9 @@ def _likeness(cell: Cell) -> Likeness:
     if counted:
         k, n = map(int, str(counted).split(" of "))
         share = f"{number(100 * k / n)} %"
-        if undecided := values.get("undecided"):  # it is not by the human rule
+        if undecided := values.get("undecided"):  # it is not by people's rule
             surely = values["k"] or 0
-            share += (
-                f" by {values['counted_by']}; {surely} to {surely + undecided} by the human rule"
-            )
+            share += f" by {values['counted_by']}; {surely} to {surely + undecided} by people's"
         return Likeness(mark, word, k, n, unbroken(share), row)
     estimate = values.get("estimate")
     known = cell.measure.name == "gap" and estimate is not None
@@ -123,7 +121,7 @@ def _likeness(cell: Cell) -> Likeness:
 
 
 def people_of(conditions: Mapping[str, Any], human: Mapping[str, Any]) -> dict[str, str]:
-    """Return humans' results in these conditions, by measure: k of n, share, 95 % interval."""
+    """Return people's results in these conditions, by measure: k of n, share, 95 % interval."""
     rows = [
         (HUMAN_CONDITIONS[name], cell)
         for name, cell in zip(conditions["names"], conditions["humans"], strict=True)

@@ -11,6 +11,7 @@ from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 UNKNOWN = "no meaning is known here"
 # Stored names in the words of a page; other names are shown as they are.
 PLAIN = {
+    "collided": "crashed",
     "timeout": "timed out",
     "no action": "neither acted",
     "one too little": "one braked too little, too late",
@@ -18,7 +19,8 @@ PLAIN = {
     "fallbacks": "some without a plan",
     "no decision": "nobody decided",
     "mocks": "mock models",
-    "human": "humans",
+    "human": "people",
+    "humans": "people",
     "decision: missing": "no decision in the reply",
     "no_array": "no plan in the reply",
     "several_arrays": "several plans in the reply",

@@ -310,7 +310,7 @@ def _both(row: Row, driver: str) -> str:
     of, reference = (estimate_text(row, name) for name in ("estimate", "estimate_reference"))
     if metric_of(row) == LEFT_FIRST.name:
         return (
-            f"in the same situations and without a collision, {driver} goes first in {of} with "
+            f"in the same situations and without a crash, {driver} goes first in {of} with "
             f"{factor}={level} and in {reference} with {factor}={_called(factor, base)}"
         )
     return f"{of} with {factor}={level}, {reference} with {factor}={_called(factor, base)}"
@@ -403,7 +403,7 @@ def _crossing_of(levels: Sequence[Row]) -> str:
 
 
 def _counted(levels: Sequence[Row], metric: str, effects: Sequence[Row]) -> str:
-    """Return how many trials the measure counts: ``58 trials without a collision, 12 with one``.
+    """Return how many trials the measure counts, as in ``58 trials without a crash, 12 with one``.
 
     Trials of equal drivers, words and course are one: ``80 identical to another one are left out``,
     with the levels that change nothing.
@@ -416,7 +416,7 @@ def _counted(levels: Sequence[Row], metric: str, effects: Sequence[Row]) -> str:
     crashed = sum(count_of(row, "crashed") for row in levels)
     what = " that ended" if metric == COLLISIONS.name else " that count"
     if metric == LEFT_FIRST.name:
-        what = f" without a collision, {crashed:,} with one" if crashed else " without a collision"
+        what = f" without a crash, {crashed:,} with one" if crashed else " without a crash"
     return f"{trials}{what}{left_out}"
 
 

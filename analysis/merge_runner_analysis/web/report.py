@@ -293,7 +293,7 @@ def alarms(study: StudyResults, origin: Provenance) -> dict[str, tuple[list[str]
 
 
 def crashes(study: StudyResults) -> dict[str, dict[str, int]]:
-    """Return the number of collisions of each driver and prompt by cause, the most first."""
+    """Return the number of crashes of each driver and prompt by cause, the most first."""
     with read_database(study.db) as connection:
         causes = {(name, spec): cause for name, spec, cause in judged_collisions(connection)}
     counted: dict[str, dict[str, int]] = {}

@@ -70,8 +70,7 @@ def judged_by(page, shape):
 def test_from_the_study_to_a_verdict_and_to_why_the_worst_condition_collides_and_a_note(page, db):
     page.goto("/")
     words = (
-        "Too few trials without a collision for a verdict "
-        "(at least 20, and half of all, are needed): "
+        "Too few trials without a crash for a verdict (at least 20, and half of all, are needed): "
     )
     expect(page.locator(".answer")).to_contain_text(words, timeout=2000 * HANGS_S)
     page.locator("#answers").get_by_role("rowheader", name="smollm2").get_by_role(
@@ -94,7 +93,7 @@ def test_from_the_study_to_a_verdict_and_to_why_the_worst_condition_collides_and
     row = page.locator("#collisions").get_by_role("row", name="smollm2")
     row.get_by_role("link").nth(3).click()
     page.locator(".of-trials tbody a").first.click()
-    account = page.locator("details", has_text="Why it collided")
+    account = page.locator("details", has_text="Why it crashed")
     expect(account).to_contain_text("could still have avoided it")
     page.locator("#moments").get_by_role("button", name="last moment to").first.click()
     expect(page.locator("#panel blockquote, #panel pre").first).to_be_visible()
@@ -128,7 +127,7 @@ def test_from_a_filtered_list_to_a_collision_its_words_and_back(page):
     expect(page.locator("#search")).to_be_focused()
     page.get_by_label("outcome").focus()
     page.get_by_label("outcome").select_option("collided")
-    expect(page.locator(".totals")).to_contain_text("smollm2: 2, 2 collided")
+    expect(page.locator(".totals")).to_contain_text("smollm2: 2, 2 crashed")
     expect(page.get_by_label("outcome")).to_be_focused()
     expect(page).to_have_url(re.compile("q=n_0_0.*outcome=collided"))
     page.reload()
@@ -315,7 +314,7 @@ def test_another_trial_is_found_by_the_keyboard_and_goes_on_where_this_one_ended
     page.keyboard.press(" ")
     expect(page.locator("#play")).to_have_text("Pause")
     page.get_by_role("button", name="next repetition").click()
-    expect(key).to_contain_text("rep 2. The vehicles collided")
+    expect(key).to_contain_text("rep 2. The vehicles crashed")
     page.go_back()
     expect(key).to_contain_text("L_4_8, rep 2")
     page.locator("#alone").click()
@@ -461,7 +460,7 @@ def test_an_exported_folder_and_a_page_of_few_trials_open_from_the_disk(page, db
     page.goto((tmp_path / "made").rename(tmp_path / "moved").joinpath("index.html").as_uri())
     expect(page.locator("footer")).to_contain_text("Search, filters, SQL and new notes need")
     page.locator(f'a[title="{COLLIDED}"]').click()
-    expect(page.get_by_text("The vehicles collided")).to_be_visible()
+    expect(page.get_by_text("The vehicles crashed")).to_be_visible()
     start = place(page, "left")
     for _ in range(3):
         page.keyboard.press("]")

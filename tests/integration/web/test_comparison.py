@@ -67,19 +67,19 @@ def test_the_headline_says_crashes_in_counts_then_points_interval_and_p(client):
     page = client.get(f"/drivers/{A}?with={B}").text
     claim = words_of(re.search(r'<p class="answer">(.*?)</p>', page, re.S)[1])
     assert re.fullmatch(
-        rf"{A} collided in 11 of 54 trials, {B} in 33 of 55\. In the same situations {A} collided "
+        rf"{A} crashed in 11 of 54 trials, {B} in 33 of 55\. In the same situations {A} crashed "
         r"less often, by \d\d\.\d\d points \[\d\d\.\d\d, \d\d\.\d\d\]; corrected p < 0\.001\.",
         claim,
     )
     turned = words_of(client.get(f"/drivers/{B}?with={A}").text)
-    assert f"{B} collided in 33 of 55 trials, {A} in 11 of 54" in turned
-    assert f"{B} collided more often, by" in turned
+    assert f"{B} crashed in 33 of 55 trials, {A} in 11 of 54" in turned
+    assert f"{B} crashed more often, by" in turned
 
 
 def test_two_models_without_factors_are_what_the_first_page_and_the_report_answer(db, client):
     study = StudyResults(db)
     table = make_tables(study, ["verdicts"])
-    claim = f"{A} collided in 11 of 54 trials, {B} in 33 of 55. "
+    claim = f"{A} crashed in 11 of 54 trials, {B} in 33 of 55. "
     answer = re.search(r'<p class="answer">(.*?)</p>', client.get("/").text, re.S)[1]
     assert words_of(answer).startswith(claim)
     assert claim in words_of(report_html(study, table, {}))

@@ -131,7 +131,7 @@ def test_a_sweep_writes_while_a_query_runs_which_is_stopped_in_time(own):
 
 
 def test_what_lies_in_the_log_beside_the_database_is_read(own, tmp_path):
-    crashed = tmp_path / "collided.duckdb"
+    crashed = tmp_path / "crashed.duckdb"
     with duckdb.connect(str(own)) as connection:
         connection.execute("SET checkpoint_threshold = '1TB'; INSERT INTO meta VALUES (-1)")
         for end in ("", ".wal"):

@@ -167,7 +167,7 @@ def test_the_gap_of_people_is_that_of_the_situations_that_were_played(db):
     assert abs(there.value - every.value) > 0.05
     with client_of(db) as client:
         page = Page(client.get("/", params={"condition": "L_4_8"}).text).text
-    people = page.partition("Gap at the merge point humans")[2].partition("emulator")[0]
+    people = page.partition("Gap at the merge point people")[2].partition("emulator")[0]
     assert f"{there.value:.2f} m [{there.low:.2f}, {there.high:.2f}]" in people.replace("\xa0", " ")
 
 
@@ -210,7 +210,7 @@ def test_the_first_screen_answers_a_study_of_two_factors(page, db, outcomes):
     assert f"The difference is +{slope:.2f} points" in beside
     assert "persona=taxi turns a 50 % chance of going first into 55 %, and 95 % into 96 %" in beside
     assert "chance of going first into 82 %, and 95 % into 99 %" in beside
-    (shown,) = re.findall(r"(\d+) trials without a collision, (\d+) with one", beside)
+    (shown,) = re.findall(r"(\d+) trials without a crash, (\d+) with one", beside)
     assert sum(map(int, shown)) == query(db, "SELECT count(*) FROM trials")[1][0][0]
     shares = [float(share) for share in re.findall(r"(\d+\.\d\d) %", said)]
     assert shares[0] - shares[1] == pytest.approx(slope, abs=0.011)

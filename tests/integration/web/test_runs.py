@@ -120,7 +120,7 @@ def test_the_page_has_the_numbers_of_the_database_and_every_rate_leads_to_its_tr
     client = client_of(written)
     text = text_of(client)
     for name, count, of, things in (
-        ("collisions", dict(facts["outcomes"]).get("collided", 0), 29, "ended trials"),
+        ("crashes", dict(facts["outcomes"]).get("collided", 0), 29, "ended trials"),
         ("failed trials", 1, 30, "stored trials"),
         ("invalid replies", 2, facts["decisions"], "decisions asked"),
         ("fallbacks", 2, facts["decisions"], "decisions asked"),

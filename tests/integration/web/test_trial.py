@@ -37,7 +37,7 @@ def accounts(tmp_path_factory):
 @pytest.mark.parametrize(
     ("account", "heading", "too_late"),
     [
-        ("both insisted", "Why it collided", [(1.6, "left"), (2.0, "right")]),
+        ("both insisted", "Why it crashed", [(1.6, "left"), (2.0, "right")]),
         ("near miss", "Why it came close", []),
         ("long wait", "Why it took so long", []),
         (None, "", []),
@@ -138,7 +138,7 @@ def test_beside_humans_who_say_nothing_stands_what_was_measured_from_control_on(
     assert "A human pair" in text
     assert "net gap when the first vehicle reaches the merge point" in text
     text = Page(client.get(f"/trials/{crash}").text).text
-    assert "The vehicles collided" in text
+    assert "The vehicles crashed" in text
     assert "outlines of 4.5 m by 1.8 m" in text
 
 

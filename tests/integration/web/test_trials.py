@@ -146,14 +146,14 @@ def test_people_and_each_driver_are_summed_up_apart(listing):
     with duckdb.connect(str(listing.site.db), read_only=True) as connection:
         sums = connection.execute(
             "SELECT driver, count(*)::VARCHAR, format('{:.2f}', avg(gap_m)) FROM (SELECT *, "
-            "if(source = 'human', 'humans', model_left) AS driver FROM trials) "
-            "JOIN trial_metrics USING (trial_id, spec_hash) WHERE driver IN ('humans', 'o3') "
-            "GROUP BY driver ORDER BY driver <> 'humans'"
+            "if(source = 'human', 'people', model_left) AS driver FROM trials) "
+            "JOIN trial_metrics USING (trial_id, spec_hash) WHERE driver IN ('people', 'o3') "
+            "GROUP BY driver ORDER BY driver <> 'people'"
         ).fetchall()
     assert len(sums) == 2
     for address, expected in (("/trials", sums), ("/trials?model=human", sums[:1])):
         text = Page(listing.get(address).text).text
-        found = re.findall(r"(o3|humans): (\d+), \d+ collided, mean gap (\S+) m", text)
+        found = re.findall(r"(o3|people): (\d+), \d+ crashed, mean gap (\S+) m", text)
         assert found == expected
 
 

@@ -28,10 +28,10 @@ from merge_runner_analysis.wording import (
 )
 
 PEOPLE = {"headway": "675 of 704", "velocity": "158 of 173", "collisions": "28 of 990"}
-# What says that a driver differs from humans, and in which direction.
+# What says that a driver differs from people, and in which direction.
 DIRECTION = re.compile(
     r"\b(more|less|fewer|larger|smaller|otherwise)\b|does not (yield|decide|add)|moves|"
-    "differs? from humans:"
+    "differs? from people:"
 )
 
 
@@ -68,31 +68,31 @@ WILD = driver(86, collisions="unlike", gap="unlike", collided=24)
         ({}, "No language model drove here.", ""),
         (
             {"gpt": {"gap": row("gap", None)}},
-            "No language model can be compared with humans yet.",
+            "No language model can be compared with people yet.",
             "",
         ),
         (
             {"wild": WILD},
-            "wild differs from humans: it collided in 24 of 110 trials, humans in 28 of 990.",
+            "wild differs from people: it crashed in 24 of 110 trials, people in 28 of 990.",
             "",
         ),
-        ({"o3": driver()}, "No difference from humans is shown for o3.", ""),
+        ({"o3": driver()}, "No difference from people is shown for o3.", ""),
         (
             {"o3": driver(headway="weaker", gap="unlike")},
-            "o3 differs from humans: with it the one ahead went first in 75 of 78 trials, with "
-            "humans in 675 of 704.",
+            "o3 differs from people: with it the one ahead went first in 75 of 78 trials, with "
+            "people in 675 of 704.",
             "",
         ),
         (
             {"o3": driver(gap="unlike", undecided=33)},
-            "o3 differs from humans: it left a gap of 1.00 [0.50, 1.50] m, humans of 2.00 m.",
-            "o3 collided in 33 of 143 trials by the paper's rule, in 0 to 33 by the human rule; "
-            "humans in 28 of 990.",
+            "o3 differs from people: it left a gap of 1.00 [0.50, 1.50] m, people of 2.00 m.",
+            "o3 crashed in 33 of 143 trials by the paper's rule, in 0 to 33 by people's rule; "
+            "people in 28 of 990.",
         ),
         (
             {"o3": driver(), "wild": WILD},
-            "wild differs from humans: it collided in 24 of 110 trials, humans in 28 of 990.",
-            "No difference from humans is shown for o3.",
+            "wild differs from people: it crashed in 24 of 110 trials, people in 28 of 990.",
+            "No difference from people is shown for o3.",
         ),
     ],
 )
@@ -118,29 +118,29 @@ NONE = "No language model drove here."
         (
             [OPEN_GAP, SHOWN_HEADWAY],
             [
-                "1 of 2 drivers let the one ahead go first, as humans do. No verdict is possible "
-                "on collisions, who goes first side by side and the gap.",
+                "1 of 2 drivers let the one ahead go first, as people do. No verdict is possible "
+                "on crashes, who goes first side by side and the gap.",
                 NONE,
             ],
         ),
         (
             [of_kind(PROGRAM, headway="unlike"), of_kind(PROGRAM, collisions="unlike")],
             [
-                "None of 2 drivers collide as often as humans; none of 2 let the one ahead go "
-                "first, as humans do. No verdict is possible on who goes first side by side and "
+                "None of 2 drivers crash as often as people; none of 2 let the one ahead go "
+                "first, as people do. No verdict is possible on who goes first side by side and "
                 "the gap.",
                 NONE,
             ],
         ),
         (
             [OPEN_GAP, {"headway": row("headway", n=19, kind="mock")}],
-            ["For 2 drivers no verdict on likeness to humans is possible.", NONE],
+            ["For 2 drivers no verdict on likeness to people is possible.", NONE],
         ),
         (
             [of_kind(PROGRAM, gap=OPEN) | {"collisions": row("collisions", n=11, counted=counted)}
              for counted in ("11 of 11", "2 of 10", "1 of 11", "0 of 9")],
-            ["For 4 drivers no verdict on likeness to humans is possible.",
-             f"Collisions range from 0 of 9 trials (d3) to 11 of 11 trials (d0). {NONE}"],
+            ["For 4 drivers no verdict on likeness to people is possible.",
+             f"Crashes range from 0 of 9 trials (d3) to 11 of 11 trials (d0). {NONE}"],
         ),
     ],
 )  # fmt: skip
@@ -157,7 +157,7 @@ def test_two_drivers_are_told_apart_with_names_and_numbers():
     rows = {"collided_percent": crashed, "gap_m": gap, "left_first_percent": first}
     claim, rest = apart("a", "b", rows, of_left=True)
     assert claim == (
-        "a collided in 42 of 110 trials, b in 84 of 110. In the same situations a collided less "
+        "a crashed in 42 of 110 trials, b in 84 of 110. In the same situations a crashed less "
         "often, by 38.64 points [27.00, 50.00]; corrected p = 0.001."
     )
     smaller = "Compared with b, a leaves a smaller gap (3.10 against 4.20 m)."
@@ -201,26 +201,22 @@ def test_of_few_outcomes_a_headline_says_the_counts_alone(of, counts):
 @pytest.mark.parametrize("of", [(20, 0), (16, 4), (0, 20)])
 def test_who_collides_has_an_outcome_too(of):
     claim, _ = headline({"gpt": driver(of[0], collided=of[1], collisions="unlike")})
-    assert claim.startswith("gpt differs from humans: it collided in")
+    assert claim.startswith("gpt differs from people: it crashed in")
 
 
 def test_crashes_that_another_rule_decides_are_said_by_both():
     of = row("collisions", "inconclusive", n=10, k=2, counted="2 of 10", human_counted="5 of 90")
-    assert crashes(of) == "collided in 2 of 10 trials; humans in 5 of 90"
+    assert crashes(of) == "crashed in 2 of 10 trials; people in 5 of 90"
     cut_off = of | {"undecided": 4, "counted": "6 of 14", "counted_by": PLAYED_RULES["euclid2d"]}
     assert crashes(cut_off) == (
-        "collided in 6 of 14 trials by the paper's rule, in 2 to 6 by the human rule; "
-        "humans in 5 of 90"
+        "crashed in 6 of 14 trials by the paper's rule, in 2 to 6 by people's rule; people in 5 of "
+        "90"
     )
 
 
 @pytest.mark.parametrize(
     ("n", "says"),
-    [
-        (19, "fewer than 20 trials"),
-        (20, "too few without a collision"),
-        (28, "smaller than humans'"),
-    ],
+    [(19, "fewer than 20 trials"), (20, "too few without a crash"), (28, "smaller than people's")],
 )
 def test_a_cell_has_no_verdict_where_the_headline_has_none(n, says):
     values = driver(n, collided=55 - n, gap="unlike")
@@ -232,7 +228,7 @@ def test_several_drivers_are_told_together():
     few = {"gpt": driver(7, undecided=15), "o4": driver(2)}
     assert headline(few)[0] == f"{TOO_FEW}: gpt 7 of 22 and o4 2 of 2."
     both = {"a": WILD, "b": WILD}
-    crashed = "from humans: a collided in 24 of 110 trials, humans in 28 of 990."
+    crashed = "from people: a crashed in 24 of 110 trials, people in 28 of 990."
     assert headline(both)[0] == f"All language models here differ {crashed}"
     assert headline({**both, **few})[0] == f"a and b differ {crashed}"
 
@@ -240,15 +236,15 @@ def test_several_drivers_are_told_together():
 @pytest.mark.parametrize(
     ("of", "says"),
     [
-        (driver(95, collided=15), "collided in 15 of 110 trials; humans in 28 of 990"),
+        (driver(95, collided=15), "crashed in 15 of 110 trials; people in 28 of 990"),
         (
             driver(7, collided=3, undecided=12),
-            "collided in 15 of 22 trials by the paper's rule, in 3 to 15 by the human rule; humans "
+            "crashed in 15 of 22 trials by the paper's rule, in 3 to 15 by people's rule; people "
             "in 28 of 990",
         ),
         (
             driver(109, collided=1, collisions="unlike"),
-            "collided in 1 of 110 trials, less often than humans (28 of 990)",
+            "crashed in 1 of 110 trials, less often than people (28 of 990)",
         ),
         (driver(0), ""),
     ],
@@ -276,18 +272,18 @@ def test_an_interval_beside_a_margin_names_its_level_where_that_is_not_95_percen
     [
         (
             driver(),
-            "Collided in 0 of 110 trials; humans in 28 of 990. The one ahead goes first, as with "
-            "humans (the one ahead in 75 of 78 trials, humans in 675 of 704). The faster one "
-            "yields, as with humans (side by side, the slower one in 16 of 19 trials, humans in "
-            "158 of 173). Cannot tell: collisions; mean gap.",
+            "Crashed in 0 of 110 trials; people in 28 of 990. The one ahead goes first, as with "
+            "people (the one ahead in 75 of 78 trials, people in 675 of 704). The faster one "
+            "yields, as with people (side by side, the slower one in 16 of 19 trials, people in "
+            "158 of 173). Cannot tell: crashes; mean gap.",
         ),
         (
             driver(headway="weaker"),
-            "Who goes first depends less on who is ahead than with humans (the one ahead in 75 of",
+            "Who goes first depends less on who is ahead than with people (the one ahead in 75 of",
         ),
-        (driver(velocity="unlike"), "The faster one does not yield, as it does with humans ("),
-        (driver(gap="unlike"), "Leaves a gap of 1.00 m, smaller than humans (2.00 m)"),
-        (driver(50, collided=50, collisions="unlike"), "Collided in 50 of 100 trials, less often"),
+        (driver(velocity="unlike"), "The faster one does not yield, as it does with people ("),
+        (driver(gap="unlike"), "Leaves a gap of 1.00 m, smaller than people (2.00 m)"),
+        (driver(50, collided=50, collisions="unlike"), "Crashed in 50 of 100 trials, less often"),
         ({"": {"note": "not judged: why"}}, "Not judged: why."),
     ],
 )
@@ -328,17 +324,17 @@ def test_no_sentence_claims_a_direction_that_the_corrected_p_does_not_carry(of):
 @pytest.mark.parametrize(
     ("measure", "ci", "says"),
     [
-        ("collisions", (-4.0, 5.0), "like humans"),
-        ("collisions", (-9.0, -5.1), "fewer than humans'"),
-        ("gap", (-1.0, -0.5), "like humans"),
-        ("gap", (-1.1, -0.5), "smaller than humans'"),
-        ("headway", (-0.1, 0.1), "unlike humans'"),
+        ("collisions", (-4.0, 5.0), "like people"),
+        ("collisions", (-9.0, -5.1), "fewer than people's"),
+        ("gap", (-1.0, -0.5), "like people"),
+        ("gap", (-1.1, -0.5), "smaller than people's"),
+        ("headway", (-0.1, 0.1), "unlike people's"),
     ],
 )
 def test_within_a_margin_a_driver_is_like_people_wherever_that_is_said(measure, ci, says):
     of = row(measure, "unlike", difference_ci=ci, p_holm=0.01)
     assert verdict_word(of) == says
-    assert differs(of) is (says != "like humans")
+    assert differs(of) is (says != "like people")
 
 
 @pytest.mark.parametrize(

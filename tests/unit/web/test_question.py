@@ -42,8 +42,8 @@ def copied(factor):
 
 
 HURRY = (
-    "Hurry changes who goes first: in the same situations and without a collision, the driver "
-    "under study goes first in 63.00 % with hurry=yes and in 50.00 % with hurry=no."
+    "Hurry changes who goes first: in the same situations and without a crash, the driver under "
+    "study goes first in 63.00 % with hurry=yes and in 50.00 % with hurry=no."
 )
 SAME = "The difference is +13.00 points [6.00, 20.00], corrected "
 SEEN = "The study had 80 % power for an effect of 10.00 points."
@@ -168,7 +168,7 @@ def test_a_planted_effect_is_said_of_a_rehearsal_with_its_size(drivers, is_said)
 @pytest.mark.parametrize("who", [EGO, LEFT])
 def test_the_driver_that_goes_first_is_named_and_explained(who):
     made = answer([effect()], levels_of("hurry"), who[1])
-    assert f"without a collision, {who[0]} goes first in" in made.claim
+    assert f"without a crash, {who[0]} goes first in" in made.claim
     assert made.who == f"G{who[1][1:]}"
 
 
@@ -185,7 +185,7 @@ def test_a_side_has_its_count_and_the_chart_the_axis_of_its_data():
     # Of both drivers, which are drawn.
     assert (
         made.counted
-        == "400 trials without a collision, 12 with one; 28 identical to another one are left out"
+        == "400 trials without a crash, 12 with one; 28 identical to another one are left out"
     )
     (chart,) = made.charts
     assert chart.title == "By factor"
@@ -206,7 +206,7 @@ def test_levels_that_are_not_tested_are_not_drawn():
     assert [line.head for line in chart.lines] == ["hurry", ""]
     assert (
         made.counted
-        == "200 trials without a collision, 6 with one; 14 identical to another one (persona=yes "
+        == "200 trials without a crash, 6 with one; 14 identical to another one (persona=yes "
         "changes nothing) are left out"
     )
 
@@ -241,10 +241,7 @@ def test_a_small_price_keeps_two_digits():
 
 def test_what_a_person_sees_at_once_is_said_of_several_other_changes():
     others = [effect(measure=COST, p=0.0001), effect(measure="coll. (%)", p=0.01)]
-    assert (
-        "Hurry changes how many trials end in a collision: "
-        in answered([effect(p=0.2), *others])[1]
-    )
+    assert "Hurry changes how many trials end in a crash: " in answered([effect(p=0.2), *others])[1]
 
 
 def test_the_end_of_an_interval_reads_as_0_only_where_it_is():

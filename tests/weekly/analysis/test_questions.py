@@ -29,7 +29,7 @@ def scientists(prepare, tmp_path_factory):
 
 
 def simulated(study, rng, hurried):
-    """The study with other outcomes: a hurry adds to the logit, and one in 20 collides."""
+    """The study with other outcomes, drawn by a logit to which a hurry adds; one in 20 crashes."""
     groups = []
     for group in study.models:
         rows = group.trials

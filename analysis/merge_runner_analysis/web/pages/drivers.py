@@ -110,7 +110,7 @@ def _counted(cells: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str]]:
             (f"Ego on the {side} goes first", f"ego_first_{side}", f"ego_merged_{side}")
             for side in (egos if "right" in egos else ())
         ),
-        ("Collisions", "collided", "ended"),
+        ("Crashes", "collided", "ended"),
     ]
 
 

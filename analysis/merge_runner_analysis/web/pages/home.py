@@ -58,7 +58,7 @@ def _beside_people(
     human: Mapping[str, Any],
     conditions: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Return what the page says of likeness to humans."""
+    """Return what the page says of likeness to people."""
     verdicts = {
         short[driver.name]: {name: cell.values for name, cell in driver.cells.items()}
         or {"": {"kind": driver.kind}}
@@ -68,7 +68,7 @@ def _beside_people(
     unposed = {name: note for name, note in UNPOSED.items() if name not in people}
     gap = human["cells"].get("gap")
     is_undecided = any(of.cells["collisions"].values.get("undecided") for of in drivers if of.cells)
-    # Of collisions that are undecided the table has the bounds.
+    # Of crashes that are undecided the table has the bounds.
     headings = {n: text for n, text in HEADINGS.items() if n != "collisions" or not is_undecided}
     return {
         "headline": headline(verdicts),
@@ -108,7 +108,7 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
     conditions = by_condition(site, scope, shown)
     names = [driver.name for driver in shown]
     short = short_names(names)
-    # Humans' gap covers the situations in which the first driver finished.
+    # People's gap covers the situations in which the first driver finished.
     human = humans_of(values["table"], next(iter(shown), None))
     return site.render(
         "home.html",

@@ -25,7 +25,7 @@ WHERE facet = 'cause' GROUP BY ALL ORDER BY trials DESC, cause
 TRUST = [
     dict(zip(("name", "count", "of", "things", "meaning", "state"), rate, strict=True))
     for rate in (
-        ("collisions", "collided", "ended", "ended trials",
+        ("crashes", "collided", "ended", "ended trials",
          "the vehicles came closer than the collision rule allows", {"outcome": "collided"}),
         ("failed trials", "failed", "trials", "stored trials",
          "a call got no answer; the trial has no outcome and can be played anew",

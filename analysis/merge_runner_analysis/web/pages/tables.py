@@ -20,7 +20,7 @@ TABLE_FILES = {"csv": TableFormat.CSV, "tex": TableFormat.LATEX}
 FIGURE_FILES = {"svg": "image/svg+xml", "png": "image/png"}
 # The list of tables, by what they answer.
 GROUPS = {
-    "Do they drive like humans?": ("verdicts", "first-action", "criticality"),
+    "Do they drive like people?": ("verdicts", "first-action", "criticality"),
     "What makes a difference?": ("effects", "contrasts", "factors"),
     "The tables of the paper": (
         "who-first",

@@ -229,7 +229,7 @@ def account(course: Course, decisions: Decided, trial: Mapping[str, Any]) -> Acc
         avoidable = (_avoidable(course, side, chance) for side, chance in chances.items())
         sentences = [_collision(course, name), *avoidable]
     marks = sorted(_marks(course, decisions, chances), key=lambda mark: mark.time_s)
-    return Account(HEADINGS.get(name, "Why it collided"), sentences, marks)
+    return Account(HEADINGS.get(name, "Why it crashed"), sentences, marks)
 
 
 def _collision(course: Course, name: str) -> str:

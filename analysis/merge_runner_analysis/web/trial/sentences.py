@@ -16,7 +16,7 @@ def outcome_text(row: Row) -> str:
     """Return how a trial ended, in a sentence."""
     end = f"{row['end_time_s']:.1f} s"
     without_first = {
-        "collided": f"The vehicles collided after {end}.",
+        "collided": f"The vehicles crashed after {end}.",
         "failed": f"The trial failed after {end}: {row['error']}.",
         "timeout": f"Nobody had left the track after {end}.",
     }

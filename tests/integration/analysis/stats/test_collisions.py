@@ -71,7 +71,7 @@ def test_both_rates_stand_in_the_tables_with_what_is_left_out(study):
         (indicators, "o3/baseline/collided_boxes_percent"),
     ):
         note = next(row.note for row in table.rows if row.id == row_id)
-        assert "by the human rule 1 to 4 of 5 trials collided: 1 surely did, and of 3 that" in note
+        assert "by people's rule 1 to 4 of 5 trials crashed: 1 surely did, and of 3 that" in note
         assert any("boxes that overlap, checked at 20 Hz" in note for note in table.notes)
     by_disc = next(r for r in indicators.rows if r.id == "o3/baseline/collided_percent")
     assert by_disc.note == ""

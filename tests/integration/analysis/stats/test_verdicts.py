@@ -19,7 +19,7 @@ BOXES = ScenarioConfig(collision_rule="rectangle")
 
 @pytest.fixture(scope="module")
 def study(tmp_path_factory):
-    """A driver like the humans, and one that collides where nobody is ahead."""
+    """A driver like the humans, and one that crashes where nobody is ahead."""
     crashes = [
         Drive("wild", "baseline", name, rep, (0.1 * rep,) * 9, (0.1 * rep,) * 9)
         for name in ("N_0_0", "L_4_0", "R_-4_0")
@@ -137,11 +137,11 @@ def test_with_undecided_trials_there_is_no_p_and_n_is_that_of_the_decided_ones(t
     row = by_id(table)["o3/baseline/collisions"]
     beside = values_of(study, "indicators")["o3/baseline/collided_boxes_percent"]
     assert (row.values["undecided"], row.values["n"], beside["n"]) == (4, 2, 2)
-    assert "of 6 trials collided" in row.note
+    assert "of 6 trials crashed" in row.note
     untested = ("estimate", "difference", "difference_ci", "level", "p", "p_holm", "detectable")
     assert {row.values[name] for name in untested} == {None}
     assert row.values["state"] == "inconclusive"
-    assert notes_with(table, "by the paper's rule, in 2 to 6 by the human rule")
+    assert notes_with(table, "by the paper's rule, in 2 to 6 by people's rule")
 
 
 def test_a_replayed_human_is_not_judged(tmp_path):

@@ -171,8 +171,8 @@ def test_prompts_are_contrasted_without_one_that_is_called_baseline(tmp_path):
 
 # Drivers with one kind of trouble each, and what is said of it.
 TROUBLE = {
-    "1 trial in which one went first without a collision": [yielding("once", reps=1)[3]],
-    "no trial in which one went first without a collision": [
+    "1 trial in which one went first without a crash": [yielding("once", reps=1)[3]],
+    "no trial in which one went first without a crash": [
         Drive("crash", "baseline", name, 1, (0.0,), (0.0,)) for name in CONDITIONS
     ],
     "separation: no finite estimate of": [

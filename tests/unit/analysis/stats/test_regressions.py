@@ -163,7 +163,7 @@ def test_a_difference_of_groups_is_the_interaction_of_a_penalised_model_of_both(
     assert [term.p for term in terms] == pytest.approx(model.lrt_pvalues_[2:5], rel=1e-3)
     no_fit(
         who_first_firth(own, less=rest.iloc[:2]),
-        "2 trials in which one went first without a collision: too",
+        "2 trials in which one went first without a crash: too",
     )
 
 
