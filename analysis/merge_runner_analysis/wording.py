@@ -46,26 +46,29 @@ VERDICTS = {
     UNLIKE: "unlike people's",
     OPEN: "cannot tell",
 }
+TENDENCY = "same tendency as people"  # its sign alone, and no difference in size is shown
 DIRECTIONS = {
+    "headway": {SHOWN: TENDENCY},
+    "velocity": {SHOWN: TENDENCY},
+    "gap-headway": {SHOWN: TENDENCY},
     "collisions": {WEAKER: "fewer than people's", STRONGER: "more than people's"},
     "gap": {WEAKER: "smaller than people's", STRONGER: "larger than people's"},
 }
 # The rule of a verdict, a line a state; ``{tests}`` is the number of a driver's tests, if known.
 VERDICT_RULES = (
-    "Like people in crashes or gap: the whole interval of the difference lies within 5 points, "
-    "or 1 m",
-    "Like people in who goes first: the one ahead or, side by side, the slower one goes first more "
-    "often, with p below .05 in a logistic regression (Firth) over all trials without a crash, not "
-    "by the counts shown",
+    "Like people (crashes, gap): the whole interval of the difference lies within 5 points, or 1 m",
+    "Same tendency as people (who goes first): the one ahead or, side by side, the slower one goes "
+    "first more often, with p below .05 in a logistic regression (Firth) over all trials without a "
+    "crash, not by the counts shown",
     "Fewer, more, smaller, larger, unlike: a difference is shown, with p below .05, corrected "
     "(Holm) for a driver's {tests}tests",
     f"Cannot tell: neither is shown. No verdict: fewer than {ENOUGH} trials are counted, or fewer "
     "than half of those that ended",
 )
 FITTED_RULE = (
-    "Like people in the gap by headway: more headway, more gap, with p below .05 in a linear "
-    "regression; by relative velocity: it moves the gap by less than 1 m; in accelerations held: "
-    "within half a standard deviation of people"
+    "Same tendency as people in the gap by headway: more headway, more gap, with p below .05 in a "
+    "linear regression. Like people in the gap by relative velocity: it moves the gap by less than "
+    "1 m; in accelerations held: within half a standard deviation of people"
 )
 VERDICT_RULE = ". ".join((*VERDICT_RULES, FITTED_RULE)).format(tests="")
 # Measures that the first page shows, with its headings.
@@ -609,7 +612,44 @@ def _without_models(drivers: Mapping[str, Mapping[str, Values]]) -> tuple[str, s
     compared = {name: of for name, of in drivers.items() if "" not in of}
     if len(compared) < 2:
         return who, ""
-    return _tally([*compared.values()]), " ".join(filter(None, (_extremes(compared), who)))
+    claims = [_tally([*compared.values()]), _extremes(compared), who]
+    if kinds == {PROGRAM}:
+        claims.insert(0, _most_alike(compared))
+    claim, *others = filter(None, claims)
+    return claim, " ".join(others)
+
+
+def _most_alike(drivers: Mapping[str, Mapping[str, Values]]) -> str:
+    """Return which of several programs are most like people, and which one crashes most."""
+    ranks = {
+        name: (
+            sum(shown_state(of[measure]) == SHOWN for measure in LIKENESS if measure in of),
+            -sum(shown_state(of[measure]) in DIFFERS for measure in LIKENESS if measure in of),
+        )
+        for name, of in drivers.items()
+    }
+    like, unlike = best = max(ranks.values())
+    names = [name for name, rank in ranks.items() if rank == best]
+    if not like or len(names) == len(drivers):
+        return ""
+    is_one = len(names) == 1
+    claim = (
+        f"Of {len(drivers)} programs {joined(names)} {'is' if is_one else 'are'} most like people: "
+        f"{'it agrees' if is_one else 'each agrees'} with them in {like} of {len(LIKENESS)} "
+        f"measures, and is shown to differ in {-unlike or 'none'}."
+    )
+    rates = _crash_rates(drivers)
+    most = [name for name, rate in rates.items() if rate == max(rates.values()) > 0]
+    if len(most) != 1:
+        return claim
+    return f"{claim} Most crashes: {most[0]} {crashes(drivers[most[0]]['collisions'])}."
+
+
+def _crash_rates(drivers: Mapping[str, Mapping[str, Values]]) -> dict[str, float]:
+    """Return the share of trials with a crash, of drivers of which both are counted."""
+    counts = {name: of.get("collisions", {}).get("counted") for name, of in drivers.items()}
+    parts = {name: text.split(" of ") for name, text in counts.items() if text}
+    return {name: int(k) / int(n) for name, (k, n) in parts.items()}
 
 
 def _tally(drivers: Sequence[Mapping[str, Values]]) -> str:
@@ -629,11 +669,12 @@ def _tally(drivers: Sequence[Mapping[str, Values]]) -> str:
 
 def _extremes(drivers: Mapping[str, Mapping[str, Values]]) -> str:
     """Return the fewest and most crashes, and the smallest and largest gap, of many drivers."""
-    crashed, gaps = {}, {}
+    crashed = {
+        f"{drivers[name]['collisions']['counted']} trials ({name})": rate
+        for name, rate in _crash_rates(drivers).items()
+    }
+    gaps = {}
     for name, of in drivers.items():
-        if counted := of.get("collisions", {}).get("counted"):
-            k, n = map(int, counted.split(" of "))
-            crashed[f"{counted} trials ({name})"] = k / n
         if (gap := of.get("gap", {}).get("estimate")) is not None:
             gaps[f"{number(gap)} m ({name})"] = gap
     parts = [

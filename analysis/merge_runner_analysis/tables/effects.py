@@ -268,6 +268,8 @@ def _planted(study: StudyResults) -> list[str]:
                 )
             if gap_m := text.emulator.gap_m:
                 planted.append(f"{factor}={level} adds {gap_m:g} m to the gap that drivers aim at")
+    if any("chance" in text for text in planted):
+        planted.append("little can change where a situation almost decides the order")
     return planted
 
 

@@ -19,6 +19,7 @@ from merge_runner_analysis.wording import (
     STRONGER,
     UNLIKE,
     VERDICT_RULES,
+    VERDICTS,
     WEAKER,
     brackets,
     number,
@@ -40,7 +41,8 @@ UNPOSED = {
 class Likeness:
     """One measure of a driver beside people's: a mark with its word, and what was counted.
 
-    A count has ``k`` and ``n``, any other value a ``text``; ``row`` is the verdict's row.
+    A count has ``k`` and ``n``, any other value a ``text``; ``row`` is the verdict's row, and
+    ``why`` says what keeps it open.
     """
 
     mark: str
@@ -49,6 +51,7 @@ class Likeness:
     n: int | None
     text: str
     row: str
+    why: str = ""
 
 
 def likeness_of(driver: Driver) -> dict[str, Likeness]:
@@ -91,7 +94,7 @@ def verdict_rules(drivers: Sequence[Driver], gap: Mapping[str, Any]) -> list[str
     numbers = " to ".join(map(str, dict.fromkeys((min(tests, default=0), max(tests, default=0)))))
     likeness, *others = (rule.format(tests=f"{numbers} ") for rule in VERDICT_RULES)
     if ends := gap.get("ci"):
-        half = (ends[1] - ends[0]) / 2
+        half = _half(ends)
         if half > MARGINS["gap"] / 2:
             likeness += (
                 f" (people's gap is known to ± {number(half)} m, by nine pairs: more trials hardly "
@@ -100,10 +103,18 @@ def verdict_rules(drivers: Sequence[Driver], gap: Mapping[str, Any]) -> list[str
     return [likeness, *others]
 
 
+def _half(ends: Sequence[float]) -> float:
+    return (ends[1] - ends[0]) / 2
+
+
 def _likeness(cell: Cell) -> Likeness:
     values = cell.values
     mark, word = MARKS.get(shown_state(values), MARKS[OPEN]), verdict_word(values)
-    row, counted = str(values["row"]), values.get("counted")
+    row, counted, why = str(values["row"]), values.get("counted"), ""
+    if cell.measure.name == "gap" and word == VERDICTS[OPEN] and values.get("human_ci"):
+        half = _half(values["human_ci"])
+        if half > MARGINS["gap"] / 2:
+            why = f"people's gap is known only to ± {number(half)} m"
     if counted:
         k, n = map(int, str(counted).split(" of "))
         share = f"{number(100 * k / n)} %"
@@ -117,7 +128,7 @@ def _likeness(cell: Cell) -> Likeness:
     if estimate is not None and ends == brackets((estimate, estimate)):
         ends = "in every trial"
     text = f"{number(estimate)} m {ends}".rstrip() if known else ""
-    return Likeness(mark, word, None, None, unbroken(text), row)
+    return Likeness(mark, word, None, None, unbroken(text), row, unbroken(why))
 
 
 def people_of(conditions: Mapping[str, Any], human: Mapping[str, Any]) -> dict[str, str]:

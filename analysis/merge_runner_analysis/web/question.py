@@ -85,7 +85,6 @@ class Change:
     p: str
     mark: Mark | None
     end: str
-    is_primary: bool
     row: str
 
 
@@ -209,7 +208,8 @@ def answered(rows: Sequence[Row], driver: str = EGO[0], planted: str = "") -> tu
     if sure:
         first = sure[0]
         claim = f"{rehearsed}{first.values['factor']} changes {what}: {_both(first, driver)}."
-        rest.append(f"The difference is {test_text(first)}.")
+        shown = test_text(first).replace("], ", "] (95 % interval), ")
+        rest.append(f"The difference is {shown}.")
     else:
         claim = f"{rehearsed}no change of {what} is shown by {joined(_factors(primary))}."
     rest += [f"{capital(level_text(row))} changes it, too: {test_text(row)}." for row in sure[1:]]
@@ -376,7 +376,6 @@ def _change(row: Row, sides: dict[str, Row], end: float, primary: str) -> Change
         p_value(value_of(row, "p_corrected")),
         difference_mark(row, end),
         f"{amount(row, end)} {unit_of(row)}",
-        bool(row.values.get("primary")),
         row.id,
     )
 

@@ -21,6 +21,8 @@ from merge_runner_analysis.web.urls import Links
 from merge_runner_analysis.wording import (
     MINUS,
     PEOPLES_RULE,
+    SHOWN,
+    TENDENCY,
     VERDICT_RULE,
     VERDICTS,
     capital,
@@ -93,6 +95,7 @@ def environment(
         used_terms=used_terms,
     )
     verdicts = {SHAPES[state]: words for state, words in VERDICTS.items()}
+    verdicts[SHAPES[SHOWN]] += f", or the {TENDENCY}"
     made.globals.update(at=at, policy=policy, inlined=inlined or {}, style=STYLE, **shared)
     made.globals.update(verdict_shapes=verdicts, verdict_rule=capital(VERDICT_RULE))
     made.globals["peoples_rule"] = PEOPLES_RULE

@@ -58,7 +58,7 @@ def test_a_less_b_is_the_table_of_effects_with_its_interval_and_both_p(db, clien
         shown = f"{sign}{form(row['difference'])} {unit} {brackets(row['ci'], form)}"
         assert shown in page
         _, _, rest = page.partition(shown)
-        numbers = re.match(r" (?:± [\d.]+ \S+ )?(\S+) (\S+)", rest).groups()
+        numbers = re.match(r" (?:−\S+ 0 \+\S+ \S+ )?(\S+) (\S+)", rest).groups()
         assert numbers == (p_value(row["p"]), p_value(row["p_corrected"]))
         assert row["detectable"] is None or f"{form(row['detectable'])} {unit}" in page
 

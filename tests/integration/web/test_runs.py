@@ -243,7 +243,7 @@ def test_a_page_follows_a_sweep_to_its_end_and_has_each_state_read_out_once(stud
     for said in (
         "Running: 1 of 33 trials ended, 1 failed, about 20 s left.",
         "cost 1.50 USD",
-        "o3 baseline 29 1 ",
+        "o3 29 1 ",
         "<script>alert(1)</script>[U+202E]<img src=x>",
     ):
         assert said in text

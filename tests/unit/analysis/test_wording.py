@@ -133,6 +133,20 @@ NONE = "No language model drove here."
             ],
         ),
         (
+            [
+                of_kind(PROGRAM, headway=SHOWN, gap=OPEN),
+                of_kind(PROGRAM, headway=SHOWN, gap="unlike"),
+                {"collisions": row("collisions", n=11, kind=PROGRAM, counted="11 of 11")},
+            ],
+            [
+                "Of 3 programs d0 is most like people: it agrees with them in 1 of 4 measures, and "
+                "is shown to differ in none. Most crashes: d2 crashed in 11 of 11 trials.",
+                "2 of 3 drivers let the one ahead go first, as people do; none of 3 leave gaps "
+                "like people's. No verdict is possible on crashes and who goes first side by side. "
+                f"{NONE}",
+            ],
+        ),
+        (
             [OPEN_GAP, {"headway": row("headway", n=19, kind="mock")}],
             ["For 2 drivers no verdict on likeness to people is possible.", NONE],
         ),
@@ -344,3 +358,9 @@ def test_within_a_margin_a_driver_is_like_people_wherever_that_is_said(measure, 
 )  # fmt: skip
 def test_a_price_has_two_digits_at_least(value, text):
     assert money(value) == text
+
+
+def test_a_measure_of_a_sign_alone_has_another_word_than_one_with_a_margin():
+    for name in ("headway", "velocity", "gap-headway"):
+        assert verdict_word(row(name, SHOWN)) == "same tendency as people"
+    assert verdict_word(row("gap-velocity", SHOWN)) == "like people"

@@ -45,7 +45,7 @@ HURRY = (
     "Hurry changes who goes first: in the same situations and without a crash, the driver under "
     "study goes first in 63.00 % with hurry=yes and in 50.00 % with hurry=no."
 )
-SAME = "The difference is +13.00 points [6.00, 20.00], corrected "
+SAME = "The difference is +13.00 points [6.00, 20.00] (95 % interval), corrected "
 SEEN = "The study had 80 % power for an effect of 10.00 points."
 
 
