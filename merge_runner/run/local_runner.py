@@ -143,8 +143,8 @@ class LocalRunner:
             failed.add(key)
             if len(failed) >= FAILURES_IN_A_ROW:
                 raise ProviderDown(
-                    f"the last {len(failed)} trials with {name} failed and no call was answered "
-                    f"in between ({record.error}): the rest is not tried. When the service answers "
+                    f"{len(failed)} different calls to {name} failed and none was answered in "
+                    f"between ({record.error}): the rest is not tried. When the service answers "
                     "again, run the same command to go on"
                 )
 
