@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import os
 import sqlite3
 from collections.abc import Callable, Mapping, Sequence
@@ -41,11 +40,6 @@ ATTEMPTS = TypeAdapter(Attempts)
 UNANSWERED, _DAMAGED = "attempts ", "damaged "
 UNSEEN = "the run ended before a reply was seen; it may have been charged"
 _GET = "SELECT mode, filename, value FROM Cache WHERE key = ? AND raw = 1"
-# One of the keys in a JSON array that no row has; the value of a row may be damaged.
-_MISSING = """
-SELECT 1 FROM json_each(?) AS call
-WHERE NOT EXISTS (SELECT 1 FROM Cache WHERE key = call.value AND raw = 1) LIMIT 1
-"""
 # The rows of a call, and of its attempts in flight when their process ended.
 _LOOK_UP = """
 SELECT key, mode, filename, value FROM Cache WHERE raw = 1 AND key IN (?1, ?2)
@@ -214,10 +208,6 @@ class CallStore(CacheFile):
         Raises RecordingError where it is damaged or forged.
         """
         return self.recording[0].get(key) or self._entry(key, request)
-
-    def has_all(self, keys: Sequence[str]) -> bool:
-        """Return whether the calls with these keys are stored here, damaged ones included."""
-        return not self.rows(_MISSING, json.dumps(keys))
 
     def in_recording(self, key: str) -> bool:
         """Return whether the recording holds an entry of a call key."""

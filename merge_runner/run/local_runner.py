@@ -59,7 +59,7 @@ class LocalRunner:
     @property
     def waiting_for_money(self) -> int:
         """The number of running trials that wait for money."""
-        return len(set().union(*(client.budget.waiting for client in self.clients.values())))
+        return len(set().union(*(client.budget.queue.trials for client in self.clients.values())))
 
     def _is_idle(self) -> bool:
         """Return whether every running trial waits for a reply, so that no trial can go on."""

@@ -277,10 +277,10 @@ async def test_trials_that_wait_for_money_are_counted_once(ledger):
     await budget.admit([1])
     both = [asyncio.create_task(budget.admit([trial])) for trial in (2, 2, 3)]
     await asyncio.sleep(0)
-    assert (budget.waiting, runner.waiting_for_money) == ({2, 3}, 2)
+    assert (budget.queue.trials, runner.waiting_for_money) == ({2, 3}, 2)
     budget.leave(1)
     await asyncio.gather(*both[:2])
-    assert (budget.waiting, runner.waiting_for_money) == ({3}, 1)
+    assert (budget.queue.trials, runner.waiting_for_money) == ({3}, 1)
     budget.leave(2)
     await both[2]
     assert runner.waiting_for_money == 0
