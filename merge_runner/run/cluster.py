@@ -210,14 +210,10 @@ class ClusterRunner:
             kept_usd = sum(assignment.unused_usd for assignment in self._assigned.values())
             share_usd = max(0.0, self._ledger.left_usd - kept_usd) / idle
             cap = Cap(share_usd, f"a task's share of {cap.source}")
-        parts = setup.plan.parts.without_code()
+        plan = setup.plan.model_copy(update={"parts": setup.plan.parts.without_code()})
         chunk = Chunk(
             name=f"task {secrets.token_hex(8)}",
-            setup=replace(
-                setup,
-                plan=setup.plan.model_copy(update={"parts": parts}),
-                options=replace(options, in_flight=in_flight),
-            ),
+            setup=replace(setup, plan=plan, options=replace(options, in_flight=in_flight)),
             cap=cap,
             specs=specs,
             share=1 / slots,

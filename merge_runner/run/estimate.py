@@ -179,7 +179,7 @@ def _cents(usd: float) -> float | None:
 
 
 def trial_costs(
-    plan: Plan, facts: Mapping[str, Usage | None], *, batch: bool = False
+    plan: Plan, facts: Mapping[str, Usage | None], *, batch: bool
 ) -> Callable[[int], float]:
     """Return a function from a trial's order to its expected cost in USD, perhaps in batches.
 

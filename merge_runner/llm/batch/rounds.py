@@ -170,7 +170,7 @@ class BatchSender:
 
     rounds: Rounds
     model: str
-    price_factor: float = 1.0
+    price_factor: float
 
     def takes(self, call: Call) -> bool:
         """Return whether the next attempt of a call goes into a batch, or waits in one already."""
