@@ -83,17 +83,14 @@ def estimate_lines(expected: Estimate) -> Iterator[str]:
     yield f"calls   about {expected.calls} not recorded yet"
     yield f"tokens  {tokens}"
     yield from _output_caps(expected)
-    if not expected.rounds:
-        yield f"cost    {usd_text(expected.cost_usd)}"
-        yield from _by_model(expected)
-        yield from _by_cap(expected)
-        yield f"time    about {expected.minutes} minutes"
-        return
-    singly = f"{usd_text(expected.singly_usd)} and {expected.minutes} minutes if asked singly"
-    yield f"cost    {usd_text(expected.cost_usd)} in batches; {singly}"
+    cost, time = usd_text(expected.cost_usd), f"{expected.minutes} minutes"
+    if expected.rounds:
+        cost += f" in batches; {usd_text(expected.singly_usd)} and {time} if asked singly"
+        time = (
+            f"{expected.rounds} rounds; each takes as long as its slowest batch: minutes, an hour, "
+            "a day at most"
+        )
+    yield f"cost    {cost}"
     yield from _by_model(expected)
     yield from _by_cap(expected)
-    yield (
-        f"time    about {expected.rounds} rounds; each takes as long as its slowest batch: "
-        "minutes, an hour, a day at most"
-    )
+    yield f"time    about {time}"
