@@ -54,6 +54,11 @@ class TrialSpec:
     prompts: dict[Side, str] = field(default_factory=dict)
     kinematics: Condition = field(kw_only=True)
 
+    @property
+    def key(self) -> tuple[str, str]:
+        """The trial's key in the database: trial_id and spec_hash."""
+        return self.trial_id, self.spec_hash
+
 
 class StateRow(NamedTuple):
     """One vehicle at one sample; the acceleration is that realised over the step before it."""

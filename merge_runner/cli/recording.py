@@ -41,13 +41,13 @@ def recording_export(
     from merge_runner.results.recorded_sweeps import carried_plugins, provenance_of
     from merge_runner.results.recording import export_recording
     from merge_runner.results.store import results_digest
-    from merge_runner.results.sweeps import recorded_sweeps
+    from merge_runner.results.sweeps import sweeps_to_export
 
     if sweeps and study is not None:
         raise UsageError(cli.NOT_BOTH)
     named = sweeps or cli.runs_of_study(study, db) or ()
     with closing(ResponseCache(cache, read_only=True)) as opened:
-        rows, keys = recorded_sweeps(db, named, opened.has_all)
+        rows, keys = sweeps_to_export(db, named, opened.has_all)
         sweep_ids = " and ".join(row["sweep_id"] for row in rows)
         if not keys:
             raise UsageError(f"the sweep {sweep_ids} made no call: there is nothing to record")

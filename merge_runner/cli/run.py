@@ -194,7 +194,7 @@ def _plans(name: str, *, selection: dict[str, Any], options: Options, trust: boo
     plan = make_plan(name, **selection, db=options.db, trust=trust)
     if options.dask is not None and options.replay:
         raise UsageError("a replay needs no cluster: leave --dask out")
-    if options.dask is not None and plan.replays_humans:
+    if options.dask is not None and plan.parts.replays_humans:
         raise UsageError("human-replay reads the database of this machine: leave --dask out")
     return [plan]
 

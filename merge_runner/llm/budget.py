@@ -25,7 +25,7 @@ from functools import partial
 
 from merge_runner.errors import TrialSuspended
 from merge_runner.llm.durable import Execute, ResultT
-from merge_runner.llm.ledger import TOLERANCE_USD, CallLabel, Ledger
+from merge_runner.llm.ledger import TOLERANCE_USD, CallLabel, Ledger, reserved_usd_of
 from merge_runner.llm.store import both
 from merge_runner.records import Attempt
 
@@ -60,7 +60,9 @@ class Reservation:
     @classmethod
     def resume(cls, budget: Budget, trial: int, key: str, label: CallLabel) -> Reservation:
         """Return the reservation of an attempt that an earlier run, of any sweep, has begun."""
-        return cls(budget, trial, key, label, budget.ledger.reserved_usd(key), queued=False)
+        return cls(
+            budget, trial, key, label, reserved_usd_of(budget.ledger.store, key), queued=False
+        )
 
     async def begin(self, number: int) -> None:
         """Reserve durably, right before the attempt is sent; raise TrialSuspended."""
@@ -119,6 +121,11 @@ class MoneyQueue:
         self._ledger = ledger
         self._running = running
 
+    @property
+    def trials(self) -> set[int]:
+        """Trials that wait for money, for admission or for an attempt."""
+        return {trial for waiter in self.waiters for trial in waiter.trials}
+
     def _place(self, waiter: Waiter) -> tuple[bool, float]:
         if waiter.is_probe:
             return False, -math.inf
@@ -172,24 +179,14 @@ class Budget:
         self._ended: set[int] = set()
         self.queue = MoneyQueue(ledger, self.expected_usd)
 
-    @property
-    def waiting(self) -> set[int]:
-        """Trials that wait for money, for admission or for an attempt."""
-        return {trial for waiter in self.queue.waiters for trial in waiter.trials}
-
-    def _is_running(self, trials: Sequence[int]) -> bool:
-        return not self.expected_usd.keys().isdisjoint(trials)
-
     async def admit(self, trials: Sequence[int]) -> None:
         """Wait until one of the trials that share a call runs, or the oldest of them may begin.
 
         ``trials`` may change meanwhile. Raise TrialSuspended if no other trial can free money.
         """
-        if self.ledger.cap is not None and not self._is_running(trials):
-            await self.queue.wait(
-                Waiter(trials, is_admission=True),
-                lambda: self._is_running(trials) or self._may_begin(min(trials)),
-            )
+        if self.ledger.cap is not None and self.expected_usd.keys().isdisjoint(trials):
+            may_begin = partial(self._may_begin, trials)
+            await self.queue.wait(Waiter(trials, is_admission=True), may_begin)
             self.queue.reorder(min(trials))
 
     def readmit(self, trial: int) -> None:
@@ -219,8 +216,14 @@ class Budget:
         self._largest_usd = max(self._largest_usd, usd)
         return Reservation(self, self._payer(trials), key, label, usd)
 
-    def _may_begin(self, trial: int) -> bool:
-        """Admit a trial if its expected cost fits beside those running; raise TrialSuspended."""
+    def _may_begin(self, trials: Sequence[int]) -> bool:
+        """Admit the oldest trial, unless one runs, if its expected cost fits beside those running.
+
+        Raise TrialSuspended.
+        """
+        if not self.expected_usd.keys().isdisjoint(trials):
+            return True
+        trial = min(trials)
         if trial in self._ended:
             raise TrialSuspended("its trial is suspended")
         needed_usd = self.trial_usd(trial)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import operator
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from functools import partial
 from itertools import islice
@@ -35,6 +36,11 @@ _NUMBER = f"SELECT count(*) FROM Cache WHERE {_IS_CALL}"  # noqa: S608 # constan
 _NEWEST = """
 SELECT CAST(key AS BLOB) FROM Cache NOT INDEXED WHERE typeof(key) = 'text' AND raw = 1
 AND length(CAST(key AS BLOB)) = 64 AND NOT instr(key, ' ') ORDER BY rowid DESC LIMIT ?
+"""
+# One of the keys in a JSON array that no row has.
+_MISSING = """
+SELECT 1 FROM json_each(?) AS call
+WHERE NOT EXISTS (SELECT 1 FROM Cache WHERE key = call.value AND raw = 1) LIMIT 1
 """
 _CALL = "SELECT key, raw, mode, filename, value FROM Cache WHERE rowid = ?"
 
@@ -110,6 +116,10 @@ class ResponseCache(CallStore):
                 call = self._entry(key.decode(errors="replace"))
             if call is not None:
                 yield call
+
+    def has_all(self, keys: Sequence[str]) -> bool:
+        """Return whether the folder has the calls with these keys, with damaged ones."""
+        return not self.rows(_MISSING, json.dumps(keys))
 
     @property
     def number(self) -> int:

@@ -121,6 +121,12 @@ def reasons(store: CacheFile, scope: str) -> list[dict[str, Any]]:
     return [dict(zip(names, row, strict=True)) for row in store.rows(_REASONS, scope)]
 
 
+def reserved_usd_of(store: CacheFile, key: str) -> float:
+    """Return the USD reserved for a call's last attempt; 0 if a user has released them."""
+    rows = store.rows("SELECT usd FROM open WHERE call = ? ORDER BY attempt", key)
+    return float(rows[-1][0]) if rows else 0.0
+
+
 class Coordinator(Protocol):
     """Coordinator of a cluster, which reserves each attempt of a chunk before it is sent."""
 
@@ -252,11 +258,6 @@ class Ledger:
             self._in_transaction_usd += usd - reserved_usd
         self.committed_usd = self._in_transaction_usd
         return driver, usd, over[0]
-
-    def reserved_usd(self, key: str) -> float:
-        """Return the USD reserved for a call's last attempt; 0 if a user has released them."""
-        rows = self.store.rows("SELECT usd FROM open WHERE call = ? ORDER BY attempt", key)
-        return float(rows[-1][0]) if rows else 0.0
 
     def rows(self) -> tuple[Rows, Rows]:
         """Return the rows of costs and of reservations, for ``share``."""

@@ -35,7 +35,7 @@ def load_models(study_folder: Path | None = None) -> dict[str, ModelEntry]:
     return entries
 
 
-def registry_files(study_folder: Path | None = None) -> list[Path]:
+def registry_files(study_folder: Path | None) -> list[Path]:
     """Return the files of ``load_models``, in order: an entry replaces an earlier one."""
     folders = [*reversed(experiments()), Path(), *([] if study_folder is None else [study_folder])]
     return [

@@ -13,7 +13,7 @@ import contextlib
 import hashlib
 import os
 import sqlite3
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing
 from dataclasses import dataclass
 from functools import cached_property
@@ -40,7 +40,6 @@ ATTEMPTS = TypeAdapter(Attempts)
 UNANSWERED, _DAMAGED = "attempts ", "damaged "
 UNSEEN = "the run ended before a reply was seen; it may have been charged"
 _GET = "SELECT mode, filename, value FROM Cache WHERE key = ? AND raw = 1"
-_IS_STORED = "SELECT 1 FROM Cache WHERE key = ? AND raw = 1"  # the value may be damaged
 # The rows of a call, and of its attempts in flight when their process ended.
 _LOOK_UP = """
 SELECT key, mode, filename, value FROM Cache WHERE raw = 1 AND key IN (?1, ?2)
@@ -209,10 +208,6 @@ class CallStore(CacheFile):
         Raises RecordingError where it is damaged or forged.
         """
         return self.recording[0].get(key) or self._entry(key, request)
-
-    def has_all(self, keys: Iterable[str]) -> bool:
-        """Return whether the calls with these keys are stored here, damaged ones included."""
-        return all(self.rows(_IS_STORED, key) for key in keys)
 
     def in_recording(self, key: str) -> bool:
         """Return whether the recording holds an entry of a call key."""

@@ -115,7 +115,7 @@ def units() -> str:
     return schema_sql().partition("\n")[0].removeprefix("-- ")
 
 
-def wide_trials(factors: Iterable[tuple[str, str]], sweep_ids: Sequence[str] | None = None) -> str:
+def wide_trials(factors: Iterable[tuple[str, str]], sweep_ids: Sequence[str] | None) -> str:
     """Return the SQL of the trials with their FACTOR_TYPES as columns; of some sweeps, or of all.
 
     A factor with the name of another column gets the prefix ``factor_``.
@@ -130,7 +130,7 @@ def wide_trials(factors: Iterable[tuple[str, str]], sweep_ids: Sequence[str] | N
     return WIDE_QUERY.format(levels=levels, only=only(sweep_ids))
 
 
-def export_tables(db: Path, folder: Path, sweep_ids: Sequence[str] | None = None) -> None:
+def export_tables(db: Path, folder: Path, sweep_ids: Sequence[str] | None) -> None:
     """Write a folder with all rows, or only with some sweeps and their trials.
 
     The dictionary has the meaning of each column and, in a row without a column, of each table.

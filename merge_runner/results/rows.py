@@ -50,8 +50,7 @@ _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
 
 def rows_of(record: TrialRecord) -> dict[str, list[Row]]:
     """Return the rows of a trial by table."""
-    spec, condition = record.spec, record.spec.kinematics
-    key = (spec.trial_id, spec.spec_hash)
+    spec, key, condition = record.spec, record.spec.key, record.spec.kinematics
     trial = (
         *(*key, spec.pair, spec.source),
         *(spec.model_left, spec.model_right, spec.variant, spec.condition),
@@ -74,15 +73,15 @@ def rows_of(record: TrialRecord) -> dict[str, list[Row]]:
 
 def factor_rows(spec: TrialSpec) -> Iterator[Row]:
     """Return the rows of ``trial_factors`` of a trial."""
-    key = (spec.trial_id, spec.spec_hash)
-    return ((*key, factor, level, factor in spec.words) for factor, level in spec.factors)
+    return ((*spec.key, factor, level, factor in spec.words) for factor, level in spec.factors)
 
 
 def _decision_rows(record: TrialRecord) -> Iterator[Row]:
+    key = record.spec.key
     for row in record.decisions:
         decision, prompt = row.decision, row.decision.prompt
         yield (
-            *(record.spec.trial_id, record.spec.spec_hash, row.number, row.time_s, row.side),
+            *(*key, row.number, row.time_s, row.side),
             *(decision.valid, decision.failure, decision.tactical, decision.rationale),
             None if decision.plan is None else list(decision.plan),
             list(decision.applied),

@@ -87,7 +87,7 @@ class Store:
         with write_database(self.path) as connection:
             connection.execute("INSERT INTO sweeps BY NAME SELECT unnest(?)", [sweep])
             _add_specs(connection, specs)
-            links = ((sweep["sweep_id"], spec.trial_id, spec.spec_hash) for spec in stored)
+            links = ((sweep["sweep_id"], *spec.key) for spec in stored)
             append(connection, "sweep_trials", links)
             _add_factors(connection, [*chain.from_iterable(map(factor_rows, stored))])
 
@@ -148,7 +148,7 @@ class Store:
         stored with other values, with the differing columns.
         """
         # Before the lock is taken, although trials that are already stored need no rows.
-        played = [(_key(record), record.status, rows_of(record)) for record in records]
+        played = [(record.spec.key, record.status, rows_of(record)) for record in records]
         calls = [call for record in records for call in record.calls]
         texts = [call.request.body for call in calls]
         texts += [attempt.reply or "" for call in calls for attempt in call.attempts]
@@ -169,7 +169,7 @@ class Store:
         Returns the number added, the number already stored, and the ids of trials that are stored
         with other values.
         """
-        keys = {_key(record): record.spec for record in records}
+        keys = {record.spec.key: record.spec for record in records}
         added = len(keys.keys() - self.ended_trials(keys))
         differing = list(self.write(None, records, specs))
         return added, len(records) - added - len(differing), differing
@@ -270,10 +270,6 @@ def _add_factors(connection: duckdb.DuckDBPyConnection, rows: Sequence[Row]) -> 
 def _add_specs(connection: duckdb.DuckDBPyConnection, specs: Mapping[str, str]) -> None:
     sql = "INSERT OR IGNORE INTO specs SELECT unnest(?), unnest(?)"
     connection.execute(sql, [list(specs), list(specs.values())])
-
-
-def _key(record: TrialRecord) -> TrialKey:
-    return record.spec.trial_id, record.spec.spec_hash
 
 
 def _ended(connection: duckdb.DuckDBPyConnection, keys: Sequence[TrialKey]) -> dict[TrialKey, bool]:

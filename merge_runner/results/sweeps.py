@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from merge_runner.errors import unknown_name
+from merge_runner.errors import UsageError, unknown_name
 from merge_runner.registry import require
 from merge_runner.results.database import append, by_name, read_database, write_database
 from merge_runner.results.instance import limit_memory
@@ -31,27 +31,33 @@ WHERE call_key IS NOT NULL ORDER BY ALL
 """
 
 
-def recorded_sweeps(
-    path: Path, sweep_ids: Sequence[str], cached: Callable[[Iterable[str]], bool] = bool
+def sweeps_to_export(
+    path: Path, sweep_ids: Sequence[str], has_all: Callable[[Sequence[str]], bool]
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """Return the rows of these sweeps and the keys of their calls.
 
-    Without ids it is the newest sweep with calls that are all ``cached``, or else the newest.
+    Without ids it is the newest sweep with calls that the store has all, or else the newest.
     Raises UsageError.
     """
     with read_database(path) as connection:
         sweeps = {row["sweep_id"]: row for row in by_name(connection.execute(ALL_SWEEPS))}
 
-        def calls_of(*ids: str) -> list[str]:
+        def calls_of(ids: Sequence[str]) -> list[str]:
             return [key for *_, key in connection.execute(CALLS_OF, [ids]).fetchall()]
 
-        ids = list(dict.fromkeys(sweep_ids))
-        if not ids:
-            newest = [*reversed(sweeps)] or [""]
-            with_calls = ((name, keys) for name in newest if (keys := calls_of(name)))
-            ids = [next((name for name, keys in with_calls if cached(keys)), newest[0])]
-        rows = [require(sweeps, "sweep", sweep_id, f"in {path}") for sweep_id in ids]
-        return rows, calls_of(*ids)
+        if sweep_ids:
+            ids = [*dict.fromkeys(sweep_ids)]
+            rows = [require(sweeps, "sweep", sweep_id, f"in {path}") for sweep_id in ids]
+            return rows, calls_of(ids)
+        newest_first = []
+        for sweep_id, row in reversed(sweeps.items()):
+            keys = calls_of([sweep_id])
+            if keys and has_all(keys):
+                return [row], keys
+            newest_first.append(([row], keys))
+        if not newest_first:
+            raise UsageError(f"{path} holds no sweep: there is nothing to record")
+        return newest_first[0]
 
 
 def sweep_facts(path: Path, sweep_id: str) -> dict[str, Any]:

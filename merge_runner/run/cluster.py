@@ -18,25 +18,26 @@ from collections import Counter, deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from merge_runner.errors import MergeRunnerError, RecordingError, SweepStopped, TrialSuspended
 from merge_runner.llm.attempts import Meter
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.call import Wait
 from merge_runner.llm.durable import Operation, Rows
-from merge_runner.llm.ledger import CallLabel, Cap, Ledger
+from merge_runner.llm.ledger import Cap, Ledger
 from merge_runner.llm.store import CachedCall
 from merge_runner.records import Attempt
 from merge_runner.run.cluster_worker import (
     Chunk,
+    MoneyEvent,
     Played,
     Recorded,
     RunSetup,
-    answer,
+    begin_chunk,
     fingerprint,
     forget,
-    play_chunk,
+    go_on,
     stop,
 )
 from merge_runner.run.estimate import most_shares
@@ -58,19 +59,17 @@ MOST_LOSSES = 3
 
 @dataclass(eq=False)
 class Assignment:
-    """A chunk on a worker, its events, and the money of its attempts.
+    """A chunk on a worker, and the money of its attempts.
 
-    An event is a kind, an attempt's number, USD and a CallLabel; after the last one comes None.
-    ``usd`` is by attempt its worst case, or its cost where that is known; ``is_reserved`` has those
-    that asked for a reservation. The rows ``booked`` are counted as spent already.
+    ``usd`` is by attempt its worst case, or its cost where that is known. The rows ``booked`` are
+    counted as spent already. ``unbooked`` is the error that ended the booking.
     """
 
     address: str
     chunk: Chunk
-    events: asyncio.Queue[tuple[Any, ...] | None] = field(default_factory=asyncio.Queue)
     usd: dict[int, float] = field(default_factory=dict)
-    is_reserved: dict[int, bool] = field(default_factory=dict)
     booked: Rows = field(default_factory=list)
+    unbooked: MergeRunnerError | None = None
 
     @property
     def unused_usd(self) -> float:
@@ -78,65 +77,49 @@ class Assignment:
         cap = self.chunk.cap
         return max(0.0, cap.usd - sum(self.usd.values())) if cap is not None else 0.0
 
-    async def play(self, client: Client, ledger: Ledger) -> tuple[Any, BaseException | None]:
-        """Let the worker play the chunk, and book its attempts meanwhile.
+    async def play(self, client: Client, ledger: Ledger) -> Played | Exception:
+        """Let the worker play the chunk and book its attempts; return why the worker is lost."""
+        run, name, answers = self.chunk.setup.run, self.chunk.name, dict[int, bool]()
+        # Not as a task of Dask, which would play a lost one again before its loss is booked.
+        ask = partial(client.run, workers=[self.address], on_error="return")
+        begun = await ask(begin_chunk, fingerprint(), pickle.dumps(self.chunk))
+        played: Played | Exception | None = begun[self.address]
+        while played is None:
+            progress = (await ask(go_on, run, name, answers))[self.address]
+            if isinstance(progress, Exception):
+                return progress
+            events, played = progress
+            if self.unbooked is None:
+                try:
+                    answers = await self._book(events, ledger)
+                except MergeRunnerError as exc:
+                    # No attempt gets an answer any more; paid replies are kept.
+                    self.unbooked, answers = exc, {}
+                    await ask(stop, run)
+        return played
 
-        Returns the worker's result, or why it is lost, and the error that ended the booking.
+    async def _book(self, events: Sequence[MoneyEvent], ledger: Ledger) -> dict[int, bool]:
+        """Reserve the attempts and book the costs of events, in their order.
+
+        Returns, for each attempt to reserve, whether it is reserved.
         """
-        run, setup = partial(client.run, workers=[self.address]), self.chunk.setup
-
-        async def play() -> Any:  # noqa: ANN401
-            # Not as a task of Dask, which would play a lost one again before its loss is booked.
-            chunk = pickle.dumps(self.chunk)
-            try:
-                results = await run(play_chunk, fingerprint(), chunk, on_error="return")
-            finally:
-                self.events.put_nowait(None)
-            return results[self.address]
-
-        async def book() -> None:
-            while (answers := await self._book(ledger)) is not None:
-                if answers:
-                    await run(answer, setup.run, self.chunk.name, answers, on_error="ignore")
-
-        playing, booking = asyncio.create_task(play()), asyncio.create_task(book())
-        await asyncio.wait([playing, booking], return_when=asyncio.FIRST_EXCEPTION)
-        if not playing.done():  # no attempt gets an answer any more; paid replies are stored
-            with contextlib.suppress(OSError):  # the scheduler is gone, as the result will say
-                await run(stop, setup.run, on_error="ignore")
-        await asyncio.wait([playing, booking])
-        unbooked = booking.exception()
-        return playing.result(), unbooked
-
-    async def _book(self, ledger: Ledger) -> dict[int, bool] | None:
-        """Reserve the attempts and book the costs of the next events, in their order.
-
-        Returns, for each attempt to reserve, whether it is reserved; None after the last event.
-        """
-        events = [await self.events.get()]
-        while not self.events.empty():
-            events.append(self.events.get_nowait())
-        messages = [event for event in events if event is not None]
-        # An attempt that has waited long asks again.
-        new = {e[:2]: e for e in messages if e[0] == "cost" or e[1] not in self.is_reserved}
         operations = list[Operation]()
-        for kind, number, usd, label in new.values():
-            attempt = self.chunk.name, number, usd
-            if kind == "reserve":
-                operations.append(partial(ledger.reserve, *attempt, CallLabel(*label)))
+        for event in events:
+            attempt, label = (self.chunk.name, event.number, event.usd), event.label
+            if event.is_cost:
+                operations.append(partial(ledger.pay, *attempt, label.driver))
             else:
-                operations.append(partial(ledger.pay, *attempt, CallLabel(*label).driver))
+                operations.append(partial(ledger.reserve, *attempt, label))
         results = await asyncio.gather(*map(ledger.store.write, operations))
-        for (kind, number, usd, _), result in zip(new.values(), results, strict=True):
-            if kind == "reserve":
-                self.is_reserved[number] = result
-            else:
+        answers = {}
+        for event, result in zip(events, results, strict=True):
+            if event.is_cost:
                 self.booked.append(result)
+            else:
+                answers[event.number] = result
             if result:
-                self.usd[number] = usd
-        if len(messages) < len(events):
-            return None
-        return {number: self.is_reserved[number] for kind, number, *_ in messages if kind != "cost"}
+                self.usd[event.number] = event.usd
+        return answers
 
 
 class ClusterRunner:
@@ -156,7 +139,7 @@ class ClusterRunner:
         self._cache = cache
         self._ledger = ledger
         self._groups: deque[list[TrialSpec]] = deque()
-        self._assigned: dict[asyncio.Task[Any], Assignment] = {}
+        self._assigned: dict[asyncio.Task[Played | Exception], Assignment] = {}
         self._losses = Counter[int]()  # by the order of a chunk's first trial
         self._one_by_one = False
 
@@ -182,7 +165,6 @@ class ClusterRunner:
         for spec in specs:  # trials that may ask the same go together, so that one worker asks
             groups.setdefault((spec.condition, spec.repetition), []).append(spec)
         self._groups.extend(groups.values())
-        self._client.subscribe_topic(self._setup.run, self._take)
         try:
             while self._groups or self._assigned:
                 addresses = list(await self._client.nthreads())
@@ -210,13 +192,6 @@ class ClusterRunner:
         with contextlib.suppress(OSError):
             await self._client.run(forget, self._setup.run, on_error="ignore")
 
-    def _take(self, event: tuple[float, tuple[Any, ...]]) -> None:
-        """Hand an event of a worker, with its time, to the chunk that it names first."""
-        name, *message = event[1]
-        for assignment in self._assigned.values():
-            if assignment.chunk.name == name:
-                assignment.events.put_nowait(tuple(message))
-
     async def _give(self, address: str) -> None:
         """Give a chunk to a worker, unless the chunks under way hold all shares."""
         setup, options = self._setup, self._setup.options
@@ -235,14 +210,10 @@ class ClusterRunner:
             kept_usd = sum(assignment.unused_usd for assignment in self._assigned.values())
             share_usd = max(0.0, self._ledger.left_usd - kept_usd) / idle
             cap = Cap(share_usd, f"a task's share of {cap.source}")
-        parts = setup.plan.parts.without_code()
+        plan = setup.plan.model_copy(update={"parts": setup.plan.parts.without_code()})
         chunk = Chunk(
             name=f"task {secrets.token_hex(8)}",
-            setup=replace(
-                setup,
-                plan=setup.plan.model_copy(update={"parts": parts}),
-                options=replace(options, in_flight=in_flight),
-            ),
+            setup=replace(setup, plan=plan, options=replace(options, in_flight=in_flight)),
             cap=cap,
             specs=specs,
             share=1 / slots,
@@ -264,13 +235,13 @@ class ClusterRunner:
         )
         for work in filter(asyncio.Task.done, works):
             assignment = self._assigned.pop(work)
-            played, unbooked = work.result()
+            played = work.result()
             if isinstance(played, Played):
                 self._keep(assignment, played)
             else:
                 self._lose(assignment, played)
-            if unbooked is not None:
-                raise unbooked
+            if assignment.unbooked is not None:
+                raise assignment.unbooked
 
     def _keep(self, assignment: Assignment, played: Played) -> None:
         """Keep the results and the costs of a chunk; costs already ``booked`` count once."""

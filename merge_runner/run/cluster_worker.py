@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import pickle
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AsyncExitStack, closing
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from itertools import count
 from pathlib import Path
@@ -38,9 +38,8 @@ from merge_runner.trial_records import TrialRecord, TrialSpec
 if TYPE_CHECKING:
     from distributed import Worker
 
-# The coordinator may be slow, or its machine suspended; one that is gone never answers. Dask may
-# lose an event, so that it is sent again.
-SILENT_S, AGAIN_S = 300, 15
+# The coordinator may be slow, or its machine suspended; one that is gone never answers.
+SILENT_S = 300
 # The calls with an answer, and by key the attempts at those without one.
 Recorded = tuple[Sequence[CachedCall], Sequence[tuple[str, tuple[Attempt, ...]]]]
 
@@ -97,51 +96,58 @@ class Played:
             self.error, self.exit_code = _described(error), SweepStopped.exit_code
 
 
+@dataclass(frozen=True, slots=True)
+class MoneyEvent:
+    """An attempt that waits until its worst case is reserved, or the cost of one that is."""
+
+    number: int
+    usd: float
+    label: CallLabel
+    is_cost: bool = False
+
+
 class RemoteCoordinator:
     """Coordinator of a chunk, which reserves its attempts before they are sent.
 
-    ``tell`` sends it ``"reserve"`` with an attempt's worst case, and then ``"cost"`` with its cost,
-    each with the attempt's number.
+    It fetches the ``events`` that are ``changed``, and answers attempts by ``waiting``.
     """
 
-    def __init__(self, tell: Callable[..., object]) -> None:
-        self._tell = tell
+    def __init__(self) -> None:
+        self.events: list[MoneyEvent] = []
+        self.changed = asyncio.Event()  # also at the end of the chunk
+        self.waiting: dict[int, asyncio.Future[bool]] = {}
+        self.work: asyncio.Task[Played] | None = None
         self._numbers = count(1)
-        self._waiting: dict[int, asyncio.Future[bool]] = {}
         self._reserved: dict[str, tuple[int, CallLabel]] = {}  # a call has one attempt at a time
+
+    def _tell(self, number: int, usd: float, label: CallLabel, *, is_cost: bool = False) -> None:
+        self.events.append(MoneyEvent(number, usd, label, is_cost))
+        self.changed.set()
 
     async def reserve(self, key: str, usd: float, label: CallLabel) -> bool:
         """Return whether an attempt is reserved; False if it exceeds the cap."""
         number = next(self._numbers)
-        answer = self._waiting[number] = asyncio.get_running_loop().create_future()
+        answer = self.waiting[number] = asyncio.get_running_loop().create_future()
+        self._tell(number, usd, label)
         try:
             async with asyncio.timeout(SILENT_S):
-                while not answer.done():
-                    self._tell("reserve", number, usd, label)
-                    await asyncio.wait([answer], timeout=AGAIN_S)
+                is_paid: bool = await answer
         except TimeoutError as exc:
             raise SweepStopped(f"the coordinator has said nothing for {SILENT_S} s") from exc
         except asyncio.CancelledError:
-            self._tell("cost", number, 0.0, label)  # it may be reserved
+            self._tell(number, 0.0, label, is_cost=True)  # it may be reserved
             raise
         finally:
-            del self._waiting[number]
-        is_paid: bool = answer.result()
+            del self.waiting[number]
         if is_paid:
             self._reserved[key] = number, label
         return is_paid
-
-    def answer(self, answers: Mapping[int, bool]) -> None:
-        """Take the coordinator's answers, by the attempts' numbers."""
-        for number, is_paid in answers.items():
-            if number in self._waiting and not self._waiting[number].done():
-                self._waiting[number].set_result(is_paid)
 
     def report_cost(self, key: str, usd: float | None) -> None:
         """Report the cost of an attempt that may be reserved, where it is known."""
         number, label = self._reserved.pop(key, (0, CallLabel()))
         if number and usd is not None:
-            self._tell("cost", number, usd, label)
+            self._tell(number, usd, label, is_cost=True)
 
 
 @dataclass
@@ -151,20 +157,13 @@ class WorkerRun:
     stopping: asyncio.Event = field(default_factory=asyncio.Event)
     limiters: dict[float, dict[str, Limiter]] = field(default_factory=dict)
     plan: Plan | None = None
-    # By the name of the chunk under way.
-    coordinators: dict[str, RemoteCoordinator] = field(default_factory=dict)
+    # By the name of a chunk under way.
+    chunks: dict[str, RemoteCoordinator] = field(default_factory=dict)
 
 
 def _state(run: str, worker: Worker) -> WorkerRun:
     state: WorkerRun = worker.extensions.setdefault(run, WorkerRun())
     return state
-
-
-def answer(run: str, name: str, answers: Mapping[int, bool], *, dask_worker: Worker) -> None:
-    """Give a chunk the coordinator's answers."""
-    coordinator = _state(run, dask_worker).coordinators.get(name)
-    if coordinator is not None:
-        coordinator.answer(answers)
 
 
 def stop(run: str, *, dask_worker: Worker) -> None:
@@ -187,8 +186,11 @@ def forget(run: str, *, dask_worker: Worker) -> None:
     dask_worker.extensions.pop(run, None)
 
 
-async def play_chunk(program: str, pickled: bytes, *, dask_worker: Worker) -> Played:
-    """Play a Chunk, which only a worker with the same ``program`` can read."""
+async def begin_chunk(program: str, pickled: bytes, *, dask_worker: Worker) -> Played | None:
+    """Begin to play a Chunk, which only a worker with the same ``program`` can read.
+
+    Returns the result of one that cannot be played.
+    """
     if fingerprint() != program:
         differs = (
             f"it has merge-runner {fingerprint()}, and the coordinator {program}: install the same "
@@ -205,15 +207,29 @@ async def play_chunk(program: str, pickled: bytes, *, dask_worker: Worker) -> Pl
     except MergeRunnerError as exc:
         return Played(error=str(exc), exit_code=exc.exit_code)
     chunk = replace(chunk, setup=replace(chunk.setup, plan=state.plan))
-
-    def tell(kind: str, number: int, usd: float, label: CallLabel) -> None:
-        dask_worker.log_event(chunk.setup.run, (chunk.name, kind, number, usd, astuple(label)))
-
+    coordinator = state.chunks[chunk.name] = RemoteCoordinator()
     with using(state.plan.parts.catalogue):
-        try:
-            return await _play(chunk, state, tell)
-        finally:
-            state.coordinators.pop(chunk.name, None)
+        coordinator.work = asyncio.create_task(_play(chunk, state, coordinator))
+    coordinator.work.add_done_callback(lambda _: coordinator.changed.set())
+    return None
+
+
+async def go_on(
+    run: str, name: str, answers: Mapping[int, bool], *, dask_worker: Worker
+) -> tuple[list[MoneyEvent], Played | None]:
+    """Give a chunk the coordinator's answers; return its next events, and its result at its end."""
+    chunks = _state(run, dask_worker).chunks
+    coordinator = chunks[name]
+    for number, is_paid in answers.items():
+        if number in coordinator.waiting and not coordinator.waiting[number].done():
+            coordinator.waiting[number].set_result(is_paid)
+    await coordinator.changed.wait()
+    coordinator.changed.clear()
+    events, coordinator.events = coordinator.events, []
+    if coordinator.work is None or not coordinator.work.done():
+        return events, None
+    del chunks[name]
+    return events, coordinator.work.result()
 
 
 def _with_code(plan: Plan) -> Plan:
@@ -223,7 +239,7 @@ def _with_code(plan: Plan) -> Plan:
     return plan.model_copy(update={"parts": plan.parts.with_code(plan.arms, catalogue)})
 
 
-async def _play(chunk: Chunk, state: WorkerRun, tell: Callable[..., object]) -> Played:
+async def _play(chunk: Chunk, state: WorkerRun, coordinator: RemoteCoordinator) -> Played:
     setup, played = chunk.setup, Played()
 
     def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
@@ -234,7 +250,6 @@ async def _play(chunk: Chunk, state: WorkerRun, tell: Callable[..., object]) -> 
     async with AsyncExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="merge-runner-")))
         replies = stack.enter_context(closing(ResponseCache(folder)))
-        coordinator = state.coordinators[chunk.name] = RemoteCoordinator(tell)
         ledger = Ledger(replies, setup.plan.ledger, chunk.cap, coordinator)
         overruns = [(driver, 0, 0, ratio) for driver, ratio in chunk.overruns]
         replies.put_now(*chunk.recorded, [partial(ledger.share, "", overruns, [])])

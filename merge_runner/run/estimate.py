@@ -22,7 +22,7 @@ from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 from merge_runner.study.arms import Arm
 
-# A reply's JSON around the prompt, and later prompts with longer histories and numbers.
+# A request's JSON around the prompt (1.10 of the baseline's), and prompts with longer numbers.
 PROMPT_MARGIN = 1.25
 BYTES_A_TOKEN = 4  # about, in English
 # Trials that turn out longer, and attempts that are charged but bring no answer.
@@ -179,7 +179,7 @@ def _cents(usd: float) -> float | None:
 
 
 def trial_costs(
-    plan: Plan, facts: Mapping[str, Usage | None], *, batch: bool = False
+    plan: Plan, facts: Mapping[str, Usage | None], *, batch: bool
 ) -> Callable[[int], float]:
     """Return a function from a trial's order to its expected cost in USD, perhaps in batches.
 

@@ -83,17 +83,14 @@ def estimate_lines(expected: Estimate) -> Iterator[str]:
     yield f"calls   about {expected.calls} not stored yet"
     yield f"tokens  {tokens}"
     yield from _output_caps(expected)
-    if not expected.rounds:
-        yield f"cost    {usd_text(expected.cost_usd)}"
-        yield from _by_model(expected)
-        yield from _by_cap(expected)
-        yield f"time    about {expected.minutes} minutes"
-        return
-    single = f"{usd_text(expected.singly_usd)} and {expected.minutes} minutes by normal requests"
-    yield f"cost    {usd_text(expected.cost_usd)} in batches; {single}"
+    cost, time = usd_text(expected.cost_usd), f"{expected.minutes} minutes"
+    if expected.rounds:
+        cost += f" in batches; {usd_text(expected.singly_usd)} and {time} by normal requests"
+        time = (
+            f"{expected.rounds} rounds; each takes as long as its slowest batch: minutes, an hour, "
+            "a day at most"
+        )
+    yield f"cost    {cost}"
     yield from _by_model(expected)
     yield from _by_cap(expected)
-    yield (
-        f"time    about {expected.rounds} rounds; each takes as long as its slowest batch: "
-        "minutes, an hour, a day at most"
-    )
+    yield f"time    about {time}"

@@ -59,7 +59,7 @@ class LocalRunner:
     @property
     def waiting_for_money(self) -> int:
         """The number of running trials that wait for money."""
-        return len(set().union(*(client.budget.waiting for client in self.clients.values())))
+        return len(set().union(*(client.budget.queue.trials for client in self.clients.values())))
 
     def _is_idle(self) -> bool:
         """Return whether every running trial waits for a reply, so that no trial can go on."""
@@ -143,8 +143,8 @@ class LocalRunner:
             failed.add(key)
             if len(failed) >= FAILURES_IN_A_ROW:
                 raise ProviderDown(
-                    f"the last {len(failed)} trials with {name} failed and no call was answered "
-                    f"in between ({record.error}): the rest is not tried. When the service answers "
+                    f"{len(failed)} different calls to {name} failed and none was answered in "
+                    f"between ({record.error}): the rest is not tried. When the service answers "
                     "again, run the same command to go on"
                 )
 

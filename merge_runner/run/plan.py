@@ -101,11 +101,6 @@ class Plan(BaseModel):
         return all(entry.price == "free" for entry in self.entries.values())
 
     @property
-    def replays_humans(self) -> bool:
-        """True where imported human trials are replayed, which only this process has read."""
-        return self.parts.replays_humans
-
-    @property
     def driver(self) -> str:
         """The drivers with their endpoints, as text."""
         pairs = (pair_name(arm.names, self.endpoints) for arm in self.arms)

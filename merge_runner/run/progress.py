@@ -7,7 +7,7 @@ import re
 import sys
 import textwrap
 from collections import Counter, defaultdict
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -90,7 +90,8 @@ class Progress:
         ended = counts.total() - counts["suspended"] - failed
         batches = first_of(self.batches(), "others", REASONS_SHOWN)
         # The time that a batch takes is unknown.
-        left_s = None if batches else self._left_s(elapsed_s, ended + failed)
+        shares = self._shares()
+        left_s = None if batches else self._left_s(elapsed_s, ended + failed, shares)
         before = f" (+{self.trials.stored} stored before)" if self.trials.stored else ""
         workers = "" if self.runner.workers is None else f" on {self.runner.workers} workers"
         waiting = self.runner.waiting_for_money
@@ -105,7 +106,7 @@ class Progress:
         rows = [
             *dict.fromkeys(("WARNING", text) for text in self._warnings()),
             ("trials", trials),
-            *(("decided", text) for text in self._decided() if ended + failed < total),
+            *(("decided", text) for text in _decided(shares) if ended + failed < total),
             ("failed", str(failed)),
             ("calls", calls_text(*meter.answered)),
             ("cost", cost),
@@ -123,7 +124,7 @@ class Progress:
             rows=tuple((name, printable(text)) for name, text in rows),
         )
 
-    def _left_s(self, elapsed_s: float, ended: int) -> float | None:
+    def _left_s(self, elapsed_s: float, ended: int, shares: Mapping[str, float]) -> float | None:
         """Return the estimated time left in s; None while there is nothing to estimate it from.
 
         The slowest model determines it. Trials that run in step all end late, so early in a run the
@@ -133,7 +134,7 @@ class Progress:
         if ended >= total:
             return None
         parts = []
-        for model, share in self._shares().items():
+        for model, share in shares.items():
             done = self._of(model, self.trials.done)
             todo = self._of(model, self.trials.todo)
             if done < todo:
@@ -163,11 +164,6 @@ class Progress:
             made[self.plan.registered.get(name, name)] += meter.calls_live + meter.calls_cached
         return {m: min(made[m] / calls, 0.99) for m, calls in expected.items() if calls}
 
-    def _decided(self) -> Iterator[str]:
-        shares = self._shares()
-        for model, share in shares.items():
-            yield f"{f'{model}: ' * (len(shares) > 1)}about {share:.0%} of the decisions"
-
     def _warnings(self) -> Iterator[str]:
         if problem := self.trials.unstored():
             yield problem
@@ -185,6 +181,11 @@ class Progress:
             until = f" until {max(ends):%H:%M:%S} UTC" if ends else ""
             texts.append(f"{number} {reason}{until}")
         return first_of(texts, "other reasons", REASONS_SHOWN)
+
+
+def _decided(shares: Mapping[str, float]) -> Iterator[str]:
+    for model, share in shares.items():
+        yield f"{f'{model}: ' * (len(shares) > 1)}about {share:.0%} of the decisions"
 
 
 @asynccontextmanager

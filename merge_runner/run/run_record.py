@@ -81,7 +81,7 @@ async def check(
 
 
 async def _read_back(session: Session, db: Path, sweep_id: str) -> tuple[dict[str, Any], Audit]:
-    keys = [(spec.trial_id, spec.spec_hash) for spec in (*session.stored, *session.todo)]
+    keys = [spec.key for spec in (*session.stored, *session.todo)]
     audited = partial(audit_sweep, db, sweep_id, keys, finished=session.exit_code == 0)
     if not session.options.replay:
         session.ledger.read()

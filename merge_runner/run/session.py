@@ -85,7 +85,7 @@ async def open_session(
     recorded = partial(spilled, options.recordings) if options.recordings else None
     with closing(ResponseCache(options.cache, overlay=recorded)) as cache:
         plan = await with_names(plan, options, cache, say)
-        specs = {(spec.trial_id, spec.spec_hash): spec for spec in plan.trial_specs()}
+        specs = {spec.key: spec for spec in plan.trial_specs()}
         # A replay derives everything from the recorded replies alone, so it plays every trial.
         with unreadable_is_usage():
             ended = set() if options.replay else Store(options.db).ended_trials(specs)

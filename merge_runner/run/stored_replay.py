@@ -107,7 +107,7 @@ def check_programs(path: Path, plan: Plan, stored: Sequence[TrialSpec]) -> None:
     arms = plan.by_label()
     programs = {name: sorted({*arm.asked.values()} - {*arm.entries}) for name, arm in arms.items()}
     firsts = {spec.spec_hash: spec for spec in reversed(stored) if programs[spec.arm]}
-    by_key = {(spec.trial_id, spec.spec_hash): spec for spec in firsts.values()}
+    by_key = {spec.key: spec for spec in firsts.values()}
     if not by_key:
         return
     replies = StoredReplies(plan, arms)
@@ -236,7 +236,7 @@ def _replay(
     """Play trials by the replies of a cache, or else the stored ones, and compare their rows."""
     stored = StoredReplies(plan, plan.by_label())
     replay = Replay(plan, cache or stored)
-    by_key = {(spec.trial_id, spec.spec_hash): spec for spec in specs}
+    by_key = {spec.key: spec for spec in specs}
     kind = "replay" if cache is None else "cache"
     findings: list[Finding] = []
     for key, tables in in_order(connection, by_key):
@@ -327,7 +327,7 @@ def _findings(
     record: TrialRecord, tables: Mapping[str, Stored], kind: str, sweep_id: str
 ) -> Iterator[Finding]:
     """Compare a trial as it was played with its stored rows, unless it lacks a reply."""
-    key = (record.spec.trial_id, record.spec.spec_hash)
+    key = record.spec.key
     (stored,) = tables["trials"].named(key)
     failed = stored["status"] == "failed"
     if record.failed_calls and not failed:

@@ -42,7 +42,7 @@ def cross(
     only: Mapping[str, Sequence[str]],
     *,
     conditions: int,
-    mirror: bool = False,
+    mirror: bool,
 ) -> list[Arm]:
     """Return the arms of a study, model by model; raises UsageError for invalid combinations.
 

@@ -254,8 +254,7 @@ def read_study(name: str) -> StudySource:
         if name not in files:
             raise unknown_name("sweep", name, sorted(files), "or a path")
         path = files[name]
-    text, sources = read_text(path), dict[str, str]()
-    study = StudySource(name=path.stem, text=text, plugins=sources, path=path)
+    study, sources = StudySource(name=path.stem, text=read_text(path), plugins={}, path=path), {}
     for file_name in study.file.plugins.get("files", ()):
         plugin = path.parent / file_name
         if not plugin.resolve().is_relative_to(path.parent.resolve()):

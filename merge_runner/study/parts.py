@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import ast
+import builtins
 import hashlib
 import re
 import sys
 import threading
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from importlib import import_module
 from importlib.abc import InspectLoader
 from importlib.util import module_from_spec, spec_from_loader
 from pathlib import Path
 from traceback import extract_tb
 from types import CodeType, ModuleType
+from typing import Any
 from urllib.parse import urlsplit
 
 from merge_runner.config import state_folder
@@ -54,7 +53,6 @@ from merge_runner.text_safety import one_line, printable, say
 # Fields that identify the model, its server, key and price; the others are request parameters.
 IDENTITY = {"provider", "format", "id", "base_url", "path", "key_env", "auth", "price"}
 _importing = threading.RLock()
-_parsing = threading.Lock()  # Python 3.11 counts the depth of a tree for all threads
 STUDY_PLUGINS = "study_plugins"
 """Prefix of the package of a study's plug-ins; a hash follows, so that studies do not share it."""
 
@@ -177,8 +175,6 @@ def catalogue_of(
     It has the parts of the plug-ins, of the file and those ``registered`` before. The user has
     given consent to the code (``load_study``). Raises UsageError.
     """
-    for source in plugins.values():
-        _import_others(source)
     known = registered.parts if registered else {}
     parts = {kind: dict(things) for kind, things in known.items()}
     with collecting(Catalogue(text, plugins, parts)) as catalogue:
@@ -218,23 +214,13 @@ def declared_catalogue(file: StudyFile) -> Catalogue:
     return catalogue_of(file.model_copy(update={"drivers": known}), "", {})
 
 
-def _import_others(source: str) -> None:
-    """Import the other modules of a plug-in first: their registrations are no part of the study.
+def _import(*args: Any, **kwargs: Any) -> Any:  # noqa: ANN401 # as the built-in function
+    """Import a module as the import statements of plug-ins do.
 
-    A name that a plug-in imports from a package may be one of the package's modules.
+    Its parts are installed, and not those of the study: the next study does not run it again.
     """
-    names: list[str] = []
-    with suppress(*FAULTS):  # reported, with its line, when the plug-in runs
-        with _parsing:
-            tree = ast.parse(source)
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Import):
-                names += [alias.name for alias in node.names]
-            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-                names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-    for name in names:
-        with suppress(UsageError, *FAULTS), installing():
-            import_module(name)
+    with installing():
+        return __import__(*args, **kwargs)
 
 
 @dataclass
@@ -276,6 +262,7 @@ def _run_plugin(name: str, file: str, source: str) -> None:
     spec = spec_from_loader(name, loader)
     assert spec is not None
     module = module_from_spec(spec)
+    vars(module)["__builtins__"] = {**vars(builtins), "__import__": _import}
     # An earlier module stays until this one is complete: a running driver may import from it.
     sys.modules.setdefault(name, module)
     try:

@@ -24,8 +24,8 @@ from merge_runner_analysis.commands import open_browser
 from merge_runner_analysis.tables import TABLES
 from tests.support import program
 from tests.support.harness import PROGRAM, environment
+from tests.support.program import every_command
 from tests.support.studies import damage
-from tests.unit.test_cli import every_command
 
 
 @pytest.fixture

@@ -141,3 +141,9 @@ async def start(arguments, *, cwd: Path, env: dict[str, str], module: str = "") 
         start_new_session=True,
     )
     return Process(process, streams)
+
+
+def every_command(command, path=()):
+    yield path, command
+    for name, inner in getattr(command, "commands", {}).items():
+        yield from every_command(inner, (*path, name))

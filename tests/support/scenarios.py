@@ -21,6 +21,9 @@ ENDINGS = {
     ":generateContent": "gemini",
     "/messages": "anthropic",
 }
+OPENAI, GEMINI = ("openai-chat", "openai-responses"), "gemini"
+MODELS = dict.fromkeys(OPENAI, "o3-2025-04-16")
+MODELS |= {GEMINI: "gemini-2.5-pro", "anthropic": "claude-sonnet-4-6"}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,8 @@
 """The analysis's tables, as tests read them."""
 
+from merge_runner_analysis.provenance import provenance
 from merge_runner_analysis.tables import TABLES, make_tables
+from merge_runner_analysis.web.report import alarms
 
 # The comparison with humans takes seconds for each driver.
 QUICK = [name for name in TABLES if name != "verdicts"]
@@ -29,3 +31,8 @@ def cell(table, row, column):
 def notes_with(table, words):
     """The notes of a table that hold these words."""
     return [note for note in table.notes if words in note]
+
+
+def alarms_of(study):
+    found = alarms(study, provenance(study.db)).items()
+    return {title: f"{'; '.join(texts)}. {meaning}" for title, (texts, meaning) in found}

@@ -5,6 +5,7 @@ import functools
 import types
 from unittest import mock
 
+import aiohttp
 import pytest
 from asyncio_throttle import throttler
 
@@ -56,7 +57,11 @@ def in_virtual_time(test):
 
     @functools.wraps(test)
     def run(*args, **kwargs):
-        with mock.patch.object(throttler, "time", THROTTLE), asyncio.Runner() as runner:
+        with (
+            mock.patch.object(throttler, "time", THROTTLE),
+            mock.patch.object(aiohttp.connector, "monotonic", now_s),  # idle connections grow old
+            asyncio.Runner() as runner,
+        ):
             runner.run(limited(*args, **kwargs))
 
     return run

@@ -17,6 +17,7 @@ from merge_runner.cli import complete_app
 from merge_runner.cli.app import GROUP, app_with_one_command
 from merge_runner.cli.signals import on_signal
 from merge_runner.run.options import Options
+from tests.support.program import every_command
 
 COMMANDS = {
     *("sweep", "replay", "sql", "digest", "models", "emulate", "recording", "audit"),
@@ -76,12 +77,6 @@ def test_packages_name_their_commands_by_an_entry_point(tmp_path, monkeypatch):
     invalidate_caches()
     with pytest.raises(ModuleNotFoundError, match="no_such_library"):
         complete_app()
-
-
-def every_command(command, path=()):
-    yield path, command
-    for name, inner in getattr(command, "commands", {}).items():
-        yield from every_command(inner, (*path, name))
 
 
 def test_every_command_that_prints_a_result_prints_it_as_json():

@@ -1,5 +1,4 @@
 import re
-import tomllib
 from datetime import date
 
 import pytest
@@ -17,11 +16,12 @@ from merge_runner.providers import (
     normalised_url,
     resolve_endpoint,
 )
+from tests.support.cases import table
 from tests.support.harness import PROJECT
 
 REGISTRY = PROJECT / "experiments/models.toml"
 KEYS = {f"{name}_API_KEY": "k" for name in ("OPENAI", "GEMINI", "ANTHROPIC", "OPENROUTER")}
-CASES = tomllib.loads((PROJECT / "tests/cases/endpoints.toml").read_text())
+CASES = table("endpoints")
 
 
 def entry(provider="openai", **changes):

@@ -18,7 +18,7 @@ from merge_runner.prompts.blocks import BLOCKS, FIELDS, VARIANTS, Situation
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.tables import TABLES
 from tests.support.harness import PROJECT, asked_to_write
-from tests.unit.prompts.test_render import FIRST
+from tests.support.prompts import FIRST
 
 WIDTH = 80
 COMMANDS = """\

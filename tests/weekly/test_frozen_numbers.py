@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.integration.test_frozen_numbers import MORE_DATABASES, check
+from tests.support.frozen import MORE_DATABASES, check
 
 
 @pytest.mark.parametrize("name", MORE_DATABASES)

@@ -97,7 +97,7 @@ def export_folder(
             for request in (*(("table", name, "", "") for name in TABLES), ("audit",), *figures):
                 site.computing.ask(request, stamp_of(db))
         try:
-            asyncio.run(_crawl(site, rows, begin, heads, stage, progress))
+            asyncio.run(_save_all(_Crawl(site, begin, stage, progress), rows, heads))
         except BrokenProcessPool:
             raise UsageError("nothing was written: a process that helped was ended") from None
     return index
@@ -147,74 +147,81 @@ def _page_of_trials(site: Site, rows: Sequence[Row]) -> str:
     return _linked(page)
 
 
-async def _crawl(
-    site: Site,
-    rows: Sequence[Row],
-    begin: str,
-    heads: tuple[str, ...],
-    stage: Path,
-    progress: Callable[[int], object],
-) -> None:
-    """Save the pages to which links lead, and a page for each trial."""
-    files, waiting = {begin: INDEX}, [begin]
-    names, done = {INDEX}, count(1)
-    transport = httpx.ASGITransport(explorer(site), raise_app_exceptions=False)
-    plain = {"accept-encoding": "identity"}
-    client = httpx.AsyncClient(transport=transport, base_url=f"http://{LOOPBACK}", headers=plain)
+class _Crawl:
+    """Pages that are saved in ``stage``: ``begin``, all of trials, and those to which links lead.
 
-    def named(page: str) -> str:
+    ``files`` has the file of each page by its address, empty for none; ``waiting`` are not saved.
+    """
+
+    def __init__(
+        self, site: Site, begin: str, stage: Path, progress: Callable[[int], object]
+    ) -> None:
+        self.site, self.stage, self.progress = site, stage, progress
+        self.begin, self.files, self.waiting = begin, {begin: INDEX}, [begin]
+        self._names, self._done = {INDEX}, count(1)
+        transport = httpx.ASGITransport(explorer(site), raise_app_exceptions=False)
+        plain = {"accept-encoding": "identity"}
+        url = f"http://{LOOPBACK}"
+        self.client = httpx.AsyncClient(transport=transport, base_url=url, headers=plain)
+
+    def add(self, page: str) -> str:
         """Return the file of a page that has none yet."""
-        files[page] = name = _name_of(page, names)
-        names.add(name.lower())
+        self.files[page] = name = _name_of(page, self._names)
+        self._names.add(name.lower())
         return name
 
-    async def file_of(page: str) -> str:
-        """Return the file of a page; empty for none."""
-        if page in files:
-            return files[page]
-        name = named(page)
-        if name.endswith(".html"):
-            waiting.append(page)
-            return name
-        # A style, a script, a table; a figure that cannot be drawn has no file.
-        file = await client.get(page)
-        if file.is_error:
-            files[page] = ""
-        else:
-            check_leaks(site.db, name, file.text)
-            (stage / name).parent.mkdir(parents=True, exist_ok=True)
-            (stage / name).write_bytes(file.content)
-        return files[page]
-
-    async def save(page: str, text: str) -> None:
-        check_leaks(site.db, files[page], text)
-        root = "" if page == begin else "../"
+    async def save(self, page: str, text: str) -> None:
+        """Save a page with links to the files of others; raise UsageError for a leak."""
+        check_leaks(self.site.db, self.files[page], text)
+        root = "" if page == self.begin else "../"
         parts = text.split(MARK)
         for place in range(1, len(parts), 2):
-            file = await file_of(parts[place])
+            file = await self._file_of(parts[place])
             parts[place] = escape(root + file) if file else ""
-        (stage / files[page]).parent.mkdir(exist_ok=True)
-        (stage / files[page]).write_text(_linked("".join(parts)), encoding="utf-8")
-        progress(next(done))
+        path = self.stage / self.files[page]
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(_linked("".join(parts)), encoding="utf-8")
+        self.progress(next(self._done))
 
+    async def _file_of(self, page: str) -> str:
+        if page in self.files:
+            return self.files[page]
+        name = self.add(page)
+        if name.endswith(".html"):
+            self.waiting.append(page)
+            return name
+        # A style, a script, a table; a figure that cannot be drawn has no file.
+        file = await self.client.get(page)
+        if file.is_error:
+            self.files[page] = ""
+        else:
+            check_leaks(self.site.db, name, file.text)
+            (self.stage / name).parent.mkdir(parents=True, exist_ok=True)
+            (self.stage / name).write_bytes(file.content)
+        return self.files[page]
+
+
+async def _save_all(crawl: _Crawl, rows: Sequence[Row], heads: tuple[str, ...]) -> None:
+    """Save the pages of a crawl; helper processes render those of trials."""
+    waiting = crawl.waiting
     for row in rows:
-        named(Links().trial(row))
+        crawl.add(Links().trial(row))
     helpers = processes(min(os.cpu_count() or 1, MOST_HELPERS))
     with ExitStack() as ends:
         ends.callback(helpers.shutdown, cancel_futures=True)
         # Most pages are of trials, and most of the time they are what is waited for.
         rendering = deque(
-            helpers.submit(_trial_pages, site.db, heads, rows[first : first + READ_AT_ONCE])
+            helpers.submit(_trial_pages, crawl.site.db, heads, rows[first : first + READ_AT_ONCE])
             for first in range(0, len(rows), READ_AT_ONCE)
         )
         while waiting or rendering:
             if rendering and (rendering[0].done() or not waiting):
                 for page, text in (await asyncio.wrap_future(rendering.popleft())).items():
-                    await save(page, text)
+                    await crawl.save(page, text)
             else:
                 page = min(waiting, key=lambda page: page.startswith(LAST))
                 waiting.remove(page)
-                await save(page, await _served(client, page))
+                await crawl.save(page, await _served(crawl.client, page))
 
 
 async def _served(client: httpx.AsyncClient, address: str) -> str:

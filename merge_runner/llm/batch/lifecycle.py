@@ -88,7 +88,7 @@ class Lifecycle:
                 await attempt.reservation.begin(attempt.number)
                 begun.append(attempt.request)
             except TrialSuspended as exc:
-                batch.refused[attempt.request.key] = exc
+                batch.suspended[attempt.request.key] = exc
 
         await asyncio.gather(*map(begin, requests))
         await self._note(batch, lines={r.key: batch.note.lines[r.key] for r in begun})

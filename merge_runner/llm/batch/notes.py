@@ -42,14 +42,14 @@ class Batch:
 
     ``work`` follows it to its end; None: no call of this run waits for it yet. ``results`` has the
     outcomes that are not taken yet, by key. All other requests have ``default``; None: they
-    go into the next round. ``refused`` has, by key, why the money of a request was not reserved.
+    go into the next round. ``suspended`` has, by key, why no money was reserved for a request.
     An ``error`` ends the sweep.
     """
 
     note: BatchNote
     results: dict[str, AttemptOutcome] = field(default_factory=dict)
     default: AttemptOutcome | None = None
-    refused: dict[str, TrialSuspended] = field(default_factory=dict)
+    suspended: dict[str, TrialSuspended] = field(default_factory=dict)
     error: MergeRunnerError | None = None
     work: asyncio.Task[None] | None = None
 

@@ -83,8 +83,8 @@ class Rounds:
         batch = batch or await self._next_round(request, number, reservation, model)
         while True:
             await asyncio.shield(batch.work or self._lifecycle.start(batch))
-            if refusal := batch.refused.get(request.key):
-                raise refusal
+            if without_money := batch.suspended.get(request.key):
+                raise without_money
             outcome = batch.results.pop(request.key, batch.default)
             if outcome is None and not self.submits:
                 outcome = no_result("not_created", "the run ended before", charged=False)
@@ -170,7 +170,7 @@ class BatchSender:
 
     rounds: Rounds
     model: str
-    price_factor: float = 1.0
+    price_factor: float
 
     def takes(self, call: Call) -> bool:
         """Return whether the next attempt of a call goes into a batch, or waits in one already."""

@@ -51,11 +51,11 @@ class OpenAIResponses(WireFormat):
         """
         items = as_dicts(payload.get("output"))
         messages = [item for item in items if item.get("type") == "message"]
-        final = [item for item in messages if item.get("phase") != "commentary"]
-        comments = [item for item in messages if item.get("phase") == "commentary"] if final else []
-        parts = [part for item in final or messages for part in as_dicts(item.get("content"))]
+        final = [item for item in messages if item.get("phase") != "commentary"] or messages
+        parts = [part for item in final for part in as_dicts(item.get("content"))]
         text = joined(part for part in parts if part.get("type") == "output_text")
-        reasoned = [item for item in items if item.get("type") == "reasoning"] + comments
+        reasoned = [item for item in items if item.get("type") == "reasoning"]
+        reasoned += [item for item in messages if item not in final]
         members = (item.get(name) for item in reasoned for name in ("summary", "content"))
         thoughts = [joined(as_dicts(member)) for member in members]
         refusal = joined((part for part in parts if part.get("type") == "refusal"), "refusal")

@@ -7,14 +7,12 @@ import pytest
 
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.frames import load
-from merge_runner_analysis.provenance import provenance
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.tables.formats import value_rows
-from merge_runner_analysis.web.report import alarms
 from tests.support.studies import changed, write_study, yielding
-from tests.support.tables import QUICK, by_id, made, notes_with
+from tests.support.tables import QUICK, alarms_of, by_id, made, notes_with
 
 SCRIPTED = "UPDATE trials SET scripted = true WHERE "
 
@@ -30,11 +28,6 @@ def written(tmp_path_factory):
 def db(written, tmp_path):
     (tmp_path / "t.duckdb").write_bytes(written.read_bytes())
     return tmp_path / "t.duckdb"
-
-
-def alarms_of(study):
-    found = alarms(study, provenance(study.db)).items()
-    return {title: f"{'; '.join(texts)}. {meaning}" for title, (texts, meaning) in found}
 
 
 def listed(study, table, cell):

@@ -20,16 +20,10 @@ from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.prices import cost_usd
 from merge_runner.providers import Endpoint, ModelEntry, Price
 from merge_runner.records import Slot, Usage, canonical_json
-from tests.integration.llm.test_scenarios import (  # noqa: F401 # fixtures
-    GEMINI,
-    MODELS,
-    OPENAI,
-    _idle_connections_grow_old_in_virtual_time,
-)
 from tests.support.clients import budget_of, client_of
 from tests.support.harness import each
 from tests.support.mock_server import FaultPlan
-from tests.support.scenarios import SCENARIOS, ScenarioPlan, playing
+from tests.support.scenarios import GEMINI, MODELS, OPENAI, SCENARIOS, ScenarioPlan, playing
 from tests.support.virtual_time import in_virtual_time
 
 PRICE = Price(input=2, output=8, source="test")

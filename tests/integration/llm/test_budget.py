@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import math
-import time
+import threading
 from functools import partial
 from types import SimpleNamespace
 
@@ -13,13 +13,14 @@ from merge_runner.errors import CacheFailed, RecordingError, TrialSuspended, Usa
 from merge_runner.llm import budget as admission
 from merge_runner.llm.attempts import Meter
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.ledger import CallLabel, Cap, Ledger, reasons
+from merge_runner.llm.ledger import _SUMS, CallLabel, Cap, Ledger, reasons
 from merge_runner.llm.store import CachedCall
 from merge_runner.records import Attempt, Slot, make_request
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import make_plan
 from tests.support.cases import cases
 from tests.support.clients import budget_of
+from tests.support.gate import HANGS_S
 from tests.support.harness import each
 
 
@@ -238,19 +239,20 @@ def test_a_sum_read_meanwhile_changes_no_check_of_a_transaction(ledger, cache):
 
 async def test_what_waits_reads_no_sum_from_before_a_reservation(ledger, monkeypatch):
     monkeypatch.setattr(admission, "READ_EVERY_S", 0.01)
-    budget, read = budget_of(ledger, 1.0), ledger.store.rows
+    budget, sum_up, is_summed = budget_of(ledger, 1.0), ledger.refresh, threading.Event()
+    before = ledger.store.rows(_SUMS, ledger.scope, "[]")
+
+    def refresh(execute):
+        sum_up(execute)
+        is_summed.set()
+
     paid = await set_aside(budget, 1, 0.5)
-
-    def late(*query):
-        rows = read(*query)
-        time.sleep(0.2)
-        return rows
-
-    monkeypatch.setattr(ledger.store, "rows", late)
+    monkeypatch.setattr(ledger.store, "rows", lambda *_: before)
+    monkeypatch.setattr(ledger, "refresh", refresh)
     waiting = asyncio.create_task(set_aside(budget, 2, 0.75))
-    await asyncio.sleep(0.05)
     await paid.begin(1)
-    await asyncio.sleep(0.25)
+    is_summed.clear()
+    assert await asyncio.to_thread(is_summed.wait, HANGS_S)
     assert ledger.committed_usd == 0.5
     waiting.cancel()
 
@@ -275,10 +277,10 @@ async def test_trials_that_wait_for_money_are_counted_once(ledger):
     await budget.admit([1])
     both = [asyncio.create_task(budget.admit([trial])) for trial in (2, 2, 3)]
     await asyncio.sleep(0)
-    assert (budget.waiting, runner.waiting_for_money) == ({2, 3}, 2)
+    assert (budget.queue.trials, runner.waiting_for_money) == ({2, 3}, 2)
     budget.leave(1)
     await asyncio.gather(*both[:2])
-    assert (budget.waiting, runner.waiting_for_money) == ({3}, 1)
+    assert (budget.queue.trials, runner.waiting_for_money) == ({3}, 1)
     budget.leave(2)
     await both[2]
     assert runner.waiting_for_money == 0

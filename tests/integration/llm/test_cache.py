@@ -150,6 +150,20 @@ os._exit(7)
 """
 
 
+async def test_calls_are_all_stored_or_not_whether_their_replies_are_damaged_or_not(cache, stock):
+    await put(cache, *map(entry, range(3)))
+    keys = [entry(number).request.key for number in range(4)]
+    stock[keys[1]] = "damaged"
+    assert cache.has_all([])
+    assert cache.has_all([*keys[:3], keys[0]])
+    assert not cache.has_all(keys)
+    assert not cache.has_all(keys[3:])
+    statements = []
+    cache.reading.set_trace_callback(statements.append)
+    assert cache.has_all(keys[:3])
+    assert len(statements) == 1
+
+
 def test_a_reply_outlives_a_process_that_dies_after_it_is_kept(folder):
     arguments = [sys.executable, "-c", PUT_AND_DIE, folder, entry(1).to_json()]
     assert subprocess.run(arguments, check=False).returncode == 7

@@ -5,7 +5,6 @@ The real client asks an emulator over loopback, in virtual time: see virtual_tim
 
 from contextlib import asynccontextmanager
 
-import aiohttp
 import pytest
 
 from merge_runner.emulator.driver import answer
@@ -16,19 +15,11 @@ from merge_runner.llm.http import HttpTransport
 from merge_runner.providers import Endpoint, ModelEntry
 from merge_runner.records import CallFailed, Slot
 from tests.support.clients import client_of
-from tests.support.scenarios import CASES, ScenarioPlan, playing
+from tests.support.scenarios import CASES, MODELS, OPENAI, ScenarioPlan, playing
 from tests.support.virtual_time import in_virtual_time, now_s
 
-OPENAI, GEMINI = ("openai-chat", "openai-responses"), "gemini"
-MODELS = dict.fromkeys(OPENAI, "o3-2025-04-16")
-MODELS |= {GEMINI: "gemini-2.5-pro", "anthropic": "claude-sonnet-4-6"}
 TIMEOUT_S, DEADLINE_S = 600, 1200
 EXIT_CODES = {"CallFailed": 1, "EndpointRefused": 2, "QuotaExhausted": 3}
-
-
-@pytest.fixture(autouse=True)
-def _idle_connections_grow_old_in_virtual_time(monkeypatch):
-    monkeypatch.setattr(aiohttp.connector, "monotonic", now_s)
 
 
 @pytest.fixture(scope="module")

@@ -12,15 +12,21 @@ import pytest
 
 from merge_runner.llm.delays import server_delay_s
 from merge_runner.llm.formats import FORMATS
+from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.http_outcome import TransportFailure
-from tests.integration.llm.test_http import endpoint_at
-from tests.integration.llm.test_http import transport_to as at_endpoint
+from merge_runner.providers import Endpoint
 from tests.support.cases import cases
 from tests.support.raw_server import a_request, head, ok, raw_server
 
 
-def transport_to(url, connections=1, **options):
-    return at_endpoint(endpoint_at(url), connections, **options)
+@contextlib.asynccontextmanager
+async def transport_to(url, connections=1, **options):
+    endpoint = Endpoint("openai", "openai", url, {})
+    transport = HttpTransport(endpoint, connections=connections, **options)
+    try:
+        yield transport
+    finally:
+        await transport.close()
 
 
 def chat(text):

@@ -11,9 +11,9 @@ from aiohttp import web
 from merge_runner.results.store import results_digest
 from merge_runner.run.options import Options
 from merge_runner.run.plan import make_plan
-from tests.integration.reliability.test_batches import PRICE, answered
 from tests.support.harness import a_model, run_sweep, watched
 from tests.support.mock_server import BatchPlan, FaultPlan
+from tests.support.priced import PRICE, answered
 
 FORMATS = {"openai": "openai-chat", "anthropic": "anthropic", "gemini": "gemini"}
 BATCH = {"price_factor": 0.5, "source": "made up"}

@@ -3,38 +3,16 @@
 import asyncio
 import json
 import re
-import shutil
 import signal
-from collections import Counter
 
-import httpx
 import pytest
 
 from merge_runner.results.store import results_digest
-from tests.support.harness import FAST, PROJECT, a_model, watched
+from tests.support.harness import FAST, a_model, watched
 from tests.support.mock_server import BatchPlan, FaultPlan
+from tests.support.priced import PRICE, answered, rows
 
 TWO = ("--conditions", "L_4_0,N_0_0", "--reps", 1)
-# A mock model that costs something, so that there is money to lose; it is told the slot.
-PRICE = {"input": 2.0, "output": 8.0, "source": "made up"}
-
-
-@pytest.fixture
-def priced(tmp_path):
-    """A model that costs something, in trials of four decisions."""
-    shutil.copytree(PROJECT / "experiments", tmp_path / "experiments")
-    (tmp_path / "models.toml").write_text(a_model("priced", price=PRICE))
-    (tmp_path / "short.toml").write_text("[repetitions]\nbaseline = 1\n[scenario]\ntimeout_s = 4\n")
-
-
-async def answered(server):
-    """How often each slot was answered: in batches, and singly."""
-    async with httpx.AsyncClient() as client:
-        counts = (await client.get(f"{server.url}/emulator/answered")).json()
-    batched, alone = Counter(), Counter()
-    for each in counts:
-        (alone if each["custom_id"] is None else batched)[each["slot"]] += each["answered"]
-    return batched, alone
 
 
 class Looks:
@@ -62,10 +40,6 @@ async def interrupted(merge_runner, looks, *command, **env):
     looks.answered.set()
     assert process.returncode == 130, err
     return out.decode()
-
-
-async def rows(merge_runner, query, db="results/merge.duckdb"):
-    return json.loads((await merge_runner("sql", query, "--db", db, "--format", "json")).out)
 
 
 async def test_a_sweep_in_batches_is_paid_and_replayed_as_any_other(merge_runner, priced, tmp_path):

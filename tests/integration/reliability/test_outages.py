@@ -72,7 +72,7 @@ async def test_when_everything_fails_the_list_is_not_burnt_and_recorded_trials_d
         assert (await merge_runner(*sweep, *part, **server.env)).code == 0
         service.working, before = False, server.requests
         run = await merge_runner(*sweep, "--db", "new", code=1, **server.env)
-        said = "the last 10 trials with patient failed and no call was answered in between"
+        said = "10 different calls to patient failed and none was answered in between"
         assert said in run.err
         assert "run the same command to go on" in run.err
         trials = run.summary["trials"]

@@ -19,7 +19,7 @@ from merge_runner.errors import StoreLocked, UsageError
 from merge_runner.results.database import in_thread, open_database
 from merge_runner.results.instance import Instance
 from merge_runner.results.store import Store, query, results_digest
-from merge_runner.results.sweeps import recorded_sweeps, sweep_facts
+from merge_runner.results.sweeps import sweep_facts, sweeps_to_export
 from merge_runner.run.writer import Flusher
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.trial import Trial, play_trial
@@ -285,8 +285,21 @@ def test_an_instance_that_is_dropped_leaves_the_connections_of_others_open():
         assert again.execute("SELECT 1").fetchall() == [(1,)]
 
 
-def test_the_newest_sweep_is_meant_where_none_is_named(golden):
-    db = golden / "golden.duckdb"
-    sweeps, _ = recorded_sweeps(db, [])
-    newest = query(db, "SELECT max_by(sweep_id, started_at) FROM sweeps")[1]
-    assert [(sweep["sweep_id"],) for sweep in sweeps] == newest
+@pytest.mark.parametrize("is_stored", [True, False])
+def test_the_newest_sweep_with_stored_calls_is_exported_or_else_the_newest(golden, is_stored):
+    db, asked = golden / "golden.duckdb", []
+    with_calls = """JOIN sweep_trials USING (sweep_id)
+    JOIN decisions USING (trial_id, spec_hash) WHERE call_key IS NOT NULL"""
+    sql = f"SELECT sweep_id FROM sweeps {with_calls if is_stored else ''} ORDER BY started_at DESC"
+    sweeps, keys = sweeps_to_export(db, [], lambda keys: asked.append(keys) or is_stored)
+    newest = query(db, sql)[1][0]
+    assert [(sweep["sweep_id"],) for sweep in sweeps] == [newest]
+    assert keys == sweeps_to_export(db, newest, bool)[1]
+    assert all(asked)
+    assert (asked == [keys]) is is_stored
+
+
+def test_a_database_without_a_sweep_has_none_to_export(path):
+    Store(path)
+    with pytest.raises(UsageError, match="holds no sweep"):
+        sweeps_to_export(path, [], bool)

@@ -14,9 +14,9 @@ import shutil
 import socket
 import sqlite3
 from contextlib import closing
-from dataclasses import astuple
 from functools import partial
 from importlib import import_module
+from types import SimpleNamespace
 
 import psutil
 import pytest
@@ -27,7 +27,7 @@ from merge_runner.llm.ledger import CallLabel, Ledger, reasons
 from merge_runner.records import SLOT_HEADER, ReplayMiss
 from merge_runner.run.cluster import Assignment
 from merge_runner.run.cluster_connection import connected
-from merge_runner.run.cluster_worker import Chunk, Played, RemoteCoordinator
+from merge_runner.run.cluster_worker import Chunk, Played, RemoteCoordinator, WorkerRun, go_on
 from tests.support.cluster import SIX, SMALL, all_held, ended, held_from, repetition_of, workers_of
 from tests.support.crossed_study import MODEL
 from tests.support.gate import HANGS_S, Gate
@@ -72,31 +72,29 @@ BEGIN SELECT RAISE(ABORT, 'the disk is full'); END
 @in_virtual_time
 async def test_a_coordinator_that_says_nothing_ends_its_workers_tasks():
     with pytest.raises(SweepStopped, match="the coordinator has said nothing for 300 s"):
-        await RemoteCoordinator(lambda *_: None).reserve("a key", 1.0, CallLabel())
+        await RemoteCoordinator().reserve("a key", 1.0, CallLabel())
     assert now_s() == 300
 
 
-async def test_an_attempt_whose_event_is_lost_asks_again_and_is_reserved_once(
-    tmp_path, monkeypatch
-):
-    monkeypatch.setattr("merge_runner.run.cluster_worker.AGAIN_S", 0.01)
+async def test_an_attempt_waits_until_it_is_reserved_and_its_cost_is_booked(tmp_path):
+    async def attempt():
+        is_paid = await coordinator.reserve("a key", 1.0, CallLabel("o3"))
+        coordinator.report_cost("a key", 0.25)
+        return is_paid
+
+    coordinator = RemoteCoordinator()
+    worker = SimpleNamespace(extensions={"run": WorkerRun(chunks={"task 1": coordinator})})
     assignment = Assignment("tcp://1", Chunk("task 1", None, None, (), 1.0, ((), ()), ()))
-    events = []
-
-    def tell(*event):
-        events.append((*event[:-1], astuple(event[-1])))
-
+    coordinator.work = asyncio.create_task(attempt())
+    coordinator.work.add_done_callback(lambda _: coordinator.changed.set())
     with closing(ResponseCache(tmp_path)) as cache:
-        ledger, worker = Ledger(cache, "baseline"), RemoteCoordinator(tell)
-        asking = asyncio.create_task(worker.reserve("a key", 1.0, CallLabel("o3")))
-        while len(events) < 4:
-            await asyncio.sleep(0.01)
-        for late in (events[1:3], events[:1]):
-            for event in late:
-                assignment.events.put_nowait(event)
-            worker.answer(await assignment._book(ledger))
-        assert await asking
-        assert (ledger.read().reserved_usd, ledger.read().open_attempts) == (1.0, 1)
+        ledger, answers, sums, ended = Ledger(cache, "baseline"), {}, [], None
+        while ended is None:
+            events, ended = await go_on("run", "task 1", answers, dask_worker=worker)
+            answers = await assignment._book(events, ledger)
+            sums.append((ledger.read().spent_usd, ledger.read().reserved_usd))
+    assert (ended, sums[0], sums[-1]) == (True, (0, 1.0), (0.25, 0))
+    assert worker.extensions["run"].chunks == {}
 
 
 async def test_what_cannot_be_on_a_cluster_is_told_in_one_line(merge_runner, tmp_path):

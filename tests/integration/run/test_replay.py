@@ -18,9 +18,9 @@ from merge_runner.results.recorded_sweeps import carried_plugins, provenance_of
 from merge_runner.results.recording import export_recording, import_recording, read_recording
 from merge_runner.results.recording_summary import summarise
 from merge_runner.results.store import results_digest
-from tests.integration.security.test_hostile_recordings import rewritten
 from tests.support.harness import FAST, PROJECT, RECORDING, environment
 from tests.support.mock_server import FaultPlan, served
+from tests.support.recording_files import rewritten
 from tests.support.studies import damage
 
 # The digests of the committed recordings: results, and so these texts, never change by themselves.

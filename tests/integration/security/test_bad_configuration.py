@@ -5,8 +5,8 @@ import shlex
 import pytest
 
 from tests.support import program
+from tests.support.bad_configuration import BASELINE, CASES, NO_TEXT, with_line
 from tests.support.harness import environment
-from tests.unit.security.test_bad_configuration import BASELINE, CASES, NO_TEXT, with_line
 
 ENVIRONMENT = environment(COLUMNS="100", EMULATOR_BASE_URL="http://127.0.0.1:9/v1")
 

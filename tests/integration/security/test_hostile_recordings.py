@@ -26,6 +26,7 @@ from merge_runner.results.recording import (
 from merge_runner.results.recording_summary import summarise, summary_lines
 from merge_runner.run.recorded_plans import recorded_plans
 from tests.support.raw_server import a_request
+from tests.support.recording_files import quoted, rewritten
 
 CALLS = 3
 ANSWER = json.dumps({"choices": [{"message": {"content": "M\n[0.1]"}}]})
@@ -58,27 +59,6 @@ def cache(tmp_path_factory):
     opened.put_now([entry(99)])
     yield opened
     assert [kept.request.slot.decision for kept in opened.entries()] == [99]
-
-
-def rewritten(file, *changes, select="FROM calls", **told):
-    """The recording with its rows and metadata changed, as somebody who knows the format would."""
-    bad = file.with_name("bad.parquet")
-    with duckdb.connect() as connection:
-        pairs = connection.execute(f"FROM parquet_kv_metadata('{file}')").fetchall()
-        kept = {key.decode(): value.decode() for _, key, value in pairs} | told
-        connection.execute(f"CREATE TABLE calls AS FROM '{file}'")
-        for change in changes:
-            connection.execute(change)
-        listed = ", ".join(f"{name}: {quoted(value)}" for name, value in kept.items())
-        connection.execute(
-            f"COPY ({select}) TO {quoted(str(bad))} (FORMAT parquet, COMPRESSION zstd, "
-            f"KV_METADATA {{{listed}}})"
-        )
-    return bad
-
-
-def quoted(text):
-    return "'" + text.replace("'", "''") + "'"
 
 
 def planted(file, **columns):

@@ -12,8 +12,8 @@ from merge_runner.config import state_folder
 from merge_runner.errors import UsageError
 from merge_runner.study.file import write_folder
 from merge_runner.study.parts import load_study
+from tests.support.cases import table
 from tests.support.harness import PROJECT, watched
-from tests.unit.test_endpoints import CASES
 
 STUDY = 'repetitions = 1\nconditions = ["N_0_0"]\n'
 CODE = STUDY + '[plugins]\nfiles = ["driver.py"]\n'
@@ -190,14 +190,14 @@ def test_a_plug_in_outside_of_the_studys_folder_is_refused(state, stranger, file
         load_study(str(stranger / "study.toml"), trust=True)
 
 
-@pytest.mark.parametrize(("keys", "words"), CASES["sends"])
+@pytest.mark.parametrize(("keys", "words"), table("endpoints", "sends"))
 def test_what_a_registry_sends_and_where_is_said(state, stranger, keys, words):
     models_file(stranger, "nice", **keys)
     with pytest.raises(UsageError, match=re.escape(words)):
         load_study(str(stranger / "study.toml"), [])
 
 
-@pytest.mark.parametrize("keys", CASES["unasked"])
+@pytest.mark.parametrize("keys", table("endpoints", "unasked"))
 def test_a_providers_key_goes_to_the_provider_and_any_call_to_loopback_unasked(
     state, stranger, keys
 ):

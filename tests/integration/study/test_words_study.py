@@ -6,11 +6,10 @@ import re
 import pytest
 
 from merge_runner.results.store import query, results_digest
-from tests.support.harness import FAST, PROJECT
+from tests.support.harness import FAST
+from tests.support.words_study import EXAMPLE
 
-PAGE = (PROJECT / "docs/run-a-study.md").read_text("utf-8")
-# The study that the page about them shows, in one condition.
-EXAMPLE = re.search(r"## Text factors\n+```toml\n(.*?)```", PAGE, re.DOTALL)[1]
+# That of the page, in one condition.
 PLANTED = EXAMPLE.replace("repetitions = 10", 'repetitions = 20\nconditions = ["N_0_0"]')
 STUDY = PLANTED.replace("emulator = { own_first = 1.5 }\n", "")
 FIRST = """

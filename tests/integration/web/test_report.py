@@ -16,9 +16,9 @@ from merge_runner_analysis.published import published
 from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables import TABLES, make_tables
 from merge_runner_analysis.web.report import report_html, write_report
-from tests.integration.analysis.test_groups import alarms_of
 from tests.support.serving import words_of
 from tests.support.studies import Said, changed, write_study, yielding
+from tests.support.tables import alarms_of
 
 
 class Page:

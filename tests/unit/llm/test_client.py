@@ -316,9 +316,8 @@ async def test_drain_gives_up_calls_that_wait_for_their_turn(make):
 
 @pytest.mark.parametrize("drains", [False, True])
 async def test_a_call_that_waits_for_its_coordinator_can_be_given_up(make, drains):
-    client, events = make(answer(), price=PRICE), []
-    tell = RemoteCoordinator(lambda *event: events.append(event[:2]))
-    client.budget.ledger.coordinator = tell
+    client, coordinator = make(answer(), price=PRICE), RemoteCoordinator()
+    client.budget.ledger.coordinator = coordinator
     asked = await begun(client.ask("prompt", slot()))
     (waits,) = client.calls.waits
     assert "coordinator" in waits.what
@@ -330,7 +329,10 @@ async def test_a_call_that_waits_for_its_coordinator_can_be_given_up(make, drain
     await ticks()
     assert (client.direct.transport.sent, client.calls.waits) == ([], [])
     assert client.budget.queued_usd == 0
-    assert events == [("reserve", 1), ("cost", 1)]
+    assert [(event.number, event.is_cost) for event in coordinator.events] == [
+        (1, False),
+        (1, True),
+    ]
     assert client.budget.ledger.read().open_attempts == 0
 
 

@@ -25,9 +25,9 @@ from merge_runner.llm.limiter import Limiter
 from merge_runner.providers import ModelEntry
 from merge_runner.records import Decision, Slot
 from merge_runner.run.local_runner import LocalRunner
+from tests.support.batch_mode import Memory
 from tests.support.clients import PRICE, answer, budget_of, client_of, error
 from tests.support.virtual_time import in_virtual_time
-from tests.unit.llm.batch.test_rounds import Memory
 
 STUDIES = int(os.environ.get("STUDIES", "150"))
 IN_MEMORY = "/dev/shm" if os.path.isdir("/dev/shm") else None

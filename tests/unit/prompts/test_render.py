@@ -4,7 +4,6 @@ To rewrite the golden files after a wanted change of the text, set UPDATE_GOLDEN
 run this file; then read the difference, since it is a new experiment.
 """
 
-import os
 from dataclasses import replace
 
 import pytest
@@ -18,21 +17,13 @@ from merge_runner.prompts.blocks import (
     Variant,
     blocks_of,
     prompt_of,
-    render_prompt,
 )
 from merge_runner.records import Observation
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
-from tests.support.cases import table
-from tests.support.harness import PROJECT
+from tests.support.prompts import FIRST, SEEN, check, shown
 
-GOLDEN = PROJECT / "tests/golden"
-SEEN = {
-    name: Observation(**{"distance_to_merge_m": None} | case)
-    for name, case in table("observations", "observations").items()
-}
-FIRST = SEEN["first"]
 REST_OF_PLAN = (0.3, 0.25, 0.2, 0.15, 0.1, 0.05, 0.0, 0.0, -0.05, -0.1, -1.0, -0.5, 0.0, 1.0, 0.5)
 FORMS = ("first", "mid_run", "straight")
 # How the paragraph begins that a variant leaves out.
@@ -47,20 +38,8 @@ REMOVED = {
 }
 
 
-def shown(observation, rest=None, variant="baseline", **scenario):
-    scenario = ScenarioConfig(**scenario)
-    return render_prompt(observation, rest, prompt=prompt_of(variant), scenario=scenario)
-
-
 def render(variant, form, **scenario):
     return shown(SEEN[form], None if form == "first" else REST_OF_PLAN, variant, **scenario)
-
-
-def check(file, text):
-    """That a golden file holds the text."""
-    if os.environ.get("UPDATE_GOLDEN_PROMPTS") == "1":
-        (GOLDEN / file).write_bytes(text.encode())
-    assert text == (GOLDEN / file).read_bytes().decode()
 
 
 @pytest.mark.parametrize("form", FORMS)

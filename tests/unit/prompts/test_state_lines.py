@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from merge_runner.prompts import state_lines
 from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Variant
 from tests.support.cases import table
-from tests.unit.prompts.test_render import FIRST, SEEN, check, shown
+from tests.support.prompts import FIRST, SEEN, check, shown
 
 TIMES = ("own_time_to_merge", "other_time_to_merge", "time_gap")
 LINES = (*TIMES, "projected_headway", "relative_speed")

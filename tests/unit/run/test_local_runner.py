@@ -76,7 +76,7 @@ async def test_a_failed_call_that_trials_share_is_no_outage(are_shared):
     if are_shared:
         await playing
     else:
-        with pytest.raises(ProviderDown, match="the last 10 trials with emulator failed"):
+        with pytest.raises(ProviderDown, match="10 different calls to emulator failed"):
             await playing
     assert failed == ["failed"] * (12 if are_shared else 10)
 

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from merge_runner.llm.ledger import Spending
+from merge_runner.run import progress_file
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import make_plan
 from merge_runner.run.progress import Progress, TrialCounts
@@ -41,8 +42,10 @@ def snapshot(sweep_id="s", **changes):
         ({"pid": NO_PROCESS, "machine": "another"}, 1, True),  # its ids mean nothing here
     ],
 )
-def test_a_sweep_is_dead_when_its_process_is_gone_or_silent(changes, age_s, alive):
-    updated_at = datetime.now(UTC) - timedelta(seconds=age_s)
+def test_a_sweep_is_dead_when_its_process_is_gone_or_silent(monkeypatch, changes, age_s, alive):
+    now = datetime.now(UTC)
+    monkeypatch.setattr(progress_file, "datetime", SimpleNamespace(now=lambda _: now))
+    updated_at = now - timedelta(seconds=age_s)
     assert snapshot(updated_at=updated_at, **changes).alive == alive
 
 

@@ -1,6 +1,5 @@
 """Whatever is wrong with a file: one line that says what is valid."""
 
-import tomllib
 from pathlib import Path
 
 import pytest
@@ -11,16 +10,7 @@ from merge_runner.llm.models import read_models
 from merge_runner.providers import ModelEntry, Price
 from merge_runner.run.plan import make_plan
 from merge_runner.study.file import StudyFile
-from tests.support.harness import PROJECT
-
-CASES = tomllib.loads((PROJECT / "tests/cases/bad_configuration.toml").read_text())
-MODEL = {"provider": '"local"', "format": '"openai-chat"', "id": '"x"', "max_output_tokens": "10"}
-BASELINE = "repetitions = { baseline = 1 }"
-NO_TEXT = {
-    bytes(range(256)): "cannot be read: 'utf-8' codec can't decode",
-    b"a = " + b"[" * 5000 + b"]" * 5000: "is no TOML file",
-    b"a = 1" + b"0" * 5000: "is no TOML file: Exceeds the limit",
-}
+from tests.support.bad_configuration import BASELINE, CASES, NO_TEXT, with_line
 
 
 @pytest.fixture
@@ -38,12 +28,6 @@ def registry():
 
 def plan():
     return make_plan("mine.toml", "m")
-
-
-def with_line(line):
-    """A model with one more line, or another one."""
-    name, _, value = line.partition(" = ")
-    return "\n".join(["[m]", *(f"{k} = {v}" for k, v in {**MODEL, name: value}.items())])
 
 
 def refusal(read):

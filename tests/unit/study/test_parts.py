@@ -6,12 +6,15 @@ import pytest
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.registry import PROGRAMS
+from merge_runner.errors import UsageError
 from merge_runner.prompts.blocks import blocks_of, prompt_of, render_prompt
 from merge_runner.registry import Registry, using
 from merge_runner.run.plan import make_plan
+from merge_runner.run.trials import TrialMaker
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
+from merge_runner.trial import play_trial
 
 HEAD = 'repetitions = 1\nconditions = ["N_0_0"]\n'
 DRIVER = """
@@ -139,7 +142,7 @@ def test_a_plug_in_beside_the_study_drives_and_another_revision_is_another_drive
 
 
 def test_what_a_plug_in_imports_is_no_part_of_its_study(plan_of, tmp_path, monkeypatch):
-    """Also where one needs a path of its own: an import that fails hides no other one."""
+    """Also where it needs a path that the plug-in adds."""
     colours, register = Registry("colour"), "import sys\nsys.colours.register({!r}, 1)\n"
     monkeypatch.setattr(sys, "colours", colours, raising=False)
     monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
@@ -152,6 +155,66 @@ def test_what_a_plug_in_imports_is_no_part_of_its_study(plan_of, tmp_path, monke
     with using(plan.parts.catalogue):
         assert {*colours} == {"elsewhere", "own"}
     assert [*colours] == ["elsewhere"]
+
+
+SIBLING = """
+from merge_runner.plugin import PROGRAMS, Program
+
+class Braking:
+    def __init__(self, context):
+        self.context = context
+
+    async def decide(self, observation, number):
+        from .strength import STRENGTH
+        from {package} import more
+        return self.context.held(STRENGTH * more.FACTOR)
+
+PROGRAMS.register("braking", Program(Braking, "brakes"))
+"""
+
+
+def first_action(plan):
+    trial = TrialMaker(plan).make(plan.trial_specs()[0])
+    return play_trial(trial, None).decisions[0].decision.applied[0]
+
+
+def test_what_a_function_of_a_plug_in_imports_is_imported_when_it_is_called(
+    plan_of, tmp_path, monkeypatch
+):
+    """Its siblings are those of its study, also where another study has some of the same name."""
+    package = tmp_path / "imported_late"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    (package / "more.py").write_text("FACTOR = 0.5\n")
+    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
+    plans, files = {}, '[plugins]\nfiles = ["strength.py", "mine.py"]\n'
+    for strength in (-0.2, -0.4):
+        (tmp_path / "strength.py").write_text(f"STRENGTH = {strength}\n")
+        plugin = SIBLING.format(package=package.name)
+        plans[strength] = plan_of(files, ["braking"], plugin=plugin)
+    assert package.name not in sys.modules
+    assert {strength: first_action(plan) for strength, plan in plans.items()} == {
+        strength: strength * 0.5 for strength in plans
+    }
+    assert f"{package.name}.more" in sys.modules
+
+
+def test_an_import_that_fails_is_told_in_one_line_with_its_first_reason(
+    plan_of, tmp_path, monkeypatch
+):
+    """The module is run once: it would register its parts a second time."""
+    monkeypatch.setattr(CONDITIONS, "_things", {**CONDITIONS._things})
+    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
+    (tmp_path / "fails_late.py").write_text(
+        "from merge_runner.plugin import CONDITIONS, Condition\n"
+        'CONDITIONS.register("Z", Condition(4, 0))\n'
+        "import no_such_module\n"
+    )
+    with pytest.raises(UsageError) as refused:
+        plan_of('[plugins]\nfiles = ["mine.py"]\n', plugin="# why\nimport fails_late\n")
+    assert str(refused.value) == (
+        "the plug-in mine.py, line 2, fails: ModuleNotFoundError: No module named 'no_such_module'"
+    )
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,8 @@ from merge_runner_analysis.metrics import LEFT_FIRST, METRICS
 from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.web.question import answered
-from tests.integration.study.test_words_study import EXAMPLE
 from tests.support.harness import FAST
+from tests.support.words_study import EXAMPLE
 
 STUDIES = 200
 

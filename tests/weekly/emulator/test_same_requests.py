@@ -21,13 +21,12 @@ from merge_runner.llm.models import read_models
 from merge_runner.providers import resolve_endpoint
 from merge_runner.records import Slot, make_request
 from tests.support.harness import PROJECT, listening, watched
-from tests.weekly.emulator.test_sdks import (
-    _no_settings_of_the_user,  # noqa: F401 # a fixture of every test here
-    gemini_client,
-    openai_client,
-)
+from tests.support.sdks import gemini_client, openai_client
 
-pytestmark = pytest.mark.filterwarnings("ignore:Inheritance class:DeprecationWarning")
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:Inheritance class:DeprecationWarning"),
+    pytest.mark.usefixtures("no_settings_of_the_user"),
+]
 MODELS = read_models(PROJECT / "experiments/models.toml")
 CAP = 16000
 # What stands for the key that both send.

@@ -2,49 +2,24 @@
 
 import io
 import json
-import os
 
 import pytest
 
 from merge_runner.prompts.parse import parse_reply
 from tests.support.mock_server import BatchPlan, FaultPlan
+from tests.support.sdks import anthropic_client, gemini_client, openai_client
 
 MODEL = "some-model"
 # One of the libraries inherits from a class of aiohttp that is not made for it.
-pytestmark = pytest.mark.filterwarnings("ignore:Inheritance class:DeprecationWarning")
-
-
-@pytest.fixture(autouse=True)
-def _no_settings_of_the_user(monkeypatch):
-    # Proxies would lead away from loopback, and the libraries read much more than keys.
-    for name in list(os.environ):
-        if name.upper().endswith("_PROXY") or name.startswith(("OPENAI_", "ANTHROPIC_", "GOOGLE_")):
-            monkeypatch.delenv(name)
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:Inheritance class:DeprecationWarning"),
+    pytest.mark.usefixtures("no_settings_of_the_user"),
+]
 
 
 @pytest.fixture
 async def limited(emulator):
     return await emulator(FaultPlan(rates={"rate_limit": 1.0}, delay_s=0.2))
-
-
-def openai_client(url):
-    from openai import AsyncOpenAI
-
-    return AsyncOpenAI(api_key="dummy", base_url=f"{url}/v1", max_retries=0, timeout=10)
-
-
-def anthropic_client(url):
-    from anthropic import AsyncAnthropic
-
-    return AsyncAnthropic(api_key="dummy", base_url=url, max_retries=0, timeout=10)
-
-
-def gemini_client(url, api_version="v1beta"):
-    from google import genai
-
-    # Its timeout is in ms; it does not retry unless told to.
-    options = genai.types.HttpOptions(base_url=url, timeout=10_000, api_version=api_version)
-    return genai.Client(api_key="dummy", http_options=options)
 
 
 async def ask_openai(url, prompt):

@@ -6,13 +6,9 @@ import signal
 import pytest
 
 from merge_runner.results.store import results_digest
-from tests.integration.reliability.test_batches import (
-    answered,
-    priced,  # noqa: F401 # a fixture
-    rows,
-)
 from tests.support.harness import watched
 from tests.support.mock_server import BatchPlan, FaultPlan
+from tests.support.priced import answered, rows
 
 KILLS = 20
 pytestmark = pytest.mark.usefixtures("priced")

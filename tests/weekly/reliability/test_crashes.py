@@ -1,4 +1,4 @@
-from tests.integration.reliability.test_crashes import kill_again_and_again
+from tests.support.kills import kill_again_and_again
 
 
 async def test_a_sweep_that_is_killed_at_20_instants_asks_nothing_answered_again(

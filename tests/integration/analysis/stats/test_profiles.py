@@ -12,7 +12,7 @@ from scipy.special import expit
 
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner_analysis.stats.regressions import who_first_firth
-from tests.unit.analysis.stats.test_regressions import frame, who_first_arrays
+from tests.support.outcomes import frame, who_first_arrays
 
 CELLS = [(one.projected_headway_m, one.relative_velocity_mps) for one in HUMAN_CONDITIONS.values()]
 TERMS = ("intercept", "projected_headway", "relative_velocity")

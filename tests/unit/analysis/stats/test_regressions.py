@@ -17,20 +17,16 @@ from merge_runner_analysis.stats.regressions import (
     who_first_firth,
     who_first_logit,
 )
+from tests.support.outcomes import COLUMNS, frame, who_first_arrays
 
 # A library's warning must not reach the user: what it warns of is a problem in words.
 pytestmark = pytest.mark.filterwarnings("error", "ignore::ResourceWarning")
 
 CELLS = [(c.projected_headway_m, c.relative_velocity_mps) for c in CONDITIONS.values()]
-COLUMNS = ["projected_headway_m", "relative_velocity_mps", "status", "merged_first", "gap_m"]
 WHO_FIRST = ["intercept", "projected_headway", "relative_velocity"]
 GAP = ["intercept", "abs_projected_headway", "abs_relative_velocity", "headway_x_velocity"]
 BOTH_FITS = pytest.mark.parametrize("fit", [who_first_logit, who_first_firth])
 ROBUST = pytest.mark.parametrize("robust", [False, True])
-
-
-def frame(rows) -> pd.DataFrame:
-    return pd.DataFrame(rows, columns=COLUMNS)
 
 
 def drawn(seed, reps, intercept, headway, velocity) -> pd.DataFrame:
@@ -60,11 +56,6 @@ def of_gaps(reps, gap_of, cells=CELLS) -> pd.DataFrame:
 
 HUMANS, OVERLAPPING = human_outcomes(), drawn(1, 5, 0.4, 0.6, -1.5)
 SEPARATED = ruled(5, lambda h, dv, rep: "left" if h - 3 * dv > 0.1 else "right")
-
-
-def who_first_arrays(trials):
-    h, dv = trials["projected_headway_m"], trials["relative_velocity_mps"]
-    return np.column_stack([np.ones(len(trials)), h, dv]), 1.0 * (trials["merged_first"] == "left")
 
 
 def numbers(fit, names):

@@ -8,7 +8,7 @@ from analysis.research.ceiling import shares
 from merge_runner_analysis.published import published
 from merge_runner_analysis.stats.first_action import exchange_rate, mean, slope
 from merge_runner_analysis.stats.intervals import melded
-from tests.unit.analysis.stats.test_first_action import HEADWAY, SLOPE, VELOCITY, drawn
+from tests.support.first_actions import HEADWAY, SLOPE, VELOCITY, drawn
 
 
 @pytest.mark.parametrize("rates", [(0.02, 0.03), (0.3, 0.03), (0.5, 0.5), (0.0, 0.03)])

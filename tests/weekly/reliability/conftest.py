@@ -1,0 +1,1 @@
+from tests.support.priced import priced
