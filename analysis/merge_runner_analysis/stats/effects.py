@@ -258,7 +258,7 @@ def _effect(
 
 def _counted(frame: Columns, metric: Metric) -> Estimate:
     """Count the trials, and the hits of a rate unless trials count for both sides."""
-    from_both = "varies" in frame and not frame["varies"].all()
+    from_both = not contrasts.read_once(frame["row"]).all()
     k = int(frame["value"].sum()) if metric.rate and not from_both else None
     return Estimate(n=len(np.unique(frame["row"])), k=k)
 
@@ -268,8 +268,14 @@ def _compared(study: Study, level: Columns, reference: Columns, metric: Metric) 
 
     Several views show the same comparison, which is made once.
     """
-    names = [name for name in sorted(level) if name != "row"]
-    key = (metric.name, *(of[name].tobytes() for of in (level, reference) for name in names))
+    key = (
+        metric.name,
+        *(
+            column.tobytes()
+            for of in (level, reference)
+            for column in (of["condition"], of["value"], contrasts.read_once(of["row"]))
+        ),
+    )
     known = _comparisons(study)
     if key not in known:
         known[key] = _compare(level, reference, metric)
