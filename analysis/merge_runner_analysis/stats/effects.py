@@ -38,8 +38,9 @@ class Effect:
     """A level against the reference of its factor in one measure, in the measure's unit.
 
     ``at_level`` and ``at_reference`` are estimates within the shared cells, without the
-    ``left_out`` trials. In an interaction they have no value, and ``across`` has both levels at the
-    other factor's reference. ``p_corrected`` is Holm's over all effects with the same ``primary``.
+    ``left_out`` trials. In an interaction they have no value, ``across`` has both levels at the
+    other factor's reference, and ``at_reference`` counts the trials at both references.
+    ``p_corrected`` is Holm's over all effects with the same ``primary``.
     """
 
     level: Level
@@ -248,7 +249,7 @@ def _effect(
         reference=levels[1],
         metric=metric,
         at_level=replace(counts[0], value=values[0]),
-        at_reference=replace(counts[1], value=values[1]),
+        at_reference=replace(counts[-1], value=values[1]),
         # Where nothing varies it is not known what could have been seen.
         difference=replace(difference, detectable=difference.detectable or None),
         left_out=tuple(sorted(left_out)),
