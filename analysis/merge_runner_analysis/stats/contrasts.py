@@ -272,7 +272,7 @@ def _within_shared(
 
 def read_once(rows: NDArray[np.int_]) -> NDArray[np.bool_]:
     """Return by row number whether it stands there once: the trial is in a single cell."""
-    return np.bincount(rows)[rows] == 1
+    return np.asarray(np.bincount(rows)[rows] == 1)
 
 
 def _numbers(column: pd.Series | Array) -> Array:
