@@ -115,7 +115,12 @@ SELECT trial_id, spec_hash, attempts, calls, retried, lost, unknown, failures, d
     others AS other_model, fallbacks AS fallback
 FROM ({COUNTED}) ORDER BY ALL
 """  # noqa: S608 # constants
-SPECS = "SELECT DISTINCT spec_hash, spec FROM specs JOIN trials USING (spec_hash) ORDER BY ALL"
+# Those of the newest run come first.
+SPECS = """
+SELECT spec_hash, spec FROM specs JOIN trials USING (spec_hash)
+LEFT JOIN sweep_trials USING (trial_id, spec_hash) LEFT JOIN sweeps USING (sweep_id)
+GROUP BY ALL ORDER BY max(started_at) DESC NULLS LAST, spec_hash
+"""
 KEYS = ["trial_id", "spec_hash"]
 # The newest run comes first: the order of its levels counts.
 SWEEPS = """
@@ -183,7 +188,7 @@ class Frames(NamedTuple):
     probes: pd.DataFrame
     """First situations that were only asked: of equal columns, of trials that end there."""
     specs: Mapping[str, dict[str, Any]]
-    """By their hashes."""
+    """By their hashes, those of the newest run first."""
     studies: Studies
     calls: pd.DataFrame
     """CALLS: outcomes of the calls, by trial."""

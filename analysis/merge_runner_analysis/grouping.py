@@ -258,7 +258,8 @@ def groups_of(
 ) -> list[Group]:
     """Return groups by driver and levels, mock models last; the frames are a study's.
 
-    All but the most frequent task settings of a driver, and texts of a prompt, carry a mark.
+    All but the most frequent task settings of a driver, and texts of a prompt, carry a mark; of
+    equally frequent ones that which is first in ``specs`` has none.
     """
     if trials.empty:
         return []
@@ -269,6 +270,7 @@ def groups_of(
     speeds = keyed.groupby(["usual", "condition"])["image"].transform("nunique")
     mixed = keyed["usual"].isin(keyed.loc[speeds > 1, "usual"])
     keyed["usual"] = keyed["usual"].mask(mixed, keyed["image"])
+    keyed["place"] = keyed["spec_hash"].map({name: place for place, name in enumerate(specs)})
     keyed["mark"] = _marks(keyed, ["driver"], "task")
     keyed["mark"] += _marks(keyed, ["driver", "mark", "variant"], "usual")
     keyed["apart"] = keyed.groupby(["driver", "mark"])["scripted"].transform("nunique") > 1
@@ -343,6 +345,6 @@ def _distinct(group: Group, *, programs: bool, scripted: bool) -> Group:
 def _marks(keyed: pd.DataFrame, within: list[str], what: str) -> pd.Series:
     """Return `` [mark]`` for all but the most frequent value of ``what`` within equal names."""
     sizes = keyed.groupby([*within, what])[what].transform("size")
-    ordered = keyed.assign(rarity=-sizes).sort_values(["rarity", what])
+    ordered = keyed.assign(rarity=-sizes).sort_values(["rarity", "place", what])
     usual = ordered.groupby(within)[what].transform("first").reindex(keyed.index)
     return (" [" + keyed[what].str[:8] + "]").mask(keyed[what] == usual, "")

@@ -357,7 +357,8 @@ class Contrast:
 
 
 def _by_cell(trials: pd.DataFrame, column: str) -> pd.DataFrame:
-    frame = pd.DataFrame({"condition": trials["condition"], "value": trials[column].astype(float)})
+    values = trials[column].astype(float)
+    frame = pd.DataFrame({"condition": trials["condition"], "value": values, "row": trials.index})
     return read_twice(frame, trials["image"])
 
 

@@ -242,8 +242,8 @@ class LlmClient:
             await reservation.book(attempt, keep)  # before the error, which may end the run
             raise error
         answered = CachedCall(call.request, attempts)
+        self.calls.answered.add(key)  # before others can find the reply in the cache
         kept = await reservation.book(attempt, partial(self.cache.keep, answered))
-        self.calls.answered.add(key)
         if kept is not answered:  # an import has stored another reply first, which is used
             return self.recorded.read(kept, call.earlier_attempts)
         text = outcome.reading.text

@@ -23,7 +23,7 @@ NEAREST = 1e-9  # to a difference, of what it may be instead
 LARGEST_Z = 30.0  # of this quantile p is 0 to 190 digits
 Z_WITH_POWER = Z + float(stats.norm.ppf(POWER))
 Array = NDArray[np.float64]
-Trials = Mapping[str, Any]  # columns, also of a data frame: condition and a measure
+Trials = Mapping[str, Any]  # columns, also of a data frame: condition, a measure, maybe row
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,19 +252,27 @@ def means_within(first: Trials, second: Trials, measure: str) -> tuple[float, fl
 def _within_shared(
     first: Trials, second: Trials, measure: str
 ) -> tuple[NDArray[np.int_], Array, Array, Array]:
-    """Return of trials in shared conditions: a code of it, group (1 or 0), value, ``varies``."""
+    """Return of trials in shared conditions: a code of it, group (1 or 0), value, ``varies``.
+
+    A trial whose ``row`` stands there twice does not vary.
+    """
     groups = (first, second)
     values = np.concatenate([_numbers(trials[measure]) for trials in groups])
     belongs = np.repeat([1.0, 0.0], [len(trials["condition"]) for trials in groups])
-    varies = np.concatenate(
-        [trials.get("varies", np.ones(len(trials["condition"]))) for trials in groups]
-    )
+    rows = [trials.get("row", np.arange(len(trials["condition"]))) for trials in groups]
     kept = ~np.isnan(values)
     cells, names = pd.factorize(np.concatenate([trials["condition"] for trials in groups]))
     for of in (0.0, 1.0):
         kept &= np.bincount(cells[kept & (belongs == of)], minlength=len(names))[cells] > 0
     cells, _ = pd.factorize(cells[kept])
-    return cells, belongs[kept], values[kept], varies[kept]
+    of_groups = np.split(kept, [len(rows[0])])
+    varies = [read_once(np.asarray(row)[of]) for row, of in zip(rows, of_groups, strict=True)]
+    return cells, belongs[kept], values[kept], np.concatenate(varies)
+
+
+def read_once(rows: NDArray[np.int_]) -> NDArray[np.bool_]:
+    """Return by row number whether it stands there once: the trial is in a single cell."""
+    return np.asarray(np.bincount(rows)[rows] == 1)
 
 
 def _numbers(column: pd.Series | Array) -> Array:

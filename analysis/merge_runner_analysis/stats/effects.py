@@ -38,8 +38,9 @@ class Effect:
     """A level against the reference of its factor in one measure, in the measure's unit.
 
     ``at_level`` and ``at_reference`` are estimates within the shared cells, without the
-    ``left_out`` trials. In an interaction they have no value, and ``across`` has both levels at the
-    other factor's reference. ``p_corrected`` is Holm's over all effects with the same ``primary``.
+    ``left_out`` trials. In an interaction they have no value, ``across`` has both levels at the
+    other factor's reference, and ``at_reference`` counts the trials at both references.
+    ``p_corrected`` is Holm's over all effects with the same ``primary``.
     """
 
     level: Level
@@ -248,7 +249,7 @@ def _effect(
         reference=levels[1],
         metric=metric,
         at_level=replace(counts[0], value=values[0]),
-        at_reference=replace(counts[1], value=values[1]),
+        at_reference=replace(counts[-1], value=values[1]),
         # Where nothing varies it is not known what could have been seen.
         difference=replace(difference, detectable=difference.detectable or None),
         left_out=tuple(sorted(left_out)),
@@ -258,7 +259,7 @@ def _effect(
 
 def _counted(frame: Columns, metric: Metric) -> Estimate:
     """Count the trials, and the hits of a rate unless trials count for both sides."""
-    from_both = "varies" in frame and not frame["varies"].all()
+    from_both = not contrasts.read_once(frame["row"]).all()
     k = int(frame["value"].sum()) if metric.rate and not from_both else None
     return Estimate(n=len(np.unique(frame["row"])), k=k)
 
@@ -270,8 +271,14 @@ def _compared(
 
     Several views show the same comparison, which is made once.
     """
-    names = [name for name in sorted(level) if name != "row"]
-    key = (metric.name, *(of[name].tobytes() for of in (level, reference) for name in names))
+    key = (
+        metric.name,
+        *(
+            column.tobytes()
+            for of in (level, reference)
+            for column in (of["condition"], of["value"], contrasts.read_once(of["row"]))
+        ),
+    )
     known = _comparisons(study)
     if key not in known:
         known[key] = _compare(level, reference, metric)

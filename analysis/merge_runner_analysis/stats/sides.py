@@ -74,9 +74,8 @@ def from_both_sides(study: StudyResults, frame: pd.DataFrame, trials: pd.DataFra
 
 def read_twice(frame: pd.DataFrame, images: pd.Series) -> pd.DataFrame:
     """Return trials by cell; one with an image also counts there, with the opposite outcome."""
-    again = images.notna()
-    right = frame.assign(condition=images, value=1 - frame["value"])[again]
-    return pd.concat([frame.assign(varies=~again), right.assign(varies=False)])
+    right = frame.assign(condition=images, value=1 - frame["value"])[images.notna()]
+    return pd.concat([frame, right])
 
 
 @remembered

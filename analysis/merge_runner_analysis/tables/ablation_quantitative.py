@@ -34,9 +34,9 @@ def metric_table(name: str, groups: list[Group], place: str, *notes: str) -> Tab
     for metric in metrics:
         kind: Kind = "percent" if metric.rate else "number"
         counts = metric.column if metric.rate else ""
-        meaning, rests_on = metric.meaning, ""
+        meaning, rests_on = metric.meaning, metric.column
         if metric.estimator == "median":
-            of, rests_on = f"{metric.trials} trials that have the measure", metric.column
+            of = f"{metric.trials} trials that have the measure"
             meaning = f"median over the {of}: {meaning}"
             columns.append(Optional(f"{metric.name}_n", "n", "count", of, rests_on=rests_on))
         columns += [

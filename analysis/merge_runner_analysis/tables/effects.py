@@ -179,7 +179,7 @@ def problem(study: StudyResults, effect: Effect) -> str:
     elif difference.value is None:
         remarks.append(f"{metric.heading}: {UNTESTED}")
     elif difference.p is None and not difference.se and metric.estimator != "median":
-        remarks.append("the same in every trial, so that there is nothing to test")
+        remarks.append(f"{metric.heading}: equal in all trials of a cell: nothing to test")
     elif copies:
         remarks.append(
             f"the difference leaves out {copies} of {shared} shared cells, those with the same "

@@ -42,6 +42,7 @@ def _of_trials(table: Table, study: StudyResults) -> Iterator[str]:
             "trials in which a decision had a fallback are left out (--without-fallbacks): long "
             "ones more often than those that a crash ended early, so that shares of crashes rise"
         )
+    yield from _pooled_by_name(table, groups)
     driven = [group for group in groups if group.setting]
     if driven and not study.file:
         sizes = sum((_studies_of(study, group) for group in driven), Counter[str]())
@@ -73,6 +74,17 @@ def _of_trials(table: Table, study: StudyResults) -> Iterator[str]:
         yield (
             "of two different drivers left stands for the one that is named first, wherever it "
             f"sat: odds that it goes first. {'; '.join(pairs)}"
+        )
+
+
+def _pooled_by_name(table: Table, groups: list[Group]) -> Iterator[str]:
+    """Yield a note on marked groups that stand in a row with groups of another mark."""
+    marks = {group.id: group.mark for group in groups}
+    mixed = [row.groups for row in table.rows if len({marks.get(name) for name in row.groups}) > 1]
+    if marked := [name for name in marks if marks[name] and any(name in names for names in mixed)]:
+        yield (
+            f"{', '.join(marked)}: another text or setting under the same name. The level counts "
+            "these trials, too; a difference compares them only with each other"
         )
 
 

@@ -79,8 +79,8 @@ MEANINGS = {
     "that was asked for is not in them: they are in no table of what drivers say.",
     "Attempts of unknown fate": "A run was killed before their reply was seen: they may have been "
     "paid for.",
-    "Several settings under one name": "They are never pooled: all but the most frequent carry a "
-    "mark.",
+    "Several settings under one name": "All but the most frequent, or the newest of these, carry a "
+    "mark. Only levels of factors pool them.",
 }
 LIBRARIES = ("statsmodels", "scipy", "numpy", "pandas", "matplotlib")
 

@@ -184,10 +184,14 @@ def test_factors_are_shown_at_each_level_of_another_one_with_interactions(played
 
 
 def test_an_interaction_is_the_difference_of_the_differences_in_shared_cells(tmp_path):
-    """o3 has two prompts in two moods; in the second mood the second prompt brakes harder."""
+    """o3 has two prompts in two moods; in the second mood the second prompt brakes harder.
+
+    The first prompt has one repetition less in the first mood.
+    """
     drives = []
     for drive in [*yielding("o3", reps=4), *yielding("o3", "A1", 4)]:
-        if drive.condition not in {"N_0_0", "L_4_0", "R_-4_8"}:
+        lacking = drive.variant == "baseline" and drive.rep == 1
+        if drive.condition not in {"N_0_0", "L_4_0", "R_-4_8"} or lacking:
             continue
         hard = drive.variant == "A1" and drive.rep % 2 == 0
         drives.append(replace(drive, right=tuple(x * (0.5 + 0.25 * hard) for x in drive.right)))
@@ -204,6 +208,9 @@ def test_an_interaction_is_the_difference_of_the_differences_in_shared_cells(tmp
     low, high = found["difference_ci"]
     assert low < found["difference"] < high
     assert (found["p"] < 0.05) == (low > 0 or high < 0)
+    row = values_of(Study(moody.db), "effects")["mood=late/prompt=A1/interaction/gap_m"]
+    assert (row["level"], row["n"]) == ("A1 × late", 6)
+    assert (row["reference"], row["n_reference"]) == ("baseline × early", 3)
     # By the other factor it is the same.
     turned = values_of(StudyResults(moody.db, Selection(by="prompt")), "factors")
     same = turned["prompt=A1/mood=late/interaction/gap_m"]["difference"]

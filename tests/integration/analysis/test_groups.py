@@ -186,3 +186,30 @@ def test_equal_trials_of_a_language_model_are_told_and_count(db):
     assert title == "Trials repeat earlier ones"
     says = "o3/baseline: 2 of 33 trials are as an earlier one to the last state; each counts"
     assert says in text
+
+
+@pytest.mark.parametrize("newest", ["o3-A1", "o3-edited"])
+def test_an_edited_prompt_is_compared_and_the_trials_of_its_former_text_are_named(tmp_path, newest):
+    """Both texts of A1 have as many trials, so that the newer one has no mark."""
+    drives = [*yielding("o3", reps=2), *yielding("o3", "A1", reps=2)]
+    db = write_study(tmp_path / "t.duckdb", drives)
+    study = changed(
+        db,
+        "INSERT INTO specs SELECT 'o3-edited', json_merge_patch(spec, "
+        '\'{"prompt_blocks": {"C3": "edited"}}\') FROM specs WHERE spec_hash = \'o3-A1\'',
+        *(
+            f"UPDATE {name} SET spec_hash = 'o3-edited' WHERE spec_hash = 'o3-A1' "
+            "AND trial_id LIKE '%rep02%'"
+            for name in ("states", "decisions", "trial_factors", "calls", "sweep_trials", "trials")
+        ),
+        "INSERT INTO sweeps BY NAME SELECT 'later' AS sweep_id, name, started_at + INTERVAL 1 DAY "
+        "AS started_at, config, versions FROM sweeps",
+        f"UPDATE sweep_trials SET sweep_id = 'later' WHERE spec_hash = '{newest}'",
+    )
+    (unmarked,) = (g for g in study.models if g.setting == "A1" and not g.mark)
+    assert unmarked.spec_hash == newest
+    levels = made(study, "levels")
+    (note,) = notes_with(levels, "another text or setting under the same name")
+    assert note.startswith(f"o3 [{({'o3-A1', 'o3-edited'} - {newest}).pop()[:8]}")
+    assert by_id(levels)["prompt=A1"].values["ended"] == 22
+    assert notes_with(made(study, "verdicts"), "under the same name") == []

@@ -76,6 +76,23 @@ async def test_all_who_ask_the_same_at_once_share_one_call_whose_attempts_count_
     assert [(len(call.attempts), call.cached_attempts) for call in failed] == [(1, 0), (1, 1)]
 
 
+async def test_who_finds_a_reply_that_was_just_stored_shares_it(make, monkeypatch):
+    """It is in the cache a moment before the call that brought it goes on."""
+    client = make(answer())
+    store, key = client.budget.ledger.store, client.recorded.request("prompt", slot()).key
+    write = store.write
+
+    async def then_ask(operation):
+        stored = await write(operation)
+        if client.cache.look_up(key)[0]:
+            await client.ask("prompt", slot())
+        return stored
+
+    monkeypatch.setattr(store, "write", then_ask)
+    await client.ask("prompt", slot())
+    assert (client.meter.calls_cached, client.meter.calls_shared) == (1, 1)
+
+
 async def test_a_call_whose_wait_for_money_times_out_is_no_call_that_was_given_up(
     make, monkeypatch
 ):

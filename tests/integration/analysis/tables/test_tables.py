@@ -12,7 +12,6 @@ from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.explain import explain
-from merge_runner_analysis.metrics import METRICS
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.stats.indicators import score
 from merge_runner_analysis.study import StudyResults
@@ -275,10 +274,12 @@ def test_explain_marks_the_trials_that_a_share_counts(study, tables):
             if row.values.get(name) is None:
                 continue
             (source,) = explain(study, table, f"{row.id}:{name}").sources
-            ended = groups[row.id].ended[METRICS[name].column].count()
-            assert 100 * len(source.numerator) / ended == pytest.approx(row.values[name], rel=1e-9)
+            share = 100 * len(source.numerator) / len(source.trials)
+            assert share == pytest.approx(row.values[name], rel=1e-9)
             assert {*source.numerator} <= {*source.trials}
             marked += bool(source.numerator)
+        (source,) = explain(study, table, f"{row.id}:gap_m").sources
+        assert len(source.trials) == len(groups[row.id].finished)
     assert marked > 2
     collided = groups["o3/baseline"].ended.set_index("trial_id")["collided"]
     for line in explain(study, table, "o3/baseline:collided_percent").lines()[-len(collided) :]:

@@ -174,6 +174,20 @@ def test_a_condition_that_one_group_lacks_changes_nothing_of_its_rates():
     assert shared_cells(*apart, "hit") is None
 
 
+def test_a_trial_that_stands_in_one_cell_alone_varies_also_if_it_was_read_from_both_sides():
+    """Trial 1 has no partner on its other side, so that its two outcomes do not add up to 1."""
+    read = pd.DataFrame(
+        {"condition": ["L", "R", "L", "R"], "value": [1.0, 0.0, 1.0, 0.0], "row": [0, 0, 1, 1]}
+    )
+    both = pd.DataFrame({"condition": ["L", "R"], "value": [0.0, 1.0]})
+    assert shared_cells(both, read, "value").varying[1].tolist() == [0, 0]
+    alone = shared_cells(both[:1], read, "value")
+    assert alone.varying[1].tolist() == [1]
+    assert alone.variance(0) == shared_cells(
+        both[:1], read[::2].drop(columns="row"), "value"
+    ).variance(0)
+
+
 def test_an_interaction_of_shares_is_excluded_at_the_level_of_its_p():
     one, other = (shared_cells(*trials(strata), "hit") for strata in STRATA[:2])
     found = difference_of_contrasts(one, other)
