@@ -286,10 +286,9 @@ def call_key(*, endpoint: str, path: str, headers: dict[str, str], body: str, sl
     The parts are the key version, the endpoint's identity, the path, the headers that change the
     meaning of the request, its canonical ``body``, and the slot.
     """
-    # "body" sorts before the other names and "slot" after them, so that the whole is canonical.
     parts = {"endpoint": endpoint, "headers": headers, "key_version": KEY_VERSION, "path": path}
-    between = canonical_json(parts)[1:-1]
-    text = f'{{"body":{body},{between},"slot":{canonical_json(slot.as_dict())}}}'
+    # "body" sorts before the other names, so that the whole is canonical.
+    text = f'{{"body":{body},{canonical_json(parts | {"slot": slot.as_dict()})[1:]}'
     return hashlib.sha256(text.encode()).hexdigest()
 
 

@@ -18,7 +18,7 @@ import duckdb
 
 from merge_runner.errors import RecordingError, StoreError
 from merge_runner.llm.store import CachedCall
-from merge_runner.records import ANSWERED_FIELD, SIDES, canonical_json
+from merge_runner.records import SIDES, canonical_json
 from merge_runner.results.database import append, by_name, read_database, schema_sql
 from merge_runner.results.instance import SETTINGS, in_memory, limit_memory
 from merge_runner.results.recorded_sweeps import described_sweeps
@@ -50,15 +50,7 @@ FROM ({ASKED_DECISIONS}) JOIN (SELECT trial_id, spec_hash, variant FROM trials)
 JOIN trial_drivers USING (trial_id, spec_hash) SEMI JOIN audited USING (trial_id, spec_hash)
 GROUP BY driver, variant, model, spec_hash ORDER BY ALL
 """  # noqa: S608 # constants
-# Calls of one sweep, or of all.
-AUDITED_CALLS = """
-calls WHERE ($sweep_id IS NULL OR (trial_id, spec_hash) IN
-    (SELECT (trial_id, spec_hash) FROM sweep_trials WHERE sweep_id = $sweep_id))
-"""
-CALL_ROWIDS = f"SELECT rowid FROM {AUDITED_CALLS} ORDER BY rowid"  # noqa: S608 # constants
-REPLIES_BETWEEN = f"""
-SELECT rowid, reply::VARCHAR FROM {AUDITED_CALLS} AND rowid BETWEEN $first AND $last
-"""  # noqa: S608 # constants
+REPLIES = "SELECT rowid, reply::VARCHAR FROM calls WHERE rowid IN (SELECT unnest(?))"
 CALL_FINDINGS = ("served_findings", "attempt_findings", "exchanged_findings", "shared_findings")
 ENTRIES_AT_ONCE = 100
 FINDINGS_SHOWN = 20
@@ -134,38 +126,30 @@ def audited_database(
 
 
 def prepare(connection: duckdb.DuckDBPyConnection, sweep_id: str | None = None) -> None:
-    """Create the views of checks.sql, and read the reply ids of a sweep, or of all."""
+    """Create the views of checks.sql, and read the reply ids of a sweep, or of all.
+
+    Replies whose id is repeated are compared.
+    """
     make_views(connection)
     append(connection, "other_models", other_models(connection))
-    parameters = {"sweep_id": sweep_id}
-    rowids = [rowid for (rowid,) in connection.execute(CALL_ROWIDS, parameters).fetchall()]
+    connection.execute("SET VARIABLE sweep_id = ?", [sweep_id])
+    connection.execute("INSERT INTO ids FROM read_ids; INSERT INTO reply_ids FROM identified")
+    rowids = [rowid for (rowid,) in connection.execute("FROM repeating").fetchall()]
     for first in range(0, len(rowids), REPLIES_AT_ONCE):  # a chunk is in memory at once
-        last = min(first + REPLIES_AT_ONCE, len(rowids)) - 1
-        span = {**parameters, "first": rowids[first], "last": rowids[last]}
-        replies = connection.execute(REPLIES_BETWEEN, span).fetchall()
-        rows = [row for rowid, reply in replies if (row := _reply_contents(rowid, reply))]
-        append(connection, "reply_contents", rows)
-    connection.execute("INSERT INTO reply_ids FROM identified")
+        replies = connection.execute(REPLIES, [rowids[first : first + REPLIES_AT_ONCE]]).fetchall()
+        append(connection, "contents", [(rowid, _content(reply)) for rowid, reply in replies])
 
 
-def _reply_contents(rowid: int, reply: str | None) -> tuple[int, str | None, str, str] | None:
-    """Return a row of ``reply_contents``: the reply's id, a hash of its answer, its request.
+def _content(reply: str) -> str:
+    """Return a hash of the answer in a reply that is a JSON object.
 
     Members other than the answer, such as a time, may differ in a copy. In an unknown format the
     hash covers the whole body: else all its answers would be equal.
     """
-    try:
-        body = json.loads(reply or "")
-    except (ValueError, RecursionError):
-        return None
-    if not isinstance(body, dict):
-        return None
-    member = body.get("id") or body.get("responseId")
-    reply_id = member.encode(errors="replace").decode() if isinstance(member, str) else None
+    body = json.loads(reply)
     known = (body[name] for name in ANSWER_MEMBERS if body.get(name) is not None)
     answer = json.dumps(next(known, body)).encode()
-    content = hashlib.blake2b(answer, digest_size=16).hexdigest()
-    return rowid, reply_id, content, json.dumps(body.get(ANSWERED_FIELD))
+    return hashlib.blake2b(answer, digest_size=16).hexdigest()
 
 
 def make_views(connection: duckdb.DuckDBPyConnection) -> None:

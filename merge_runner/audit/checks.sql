@@ -56,9 +56,7 @@ FROM (
 UNION ALL SELECT 'spec', NULL, format('the spec stored as {} has another hash', spec_hash)
 FROM specs WHERE left(sha256(spec::VARCHAR), 16) <> spec_hash;
 
--- Calls and their replies. Replies are read in chunks, since each may have many megabytes: the id of
--- each, a hash of its answer, and the request that it answers, if it names one.
-CREATE OR REPLACE TEMP TABLE reply_contents (call_rowid BIGINT, reply_id VARCHAR, content VARCHAR, answered JSON);
+-- Calls and their replies.
 
 CREATE OR REPLACE TEMP VIEW served_findings AS
 -- One finding for each pair of models, at its first reply.
@@ -88,23 +86,41 @@ CREATE OR REPLACE TEMP VIEW exchanged_findings AS
 SELECT 'exchanged' AS kind, trial_id, side, decision,
     'its reply names another request' AS text
 FROM (
-    SELECT trial_id, calls.side, calls.decision, condition, rep, sample_set, request, answered
-    FROM calls SEMI JOIN audited USING (trial_id, spec_hash)
-    JOIN trials USING (trial_id, spec_hash) JOIN reply_contents ON calls.rowid = call_rowid
-) WHERE answered->>'$.body_sha256' <> sha256(request::VARCHAR)
+    SELECT trial_id, spec_hash, side, decision, request, reply->'$.merge_runner_request' AS answered
+    FROM calls WHERE contains(reply::VARCHAR, 'merge_runner_request')
+) SEMI JOIN audited USING (trial_id, spec_hash) JOIN trials USING (trial_id, spec_hash)
+WHERE answered->>'$.body_sha256' <> sha256(request::VARCHAR)
     OR [answered->>'$.slot.condition', answered->>'$.slot.repetition', answered->>'$.slot.side',
         answered->>'$.slot.decision', answered->>'$.slot.sample_set']
         <> [condition, rep::VARCHAR, side, decision::VARCHAR, sample_set::VARCHAR]
     AND json_type(answered, '$.slot') = 'OBJECT';
 
--- Ids are compared within an endpoint: two emulators give equal requests equal ids.
+-- The ids of the replies of the sweep in the variable sweep_id, or of all, are read once and without
+-- any other column, since replies may be long.
+CREATE OR REPLACE TEMP MACRO text_of(json) AS if(json_type(json) = 'VARCHAR', json->>'$', NULL);
+CREATE OR REPLACE TEMP VIEW read_ids AS
+SELECT call_rowid, coalesce(nullif(text_of(ids[1]), ''), text_of(ids[2])) AS reply_id FROM (
+    SELECT rowid AS call_rowid, json_extract(reply, ['$.id', '$.responseId']) AS ids FROM calls
+    WHERE http_status = 200 AND (getvariable('sweep_id') IS NULL OR (trial_id, spec_hash) IN (
+        SELECT (trial_id, spec_hash) FROM sweep_trials WHERE sweep_id = getvariable('sweep_id')))
+) WHERE reply_id IS NOT NULL;
+CREATE OR REPLACE TEMP TABLE ids AS FROM read_ids LIMIT 0;
+
+-- They are compared within an endpoint: two emulators give equal requests equal ids.
 CREATE OR REPLACE TEMP VIEW identified AS
-SELECT calls.trial_id, calls.spec_hash, calls.side, decision, call_key, provider, model_requested,
-    coalesce(json_extract_string(spec, '$.' || side || '.endpoint'), '') AS endpoint, reply_id,
-    content
-FROM calls JOIN reply_contents ON calls.rowid = call_rowid LEFT JOIN specs USING (spec_hash)
-WHERE http_status = 200 AND reply_id IS NOT NULL;
+SELECT call_rowid, calls.trial_id, calls.spec_hash, calls.side, decision, call_key, provider,
+    model_requested,
+    coalesce(json_extract_string(spec, '$.' || side || '.endpoint'), '') AS endpoint, reply_id
+FROM calls JOIN ids ON calls.rowid = call_rowid LEFT JOIN specs USING (spec_hash);
 CREATE OR REPLACE TEMP TABLE reply_ids AS FROM identified LIMIT 0;
+
+-- The replies whose id another call has too, and a hash of the answer of each.
+CREATE OR REPLACE TEMP VIEW repeating AS
+SELECT call_rowid FROM reply_ids SEMI JOIN (
+    SELECT endpoint, model_requested, reply_id FROM reply_ids
+    GROUP BY ALL HAVING min(call_key) <> max(call_key)
+) USING (endpoint, model_requested, reply_id) ORDER BY call_rowid;
+CREATE OR REPLACE TEMP TABLE contents (call_rowid BIGINT, content VARCHAR);
 
 -- Some servers draw ids out of a thousand, or have only one. An id with different answers proves
 -- nothing; neither does an id of a server most of whose repeated ids are such, nor an id of a local
@@ -115,7 +131,7 @@ SELECT endpoint, model_requested, reply_id, same AND provider <> 'local'
 FROM (
     SELECT endpoint, model_requested, reply_id, any_value(provider) AS provider,
         min(content) = max(content) AS same
-    FROM reply_ids GROUP BY ALL HAVING min(call_key) <> max(call_key)
+    FROM reply_ids JOIN contents USING (call_rowid) GROUP BY ALL
 ) WINDOW server AS (PARTITION BY endpoint, model_requested);
 
 -- Two slots of one spec with one call, and two calls of any spec with one reply: a caching proxy
@@ -125,8 +141,10 @@ CREATE OR REPLACE TEMP VIEW shared AS
 SELECT 'shares its call with' AS text,
     list(DISTINCT (trial_id, side, decision) ORDER BY (trial_id, side, decision)) AS places,
     list(DISTINCT (trial_id, spec_hash)) AS trials
-FROM decisions JOIN trial_drivers USING (trial_id, spec_hash)
-WHERE call_key IS NOT NULL GROUP BY spec_hash, driver, call_key HAVING count(*) > 1
+FROM decisions SEMI JOIN (
+    SELECT call_key FROM decisions GROUP BY call_key HAVING count(*) > 1
+) USING (call_key) JOIN trial_drivers USING (trial_id, spec_hash)
+GROUP BY spec_hash, driver, call_key HAVING count(*) > 1
 UNION ALL SELECT 'shares its reply, and the provider''s id of it, with',
     list(place ORDER BY place), list(DISTINCT trial)
 FROM (
@@ -229,8 +247,8 @@ FROM linked SEMI JOIN done USING (trial_id, spec_hash) ANTI JOIN (
 UNION ALL SELECT format('{} replies of {} at {} have an id that the server gave more than once: its ids '
     'do not tell whether a reply was given twice', count(DISTINCT call_key), model_requested,
     coalesce(nullif(endpoint, ''), 'its endpoint'))
-FROM reply_ids SEMI JOIN audited USING (trial_id, spec_hash)
-JOIN repeated_ids USING (endpoint, model_requested, reply_id)
+FROM reply_ids JOIN repeated_ids USING (endpoint, model_requested, reply_id)
+SEMI JOIN audited USING (trial_id, spec_hash)
 WHERE NOT telling GROUP BY model_requested, endpoint
 -- Without replies of the emulator, which has only a few phrases.
 UNION ALL SELECT format('all {} replies to prompts that were asked before are word for word as before: '

@@ -27,7 +27,7 @@ _CLOSING = re.compile(
     re.IGNORECASE,
 )
 # Each closing tag contains one of these. Most replies have none, and this check is far faster.
-_IN_A_CLOSING = ("</", "[/", "\u25c1/", "<|")
+_IN_A_CLOSING = ("<", "[/", "\u25c1")
 # The channels of a server that leaves out the special tokens.
 _BARE_FINAL = "assistantfinal"
 _BARE_CHANNELS = re.compile(rf"\s*(?:analysis|commentary).*{_BARE_FINAL}", re.DOTALL)

@@ -106,7 +106,8 @@ class RecordedReplies:
         attempts, last = recorded.attempts, recorded.attempts[-1]
         payload = reply_object(last.reply or "{}") if last.http_status == 200 else {}
         reading = read_reply(self.wire, payload)
-        if payload and reading.outcome in ANSWERS:
+        differs = (reading.outcome, reading.usage) != (last.outcome, last.usage)
+        if payload and reading.outcome in ANSWERS and differs:
             last = replace(last, outcome=reading.outcome, usage=reading.usage)
             attempts = (*attempts[:-1], last)
         return ChatReply(reading.text, last.outcome, recorded.request, attempts, cached_attempts)

@@ -243,7 +243,7 @@ class CallStore(CacheFile):
 
     def replace(self, name: str, text: str, _: Execute) -> None:
         """Store a text after a checksum, not under a call key. Runs in a transaction."""
-        self.texts.set(name, _behind_checksum(text))
+        self.texts.set(name, _checksum(text) + text)
 
     def remove(self, name: str, _: Execute) -> None:
         """Delete the text under a name that is no call key. Runs in a transaction."""
@@ -259,7 +259,8 @@ class CallStore(CacheFile):
 
         A damaged one is quarantined.
         """
-        key, text = entry.request.key, _behind_checksum(entry.to_json())
+        key, content = entry.request.key, entry.to_json()
+        text = _checksum(content) + content
         if not execute(_ADD, (key, text)).rowcount:
             try:
                 return self._entry(key) or entry
@@ -307,8 +308,8 @@ def verified(key: str, text: str, request: ChatRequest | None = None) -> CachedC
     return entry
 
 
-def _behind_checksum(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()[:CHECKSUM_LENGTH] + text
+def _checksum(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:CHECKSUM_LENGTH]
 
 
 def text_of(mode: object, filename: object, value: object) -> str:
@@ -323,6 +324,6 @@ def text_of(mode: object, filename: object, value: object) -> str:
     if not isinstance(value, str):
         raise RecordingError("the recorded reply is damaged: it is no text")
     content = value[CHECKSUM_LENGTH:]
-    if value != _behind_checksum(content):
+    if value[:CHECKSUM_LENGTH] != _checksum(content):
         raise RecordingError("the recorded reply is damaged: its checksum is wrong")
     return content

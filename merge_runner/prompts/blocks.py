@@ -319,14 +319,16 @@ def render_prompt(
     None before the first. ``first`` is true at the driver's first decision; it has an effect only
     without a plan.
     """
-    template, names = prompt.templates[observation.road]
     now = Situation(observation, scenario, remaining_plan, first)
-    text = template.format_map({name: FIELDS[name](now) for name in names})
+    parts = prompt.templates[observation.road]
+    text = "".join([literal + field(now) if field else literal for literal, field in parts])
     return text if observation.other_seen else _UNIT_OF_NOTHING.sub(r"\1", text)
 
 
-def _template(blocks: Iterable[Block], road: Road) -> tuple[str, frozenset[str]]:
-    """Return the joined template of the blocks for a road, and its variables."""
+def _template(
+    blocks: Iterable[Block], road: Road
+) -> list[tuple[str, Callable[[Situation], str] | None]]:
+    """Return the joined template of the blocks for a road: its texts, each before a variable."""
     templates = (block.merge if road == "merge" else block.straight for block in blocks)
     whole = "\n\n".join(template for template in templates if template is not None) + "\n"
-    return whole, frozenset(named(whole))
+    return [(text, FIELDS[name] if name else None) for text, name, *_ in Formatter().parse(whole)]

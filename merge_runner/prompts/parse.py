@@ -94,7 +94,9 @@ class ParsedReply:
 def parse_reply(text: str, plan_actions: int) -> ParsedReply:
     """Parse a reply that should contain a list of ``plan_actions`` numbers in [-1, 1]."""
     # JSON can contain half a surrogate pair, which no table can store.
-    text = text.encode(errors="replace").decode().replace("\r\n", "\n")
+    if not text.isascii():
+        text = text.encode(errors="replace").decode()
+    text = text.replace("\r\n", "\n")
     prose, places = _split(text)
     plan, failure = _plan(places, plan_actions)
     tactical, rationale = _tactical(prose.strip())
@@ -133,9 +135,9 @@ def _plan(places: Iterable[str], plan_actions: int) -> tuple[tuple[float, ...] |
 def _failure(array: tuple[float | str, ...], plan_actions: int) -> str | None:
     """Return why an array is no valid plan; None for a valid one."""
     numbers = [entry for entry in array if isinstance(entry, float)]
-    words = [entry for entry in array if isinstance(entry, str)]
-    if not words and len(numbers) == plan_actions and -1 <= min(numbers) <= max(numbers) <= 1:
+    if len(array) == len(numbers) == plan_actions and -1 <= min(numbers) <= max(numbers) <= 1:
         return None
+    words = [entry for entry in array if isinstance(entry, str)]
     # A literal can be too large for a float.
     if any(_NOT_FINITE.fullmatch(word) for word in words) or not all(map(math.isfinite, numbers)):
         return "not_finite"

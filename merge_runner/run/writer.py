@@ -18,8 +18,8 @@ from merge_runner.trial_records import TrialRecord, TrialSpec
 EVERY_S, POLL_S = 1.0, 0.05
 # Trials in one transaction, which costs as much as storing dozens of them; and in memory while
 # storing fails, as when another program holds the file.
-BATCH = 256
-MOST_PENDING = 2 * BATCH
+BATCH = 512
+MOST_PENDING = 3 * BATCH // 2
 BATCH_BYTES, MOST_PENDING_BYTES = 2**24, 2**25
 DECISION_BYTES = 2_000  # with its share of the states
 LOCK_PATIENCE_S = 2.0
@@ -48,6 +48,7 @@ class Flusher:
         self._sweep_id = sweep_id
         self._say = say
         self._pending: list[tuple[TrialRecord, int]] = []  # with their bytes
+        self._bytes = 0  # of all of them
         self._problem: StoreError | None = None
         self._closing = False
         self._task = asyncio.create_task(self._run())
@@ -58,6 +59,7 @@ class Flusher:
         bytes_of_replies = sum([sys.getsizeof(attempt.reply) for attempt in attempts])
         size = bytes_of_replies + DECISION_BYTES * len(record.decisions)
         self._pending.append((record, size))
+        self._bytes += size
         if self._problem is not None:
             self._drop_excess()
 
@@ -104,10 +106,6 @@ class Flusher:
             elif self._problem:
                 return  # the next command that opens the database reports it
 
-    @property
-    def _bytes(self) -> int:
-        return sum(size for _, size in self._pending)
-
     async def _run(self) -> None:
         clock_s = asyncio.get_running_loop().time
         flushed_s = clock_s()
@@ -136,6 +134,7 @@ class Flusher:
             return False
         self.differing |= writing.result()
         self._problem = None
+        self._bytes -= sum(size for _, size in self._pending[: len(batch)])
         del self._pending[: len(batch)]
         return True
 
@@ -154,12 +153,11 @@ class Flusher:
 
     def _drop_excess(self) -> None:
         """Drop the newest trials beyond what may wait, which are in no batch under way."""
-        pending, self._pending = self._pending, []
-        held_bytes = 0
+        pending, self._pending, self._bytes = self._pending, [], 0
         for record, size in pending:
-            is_much = len(self._pending) >= BATCH or held_bytes + size > MOST_PENDING_BYTES
+            is_much = len(self._pending) >= BATCH or self._bytes + size > MOST_PENDING_BYTES
             if is_much and self._pending and record.status != "failed":
                 self.dropped.append(record.spec)
             else:
                 self._pending.append((record, size))
-                held_bytes += size
+                self._bytes += size

@@ -103,9 +103,8 @@ def test_whole_sweeps_pass_and_what_was_checked_is_counted(made):
     assert judged, "none of the models was unreliable"
 
 
-def test_the_audit_at_the_end_of_a_run_reads_that_run_s_replies_in_parts(made, monkeypatch):
+def test_the_audit_at_the_end_of_a_run_reads_that_run_s_replies(made):
     db = made / "results/merge.duckdb"
-    monkeypatch.setattr(checks, "REPLIES_AT_ONCE", 50)
     _, rows = query(
         db,
         "SELECT sweep_id, count(DISTINCT call_key) FROM sweep_trials "
@@ -315,7 +314,8 @@ async def test_equal_answers_under_repeating_ids_of_a_local_server_are_a_note(
     assert (found.code, "gave more than once" in found.notes) == (0, True)
 
 
-def test_one_id_of_two_answers_does_not_hide_one_answer_of_two_samples(db):
+def test_one_id_of_two_answers_does_not_hide_one_answer_of_two_samples(db, monkeypatch):
+    monkeypatch.setattr(checks, "REPLIES_AT_ONCE", 3)  # of four
     slots = [f"{OF_PAIR} AND side = 'left' AND decision = {n}" for n in range(4)]
     (one, other) = (f"(SELECT reply FROM calls WHERE {slot})" for slot in slots[:2])
     damage(

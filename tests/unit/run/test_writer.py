@@ -78,10 +78,10 @@ async def test_trials_are_stored_in_few_transactions():
     store = Scripted()
     store.go_on.set()
     flusher = flusher_of(store)
-    for _ in range(300):
+    for _ in range(600):
         flusher.add(ended())
     await flusher.close()
-    assert [*map(len, store.written)] == [256, 44]
+    assert [*map(len, store.written)] == [512, 88]
 
 
 def ended(order=0, status="finished", size=0):
@@ -99,32 +99,32 @@ async def is_refused(flusher):
 
 
 @pytest.mark.parametrize("known", [True, False])
-async def test_while_the_database_is_held_256_trials_stay_in_memory_and_the_failed_ones(known):
+async def test_while_the_database_is_held_512_trials_stay_in_memory_and_the_failed_ones(known):
     store, said = Scripted(HELD), []
     flusher = flusher_of(store, said.append)
     flusher.add(ended(0))
     if known:
         await is_refused(flusher)
-    for order in range(1, 500):
-        flusher.add(ended(order, "failed" if order in (300, 400) else "collided"))
+    for order in range(1, 1000):
+        flusher.add(ended(order, "failed" if order in (600, 700) else "collided"))
         await asyncio.wait_for(flusher.wait_for_capacity(), HANGS_S)
     await is_refused(flusher)
-    kept = [*range(256), 300, 400]
-    dropped = [order for order in range(500) if order not in kept]
+    kept = [*range(512), 600, 700]
+    dropped = [order for order in range(1000) if order not in kept]
     assert [spec.order for spec in flusher.dropped] == dropped
-    assert flusher.problem == "500 trials wait to be stored: somebody reads"
+    assert flusher.problem == "1000 trials wait to be stored: somebody reads"
     closing = asyncio.create_task(flusher.close())
     async with asyncio.timeout(HANGS_S):
-        while "500 trials wait to be stored: somebody reads. Ctrl-C ends" not in str(said):
+        while "1000 trials wait to be stored: somebody reads. Ctrl-C ends" not in str(said):
             await asyncio.sleep(0.05)
         store.error = None
         await closing
     assert store.orders == kept
-    assert (flusher.left, flusher.problem) == (242, "")
+    assert (flusher.left, flusher.problem) == (486, "")
     # They may come again, and are stored by the next call.
-    flusher.add(ended(256))
+    flusher.add(ended(512))
     await asyncio.wait_for(flusher.close(), HANGS_S)
-    assert store.orders[-1] == 256
+    assert store.orders[-1] == 512
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,8 @@ def by_label(plan):
 
 
 def paragraphs(prompt, road="merge"):
-    return prompt.templates[road][0].strip("\n").split("\n\n")
+    texts = (getattr(block, road) for block in prompt.blocks.values())
+    return "\n\n".join(filter(None, texts)).split("\n\n")
 
 
 def test_levels_of_words_cross_and_stand_in_the_order_of_the_factors(plan_of):
