@@ -27,7 +27,7 @@ from merge_runner.text_safety import first_line, quoted
 SCHEMA_VERSION = 10
 SCHEMA = Path(__file__).with_name("schema.sql")
 """Tables and views, without the views of measures (``schema_sql`` has both)."""
-LOCK_RETRY_S = 0.05
+LOCK_RETRY_S = 0.005  # a sweep leaves the file for a moment between two writes
 PATIENCE_S = 60.0
 ROWS_AT_ONCE = 100
 ROWS_OF_A_GROUP = 4_096
@@ -233,9 +233,10 @@ def append(
     connection: duckdb.DuckDBPyConnection, table: str, rows: Iterable[tuple[Any, ...]]
 ) -> None:
     """Add rows to a table."""
-    appender = connection.appender(table)  # an INSERT would be a statement for each row
-    appender.append_rows(list(rows))
-    appender.flush()
+    if added := list(rows):
+        appender = connection.appender(table)  # an INSERT would be a statement for each row
+        appender.append_rows(added)
+        appender.flush()
 
 
 @contextmanager
@@ -249,7 +250,9 @@ def write_database(
             yield connection
             connection.commit()
         except duckdb.Error as exc:
-            raise StoreError(f"{path} cannot be used: {first_line(exc)}") from exc
+            # DuckDB's own words on a commit, which is a checkpoint too, go before what went wrong.
+            why = first_line(exc).rpartition("Original error: ")[2]
+            raise StoreError(f"{path} cannot be used: {why}") from exc
 
 
 @contextmanager

@@ -15,13 +15,14 @@ import duckdb
 BYTES_OF_A_CALL, MERGED_BYTES = 1_000, 2**26
 """Compressed bytes of a call with short replies and its share of the states; and the excess of the
 file's size up to which its row groups are merged."""
-MANY_CALLS = 2_048
-"""Half a row group: calls that are added at once and leave few small groups."""
+MANY_CALLS = 256
+"""Calls that are added at once and need not be merged: their blocks are nearly full."""
 SIZES = """
 SELECT greatest(max(stats(request).max_string_length), max(stats(reply).max_string_length), 0),
     (SELECT count(*) FROM calls)
-FROM (SELECT request, reply FROM calls LIMIT 1)
+FROM (SELECT request, reply FROM calls WHERE rowid < 0 UNION ALL SELECT NULL, NULL)
 """
+"""Length of the longest text, from DuckDB's statistics alone, and the number of calls."""
 Settings = dict[str, str | bool | int | float | list[str]]
 SETTINGS: Settings = {
     # DuckDB's defaults are shares of the machine's memory, mostly spent on caching the file. A
@@ -29,6 +30,9 @@ SETTINGS: Settings = {
     "memory_limit": "1GB",  # limit_memory lowers it
     "threads": 2,
     "max_vacuum_tasks": 0,  # merge_small_groups raises it
+    # A commit writes into the file alone; else it writes a log, which detaching copies into it.
+    "checkpoint_threshold": "0B",
+    "default_block_size": "16384",  # the least: every write begins new blocks for each column
     "force_compression": "zstd",  # a quarter of the size of what DuckDB chooses, and written sooner
     # The oldest DuckDB that can open new files.
     "storage_compatibility_version": "v1.2.0",

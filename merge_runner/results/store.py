@@ -155,7 +155,8 @@ class Store:
         with write_database(self.path, patience_s) as connection:
             limit_memory(connection, max(map(len, texts), default=0))
             merge_small_groups(connection, sum(len(rows["calls"]) for *_, rows in played))
-            _add_specs(connection, specs or {})
+            if specs:
+                _add_specs(connection, specs)
             differing = _add_trials(connection, played)
             if sweep_id is not None:
                 append(connection, "sweep_trials", ((sweep_id, *key) for key, *_ in played))
@@ -301,10 +302,12 @@ def _add_trials(
                 key,
             )
         append(connection, table, chain.from_iterable(rows[table] for rows in new.values()))
-    _add_factors(connection, [row for rows in again.values() for row in rows[FACTOR_TABLE]])
     differing: dict[str, list[str]] = {}
+    if not again:
+        return differing
+    _add_factors(connection, [row for rows in again.values() for row in rows[FACTOR_TABLE]])
     # Factor levels are no results: another study may have others for the same trial.
-    for table in [table for table in KEY_COLUMNS if table != FACTOR_TABLE] if again else []:
+    for table in [table for table in KEY_COLUMNS if table != FACTOR_TABLE]:
         stored_trials = stored_rows(connection, table, list(again))
         for key, rows in again.items():
             for difference in stored_trials.differences(key, rows[table], ignored=RUN_COLUMNS):

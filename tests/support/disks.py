@@ -37,13 +37,13 @@ def read_only():
 
 @pytest.fixture
 def small_disk(tmp_path):
-    """A folder on a disk of its own, of a few megabytes."""
+    """A folder on a disk of its own, of so many KiB."""
 
     @contextlib.contextmanager
-    def make(megabytes):
+    def make(kib):
         folder = tmp_path / "small"
         folder.mkdir()
-        with mount(folder, "-t", "tmpfs", "-o", f"size={megabytes}m", "tmpfs"):
+        with mount(folder, "-t", "tmpfs", "-o", f"size={kib}k", "tmpfs"):
             yield folder
 
     return make

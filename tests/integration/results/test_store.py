@@ -16,7 +16,7 @@ import pytest
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import StoreLocked, UsageError
-from merge_runner.results.database import in_thread, open_database
+from merge_runner.results.database import append, in_thread, open_database
 from merge_runner.results.instance import Instance
 from merge_runner.results.store import Store, query, results_digest
 from merge_runner.results.sweeps import sweep_facts, sweeps_to_export
@@ -98,6 +98,16 @@ def test_a_trial_that_ends_otherwise_than_the_stored_one_is_named_and_not_stored
         "m/baseline/L_4_0/rep01": ["decisions.applied"]
     }
     assert query(path, "select count(*) from states")[1] == [(len(record.states),)]
+
+
+def test_a_new_database_is_small_and_a_commit_writes_no_log_beside_it(store, path):
+    assert path.stat().st_size < 2**18
+    with open_database(path, read_only=False, patience_s=1) as connection:
+        connection.begin()
+        append(connection, "sweep_trials", [("sweep", "trial", "spec")])
+        connection.commit()
+        logs = [file for file in path.parent.glob("*.wal") if file.stat().st_size]
+    assert not logs
 
 
 def test_two_specs_of_one_trial_stay_apart_and_a_changed_condition_needs_another_name(store, path):
