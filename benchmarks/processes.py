@@ -20,7 +20,7 @@ from urllib.request import Request, urlopen
 PROJECT = Path(__file__).resolve().parents[1]
 PYTHON = sys.executable
 RUNNER = (PYTHON, "-m", "merge_runner")
-PROGRAM = (PYTHON, "-c", "from merge_runner.cli import main; main()")
+PROGRAM = (PYTHON, "-c", "from merge_runner.__main__ import main; main()")
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,15 +2,31 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import sys
+
+codes: list[int] = []
 
 
 def main() -> None:
     """Run the command line, which is imported only after the path is set."""
+    atexit.register(_end)  # before all others, and so called after them
     from merge_runner.cli import main as run
 
-    run()
+    try:
+        run()
+    except SystemExit as exc:
+        codes.append(int(exc.code or 0))
+        raise
+
+
+def _end() -> None:
+    """End the process at once: to free all that a report has loaded takes most of a second."""
+    if codes:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(codes[0])
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ import re
 import shlex
 import struct
 import subprocess
+import sys
 import termios
 from contextlib import suppress
 from itertools import chain
@@ -125,6 +126,31 @@ def at_a_terminal(*words, cwd):
                 text += part
     assert process.wait() == 0
     return text.decode().splitlines()
+
+
+ENDED = """
+import atexit, sys
+from merge_runner import cli
+from merge_runner.__main__ import main
+
+class Kept:
+    def __del__(self):
+        print("freed")
+
+def run():
+    atexit.register(print, "registered")
+    sys.exit(3)
+
+kept, cli.main = Kept(), run
+main()
+"""
+
+
+def test_the_program_ends_by_its_code_after_what_is_registered_and_frees_nothing():
+    ended = subprocess.run(
+        [sys.executable, "-c", ENDED], capture_output=True, text=True, check=False
+    )
+    assert (ended.returncode, ended.stdout, ended.stderr) == (3, "registered\n", "")
 
 
 def test_explain_shows_the_trials_that_a_share_counts_and_with_all_the_others(run):

@@ -76,6 +76,8 @@ def figure2(study: StudyResults, chosen: list[Group]) -> Figure:
     row_in = max(ROW_IN, min(HIGHEST_ROW_IN, FEW_ROWS_IN / rows), LINE_IN * lines + 0.2)
     figure = Figure(figsize=(PAGE_IN, AROUND_IN + rows * row_in), layout="constrained")
     axes = figure.subplots(rows, len(HEADINGS), sharex="col", sharey="col", squeeze=False)
+    # Before anything is drawn, which would move all scales of a column each time.
+    _scale(axes[0, 2:], groups, study)
     for row, group, name in zip(axes, groups, names, strict=False):
         row[0].set_ylabel(name, rotation=0, ha="right", va="center", multialignment="right")
         for axis, first in zip(row[:2], ("left", "right"), strict=True):
@@ -84,7 +86,7 @@ def figure2(study: StudyResults, chosen: list[Group]) -> Figure:
             _draw_estimates(axis, group, summary, styles)
             if group.setting and groups[0].driver == HUMAN:
                 _draw_humans(axis, groups[0], summary, styles, ":")
-    _scale(axes, groups, study)
+    _scale_speeds(*axes[0, :2])
     # A group that is mirrored has its ego on the left.
     left = "ego" if any(group.measured and group.ego_sides[1] for group in groups) else "left"
     for axis, heading, panel in zip(axes[0], HEADINGS, "ABCDE", strict=True):
@@ -185,17 +187,26 @@ def published_gap_line(velocity_mps: float) -> tuple[Array, Array]:
 
 def _draw_traces(axis: Axes, study: StudyResults, group: Group, first: str, styles: Styles) -> None:
     traces = left_traces(study, group, first)
-    count = sum(len(traces.get(velocity, ())) for velocity in styles)
+    shown = [traces.get(velocity, []) for velocity in styles]
+    count = sum(map(len, shown))
     if not count:
         _say(axis, "no such trial" if group.measured else MISSING)
         return
-    for velocity, look in styles.items():
-        # Many traces must not be one blot, nor a large file.
-        alpha, is_raster = min(0.4, max(0.06, 25 / count)), count > MANY_TRACES
-        lines = LineCollection(traces.get(velocity, []), color=look["color"], lw=0.4, alpha=alpha)
-        lines.set(capstyle="projecting", joinstyle="round", rasterized=is_raster)
-        axis.add_collection(lines)
-    axis.autoscale_view()
+    # Many traces must not be one blot, nor a large file.
+    alpha, is_raster = min(0.4, max(0.06, 25 / count)), count > MANY_TRACES
+    lines = LineCollection(
+        [line for of_velocity in shown for line in of_velocity],
+        colors=[
+            look["color"]
+            for of_velocity, look in zip(shown, styles.values(), strict=True)
+            for _ in of_velocity
+        ],
+        lw=0.4,
+        alpha=alpha,
+        rasterized=is_raster,
+    )
+    lines.set(capstyle="projecting", joinstyle="round")
+    axis.add_collection(lines)
     # The vehicle that goes first drives faster, which leaves room below its traces. The one that
     # goes second leaves room above.
     y, va = (0.04, "bottom") if first == "left" else (0.96, "top")
@@ -228,14 +239,20 @@ def _draw_humans(axis: Axes, human: Group, summary: Summary, styles: Styles, das
         axis.plot(x, y, color=styles[velocity]["color"], ls=dashes, lw=0.8)
 
 
-def _scale(axes: NDArray[np.object_], groups: list[Group], study: StudyResults) -> None:
-    """Set one scale per quantity: all values and lines, intervals as far as single trials reach."""
-    speeds = [limit for axis in axes[0, :2] for limit in axis.get_ylim()]
-    for axis in axes[0, :2]:
+def _scale_speeds(*panels: Axes) -> None:
+    """Set one scale of speeds, that of all traces."""
+    for axis in panels:
+        axis.autoscale_view()
+    speeds = [limit for axis in panels for limit in axis.get_ylim()]
+    for axis in panels:
         axis.set_ylim(min(speeds), max(speeds))
-    axes[0, 2].set(ylim=(-0.08, 1.08), yticks=[0, 0.5, 1])
+
+
+def _scale(panels: NDArray[np.object_], groups: list[Group], study: StudyResults) -> None:
+    """Set the scales of C to E: all values and lines, intervals as far as single trials reach."""
+    panels[0].set(ylim=(-0.08, 1.08), yticks=[0, 0.5, 1])
     velocities = {velocity for _, velocity in study.conditions.values()}
-    for axis, summary in zip(axes[0, 3:], (gap, deviation), strict=True):
+    for axis, summary in zip(panels[1:], (gap, deviation), strict=True):
         estimates = [
             estimate for g in groups for v in velocities for _, estimate in points(g, v, summary)
         ]
@@ -253,5 +270,5 @@ def _scale(axes: NDArray[np.object_], groups: list[Group], study: StudyResults) 
         bottom = low - margin
         axis.set_ylim(bottom if summary is gap else max(0.0, bottom), high + margin)
     farthest_m = max(abs(headway_m) for headway_m, _ in study.conditions.values())
-    for axis in axes[0, 2:]:
+    for axis in panels:
         axis.set(xlim=(-farthest_m - 1, farthest_m + 1), xticks=[-farthest_m, 0, farthest_m])

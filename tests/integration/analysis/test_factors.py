@@ -208,7 +208,7 @@ def test_an_interaction_is_the_difference_of_the_differences_in_shared_cells(tmp
     low, high = found["difference_ci"]
     assert low < found["difference"] < high
     assert (found["p"] < 0.05) == (low > 0 or high < 0)
-    row = values_of(Study(moody.db), "effects")["mood=late/prompt=A1/interaction/gap_m"]
+    row = values_of(StudyResults(moody.db), "effects")["mood=late/prompt=A1/interaction/gap_m"]
     assert (row["level"], row["n"]) == ("A1 × late", 6)
     assert (row["reference"], row["n_reference"]) == ("baseline × early", 3)
     # By the other factor it is the same.

@@ -15,7 +15,7 @@ plan_step_s = 0.2
 """
 # The program, which writes into a file what it took.
 MEASURED = """
-import atexit, json, runpy
+import json, runpy
 
 def tell():
     with open("/proc/self/status") as status:
@@ -23,8 +23,10 @@ def tell():
     with open("used.json", "w") as file:
         json.dump({"peak_mb": int(peak_kb) / 1024}, file)
 
-atexit.register(tell)
-runpy.run_module("merge_runner", run_name="__main__", alter_sys=True)
+try:
+    runpy.run_module("merge_runner", run_name="__main__", alter_sys=True)
+finally:
+    tell()
 """
 
 
