@@ -2,9 +2,9 @@
 
 A chunk of trials has a share of the rate limits and of the cap. Its worker plays it with the
 ordinary runner and a reply folder of its own. The coordinator keeps its records and replies in one
-transaction before it counts the chunk as done, and gives the chunk of a lost worker to another. A
-worker announces each attempt and each cost. The coordinator reserves the attempt's worst case
-durably before it is sent, so that a lost attempt counts with its worst case.
+transaction before it counts the chunk as done, and gives the chunk of a lost worker to another. It
+fetches each attempt and each cost from the worker, and reserves the attempt's worst case durably
+before it is sent, so that a lost attempt counts with its worst case.
 """
 
 from __future__ import annotations

@@ -103,13 +103,14 @@ class MoneyEvent:
     number: int
     usd: float
     label: CallLabel
-    is_cost: bool = False
+    is_cost: bool
 
 
 class RemoteCoordinator:
     """Coordinator of a chunk, which reserves its attempts before they are sent.
 
-    It fetches the ``events`` that are ``changed``, and answers attempts by ``waiting``.
+    ``go_on`` gives it the ``events`` once they have ``changed``; the attempts ``waiting`` for its
+    answers are by number.
     """
 
     def __init__(self) -> None:

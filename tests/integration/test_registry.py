@@ -36,6 +36,26 @@ def test_a_plug_in_that_fails_is_told_in_one_line_at_each_look(tmp_path):
     assert (run.returncode, run.stdout, run.stderr) == (2, "", f"error: {said}")
 
 
+def test_an_import_that_fails_while_a_driver_decides_is_told_in_one_line(tmp_path):
+    (tmp_path / "mine.py").write_text(
+        "from merge_runner.plugin import PROGRAMS, Program\n"
+        "class Importing:\n"
+        "    def __init__(self, context):\n"
+        "        self.context = context\n"
+        "    async def decide(self, observation, number):\n"
+        "        import no_such_module\n"
+        'PROGRAMS.register("importing", Program(Importing, "imports"))\n'
+    )
+    (tmp_path / "mine.toml").write_text(
+        'models = ["importing"]\nconditions = ["N_0_0"]\nrepetitions = 1\n'
+        '[plugins]\nfiles = ["mine.py"]\n'
+    )
+    sweep = ("sweep", "mine.toml", "--trust", "--quiet")
+    run = program.run(sweep, cwd=tmp_path, env=environment())
+    told = "error: this needs no_such_module, which is not installed: pip install no_such_module\n"
+    assert (run.code, run.out, run.err) == (2, "", told)
+
+
 def test_a_plug_in_may_look_at_what_is_there_and_register(tmp_path):
     looks = with_plugin(tmp_path, REGISTERS, sys.executable, "-c", LOOKS)
     assert (looks.stdout, looks.stderr) == (6 * "found\n", "")

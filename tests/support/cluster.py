@@ -7,6 +7,7 @@ import sys
 import psutil
 import pytest
 
+from merge_runner.records import SIDES
 from tests.support import program
 from tests.support.gate import HANGS_S, Gate
 from tests.support.harness import environment
@@ -51,12 +52,10 @@ def repetition_of(slot: str) -> tuple[str, int]:
 
 
 async def all_held(gate: Gate, trials: int) -> None:
-    """Wait until so many trials are held, and nothing more is asked."""
+    """Wait until both drivers of so many trials are held."""
     async with asyncio.timeout(HANGS_S):
-        before = -1
-        while len(set(map(repetition_of, gate.held))) < trials or before != len(gate.asked):
-            before = len(gate.asked)
-            await asyncio.sleep(0.5)
+        while len(gate.held) < len(SIDES) * trials:
+            await asyncio.sleep(0.05)
 
 
 async def ended(process) -> tuple[int, str, str]:
