@@ -126,7 +126,9 @@ class HttpTransport:
         sent |= dict.fromkeys(ID_HEADERS, request_id)
         sent["connection"] = "close" if self.single_use else "keep-alive"
         url = url_of(self._endpoint.base_url, path, self._endpoint.place)
-        request = httpx.Request(method, url, headers=sent, content=body)
+        # As a stream, since aiohttp adds Host and Content-Length itself.
+        request = httpx.Request(method, url, headers=sent, stream=httpx.ByteStream(body))
+        request.read()
         try:
             async with asyncio.timeout(timeout_s):
                 reply = await self._carrier.handle_async_request(request)

@@ -22,7 +22,7 @@ from merge_runner.trial_records import TrialRecord, TrialSpec
 
 # More than bad luck explains, since nothing is answered between them; few enough to stop early.
 FAILURES_IN_A_ROW = 10
-# Trials or calls that begin in one round of the event loop, so that each round stays short.
+# Trials that begin or go on in one round of the event loop, so that each round stays short.
 A_FEW = 16
 
 
@@ -109,26 +109,37 @@ class LocalRunner:
         async with self.first.turn(self.clients.keys() & asked):
             self.running += 1
             try:
-                return await self._play(self._trials.make(spec), spec.order)
+                return await self._play(spec)
             finally:
                 self.running -= 1
                 self._asking.pop(spec.order, None)
                 for client in self.clients.values():
                     client.budget.leave(spec.order)
 
-    async def _play(self, trial: Trial, order: int) -> TrialRecord:
+    async def _play(self, spec: TrialSpec) -> TrialRecord:
         """Ask all pending questions at once; an error of one driver cancels the others."""
+        await self._next_round()
+        trial = self._trials.make(spec)
         while questions := trial.pending():
             try:
                 async with asyncio.TaskGroup() as group:
                     asking = [
-                        group.create_task(self._ask(question, order, trial))
+                        group.create_task(self._ask(question, spec.order, trial))
                         for question in questions
                     ]
             except BaseExceptionGroup as errors:
                 raise errors.exceptions[0] from None
             trial.answer(dict(filter(None, (task.result() for task in asking))))
+            await self._next_round()
         return trial.record()
+
+    async def _next_round(self) -> None:
+        """Wait for a round of the event loop with room for a trial.
+
+        Thousands of recorded replies would all be ready at once.
+        """
+        async with self._gate:
+            await asyncio.sleep(0)
 
     async def drain(self) -> None:
         """Let calls in flight end and be saved, and drop those that still wait for a turn."""
@@ -155,8 +166,6 @@ class LocalRunner:
         client, side = self.clients[question.model], question.slot.side
         self._asking[order] += 1
         try:
-            async with self._gate:  # thousands of recorded replies would all be ready at once
-                await asyncio.sleep(0)
             prompt = client.recorded.prompt(question)
             reply = await client.ask(prompt, question.slot, order=order)
         except CallFailed as failure:

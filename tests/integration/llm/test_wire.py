@@ -230,7 +230,7 @@ async def test_of_a_header_that_is_sent_several_times_no_value_is_lost():
 
 async def test_a_carrier_takes_requests_in_the_place_of_connections():
     def answer(request):
-        return httpx.Response(200, stream=httpx.ByteStream(chat(request.headers["host"])))
+        return httpx.Response(200, stream=httpx.ByteStream(chat(request.url.host)))
 
     carrier = httpx.MockTransport(answer)
     async with transport_to("http://nowhere.invalid/v1", carrier=carrier) as transport:
