@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy import optimize, special, stats
+from scipy import optimize, special
 
 from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.intervals import LEVEL, POWER, ROUNDING, tested, two_sided_p
@@ -21,7 +21,7 @@ from merge_runner_analysis.stats.score_interval import Z
 LEVERAGE = 1e-9
 NEAREST = 1e-9  # to a difference, of what it may be instead
 LARGEST_Z = 30.0  # of this quantile p is 0 to 190 digits
-Z_WITH_POWER = Z + float(stats.norm.ppf(POWER))
+Z_WITH_POWER = Z + float(special.ndtri(POWER))
 Array = NDArray[np.float64]
 Trials = Mapping[str, Any]  # columns, also of a data frame: condition, a measure, maybe row
 
@@ -90,10 +90,12 @@ class Cells:
     @property
     def p(self) -> float:
         """The p-value of Fisher's exact test within cells, two-sided by probability."""
+        from scipy.stats import hypergeom
+
         chances, least = np.ones(1), 0
         for a, n, b, m in zip(self.a, self.n, self.b, self.m, strict=True):
             possible = np.arange(max(0, a + b - m), min(n, a + b) + 1)
-            chances = np.convolve(chances, stats.hypergeom.pmf(possible, n + m, a + b, n))
+            chances = np.convolve(chances, hypergeom.pmf(possible, n + m, a + b, n))
             least += possible[0]
         # As likely but for rounding is as likely.
         likely = chances <= chances[self.a.sum() - least] * (1 + 1e-7)
@@ -179,10 +181,12 @@ def detectable_rate(n: int, m: int, rate: float) -> float | None:
 
     It is the smaller of both directions; None if no rate has the power.
     """
-    chances = rejected(n, m) @ stats.binom.pmf(np.arange(m + 1), m, rate)
+    from scipy.stats import binom
+
+    chances = rejected(n, m) @ binom.pmf(np.arange(m + 1), m, rate)
 
     def enough(other: float) -> float:
-        return float(stats.binom.pmf(np.arange(n + 1), n, other) @ chances) - POWER
+        return float(binom.pmf(np.arange(n + 1), n, other) @ chances) - POWER
 
     ends = [end for end in (0.0, 1.0) if enough(end) >= 0]
     return min((abs(optimize.brentq(enough, rate, end) - rate) for end in ends), default=None)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
-from scipy import stats
+from scipy import special
 
 from merge_runner.records import SIDES
 from merge_runner_analysis.cache import remembered
@@ -116,26 +116,32 @@ def _stored(study: StudyResults, driver: GroupDriver) -> pd.DataFrame:
 
 
 def slope(rows: pd.DataFrame) -> Estimate | None:
-    """Return the slope of the first action on the own relative velocity, in m/s² per m/s."""
-    return _least_squares(rows, np.column_stack([np.ones(len(rows)), rows["velocity_mps"]]))
+    """Return the slope of the first action on the own relative velocity, in m/s² per m/s.
 
-
-def mean(rows: pd.DataFrame) -> Estimate | None:
-    """Return the mean first action in m/s²."""
-    return _least_squares(rows, np.ones((len(rows), 1)))
-
-
-def _least_squares(rows: pd.DataFrame, design: Array) -> Estimate | None:
-    """Return the last coefficient; None where the rows do not determine it or its error."""
+    None where the rows do not determine it or its error.
+    """
     from statsmodels.regression.linear_model import OLS
 
-    clusters, terms = rows["cluster"].nunique(), design.shape[1]
-    if clusters <= terms or np.linalg.matrix_rank(design) < terms:
+    clusters = rows["cluster"].nunique()
+    design = np.column_stack([np.ones(len(rows)), rows["velocity_mps"]])
+    if clusters < 3 or np.linalg.matrix_rank(design) < 2:
         return None
     fit = OLS(rows["first_mps2"].to_numpy(float), design).fit(
         cov_type="cluster", cov_kwds={"groups": rows["cluster"].to_numpy()}, use_t=True
     )
     return estimate(float(fit.params[-1]), float(fit.bse[-1]), clusters - 1, len(rows))
+
+
+def mean(rows: pd.DataFrame) -> Estimate | None:
+    """Return the mean first action in m/s²; None where all are of one cluster."""
+    actions, clusters = rows["first_mps2"].to_numpy(float), rows["cluster"].nunique()
+    if clusters < 2:
+        return None
+    whole = float(actions.mean())
+    # The clustered error of a regression on a constant (Liang and Zeger 1986), as statsmodels has.
+    residuals = np.bincount(rows["cluster"], actions - whole)
+    se = sqrt(clusters / (clusters - 1) * float(residuals @ residuals)) / len(rows)
+    return estimate(whole, se, clusters - 1, len(rows))
 
 
 def exchange_rate(rows: pd.DataFrame) -> Estimate | None:
@@ -174,7 +180,7 @@ def fieller(
 
     By Fieller (1954); None if the slope on headway may be 0, as then no ratio is too large.
     """
-    t = float(stats.t.ppf((1 + LEVEL) / 2, freedom)) ** 2
+    t = float(special.stdtrit(freedom, (1 + LEVEL) / 2)) ** 2
     squared = headway**2 - t * float(covariance[0, 0])
     if squared <= 0:
         return None

@@ -8,7 +8,6 @@ from functools import cache
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy import stats
 
 from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.grouping import Group
@@ -115,8 +114,10 @@ def median(sample: np.ndarray) -> Estimate:
 @cache
 def _ranks(n: int) -> tuple[int, int]:
     """Return the places of a median's ends, faster than scipy's quantile_test."""
+    from scipy.stats import binom
+
     outside = (1 - LEVEL) / 2
-    return int(stats.binom.ppf(outside, n, 0.5)) - 1, int(stats.binom.isf(outside, n, 0.5))
+    return int(binom.ppf(outside, n, 0.5)) - 1, int(binom.isf(outside, n, 0.5))
 
 
 @remembered

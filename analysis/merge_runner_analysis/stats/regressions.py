@@ -15,9 +15,8 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 from scipy.optimize import brentq, linprog
-from scipy.special import expit
 
 from merge_runner_analysis.stats import intervals
 from merge_runner_analysis.wording import Fact, Why
@@ -107,7 +106,7 @@ class Counts:
         The penalty is Jeffreys' prior; where the information is singular, it is minus infinity.
         """
         linear = b @ self.design.T
-        p = expit(linear)
+        p = special.expit(linear)
         weights = self.n * p * (1 - p)
         information = (self.design.T * weights[:, None]) @ self.design
         sign, penalty = np.linalg.slogdet(information)
@@ -160,7 +159,9 @@ class Fit:
     def p(self, term: int) -> float:
         """Return the p-value of the penalised likelihood ratio against a coefficient of 0."""
         without = self.profile(term, 0.0)
-        return float(stats.chi2.sf(2 * (self.best - without.best), 1)) if without else np.nan
+        if without is None:
+            return np.nan
+        return float(special.chdtrc(1, max(0.0, 2 * (self.best - without.best))))
 
     def profile(self, term: int, value: float) -> Fit | None:
         """Return the best fit with a term held at a value, or None where none converges."""
@@ -168,7 +169,8 @@ class Fit:
 
     def interval(self, term: int, level: float) -> tuple[float, float] | None:
         """Return the interval that the penalised likelihood ratio does not reject."""
-        lost, error = stats.chi2.ppf(level, 1) / 2, self.errors[term]
+        # Half the quantile of chi squared with one degree of freedom.
+        lost, error = float(special.gammaincinv(0.5, level)), self.errors[term]
         try:
             low, high = (self._bound(term, lost, width) for width in (-error, error))
         except ValueError:  # there is no bound, or a profile does not converge
@@ -311,8 +313,8 @@ class Moved:
         It ends where an intersection-union test does (Berger 1982), as all must be below a bound,
         and begins where one is above in simultaneous intervals (Scheffé 1953).
         """
-        together = sqrt(self.rank * float(stats.f.ppf(level, self.rank, self.freedom)))
-        alone = float(stats.t.ppf((1 + level) / 2, self.freedom))
+        together = sqrt(self.rank * float(special.fdtri(self.rank, self.freedom, level)))
+        alone = float(special.stdtrit(self.freedom, (1 + level) / 2))
         low = float((self.sizes - together * self.errors).max())
         return max(0.0, low), float((self.sizes + alone * self.errors).max())
 
@@ -328,7 +330,7 @@ class Moved:
         above = self.sizes > GAP_MARGIN_M
         with np.errstate(divide="ignore"):
             ratio = (self.sizes[above] - GAP_MARGIN_M) / self.errors[above]
-        p = stats.f.sf(ratio**2 / self.rank, self.rank, self.freedom)
+        p = special.fdtrc(self.rank, self.freedom, ratio**2 / self.rank)
         return float(p.min(initial=1.0))
 
 
@@ -358,7 +360,7 @@ def equivalence_p(b: float, se: float, freedom: float) -> float:
     Without an error it is sure.
     """
     inside = GAP_MARGIN_M - abs(b)
-    return float(stats.t.sf(inside / se, freedom)) if se else float(inside <= 0)
+    return float(special.stdtr(freedom, -inside / se)) if se else float(inside <= 0)
 
 
 def who_first_logit(trials: pd.DataFrame) -> Regression:
