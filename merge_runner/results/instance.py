@@ -110,10 +110,11 @@ def merge_small_groups(connection: duckdb.DuckDBPyConnection, added: int) -> Non
     Merging takes as much memory as the texts of a full group, and rewrites the group each time: the
     file is held twice as long.
     """
-    [(calls, path)] = connection.execute(
-        "SELECT estimated_size, path FROM duckdb_tables() JOIN duckdb_databases() "
-        "USING (database_name) WHERE table_name = 'calls' AND database_name = current_database()"
-    ).fetchall()
-    most_bytes = calls * BYTES_OF_A_CALL + MERGED_BYTES
-    merges = added < MANY_CALLS and Path(path).stat().st_size <= most_bytes
+    merges = False
+    if added < MANY_CALLS:
+        [(calls, path)] = connection.execute(
+            "SELECT estimated_size, path FROM duckdb_tables() JOIN duckdb_databases() USING "
+            "(database_name) WHERE table_name = 'calls' AND database_name = current_database()"
+        ).fetchall()
+        merges = Path(path).stat().st_size <= calls * BYTES_OF_A_CALL + MERGED_BYTES
     connection.execute(f"SET max_vacuum_tasks = {100 * merges}")

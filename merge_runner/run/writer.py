@@ -6,6 +6,7 @@ import asyncio
 import sys
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from itertools import accumulate
 from pathlib import Path
@@ -15,12 +16,14 @@ from merge_runner.results.store import Store
 from merge_runner.text_safety import one_line
 from merge_runner.trial_records import TrialRecord, TrialSpec
 
-EVERY_S, POLL_S = 1.0, 0.05
+# Between two transactions other programs can open the file.
+EVERY_S, POLL_S = 1.0, 0.06
 # Trials in one transaction, which costs as much as storing dozens of them; and in memory while
 # storing fails, as when another program holds the file.
 BATCH = 512
 MOST_PENDING = 3 * BATCH // 2
 BATCH_BYTES, MOST_PENDING_BYTES = 2**24, 2**25
+LIVE_BATCH_BYTES = 2**22  # some 1,000 decisions: a reader waits for about 0.1 s
 DECISION_BYTES = 2_000  # with its share of the states
 LOCK_PATIENCE_S = 2.0
 AGAIN = (
@@ -39,7 +42,13 @@ class Flusher:
     ``broken``: it writes nothing more, and calls ``on_break`` once.
     """
 
-    def __init__(self, store: Store, sweep_id: str, say: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        store: Store,
+        sweep_id: str,
+        say: Callable[[str], None],
+        batch_bytes: int = BATCH_BYTES,
+    ) -> None:
         self.differing: dict[str, list[str]] = {}
         self.dropped: list[TrialSpec] = []
         self.broken = False
@@ -47,10 +56,11 @@ class Flusher:
         self._store = store
         self._sweep_id = sweep_id
         self._say = say
+        self._batch_bytes = batch_bytes
         self._pending: list[tuple[TrialRecord, int]] = []  # with their bytes
         self._bytes = 0  # of all of them
         self._problem: StoreError | None = None
-        self._closing = False
+        self._closing = asyncio.Event()
         self._task = asyncio.create_task(self._run())
 
     def add(self, record: TrialRecord) -> None:
@@ -89,7 +99,7 @@ class Flusher:
         Waits as long as another program holds it; raises StoreError for anything else.
         More trials may be added later, and stored by the next call.
         """
-        self._closing = True
+        self._closing.set()
         await self._task
         is_announced = False
         while not await self._flush() or self._pending:
@@ -109,9 +119,11 @@ class Flusher:
     async def _run(self) -> None:
         clock_s = asyncio.get_running_loop().time
         flushed_s = clock_s()
-        while not self._closing:
-            await asyncio.sleep(POLL_S)
-            is_much = len(self._pending) >= BATCH or self._bytes >= BATCH_BYTES
+        while not self._closing.is_set():
+            with suppress(TimeoutError):
+                async with asyncio.timeout(POLL_S):
+                    await self._closing.wait()
+            is_much = len(self._pending) >= BATCH or self._bytes >= self._batch_bytes
             if self._pending and (is_much or clock_s() - flushed_s >= EVERY_S):
                 flushed_s = clock_s()
                 await self._flush()
@@ -122,7 +134,7 @@ class Flusher:
             return False
         sizes = accumulate(size for _, size in self._pending[:BATCH])
         # At least one: a single trial may be larger than a batch should be.
-        number = max(1, sum(size <= BATCH_BYTES for size in sizes))
+        number = max(1, sum(size <= self._batch_bytes for size in sizes))
         # It stays in front until it is stored: others are added behind it meanwhile.
         batch = [record for record, _ in self._pending[:number]]
         # In a thread, since DuckDB waits for the file's lock and for the disk.

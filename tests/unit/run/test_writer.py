@@ -8,7 +8,12 @@ import pytest
 
 from merge_runner.errors import StoreError, StoreLocked
 from merge_runner.records import Attempt, ChatReply, Decision
-from merge_runner.run.writer import MOST_PENDING, MOST_PENDING_BYTES, Flusher
+from merge_runner.run.writer import (
+    LIVE_BATCH_BYTES,
+    MOST_PENDING,
+    MOST_PENDING_BYTES,
+    Flusher,
+)
 from merge_runner.trial_records import DecisionRow, TrialRecord
 from tests.support.gate import HANGS_S
 from tests.support.specs import spec_of
@@ -82,6 +87,16 @@ async def test_trials_are_stored_in_few_transactions():
         flusher.add(ended())
     await flusher.close()
     assert [*map(len, store.written)] == [512, 88]
+
+
+async def test_live_trials_are_stored_in_short_transactions():
+    store = Scripted()
+    store.go_on.set()
+    flusher = Flusher(store, "sweep", print, LIVE_BATCH_BYTES)
+    for _ in range(5):
+        flusher.add(ended(size=LIVE_BATCH_BYTES // 3))
+    await flusher.close()
+    assert [*map(len, store.written)] == [2, 2, 1]
 
 
 def ended(order=0, status="finished", size=0):
