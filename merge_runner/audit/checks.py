@@ -134,7 +134,7 @@ def prepare(connection: duckdb.DuckDBPyConnection, sweep_id: str | None = None) 
     append(connection, "other_models", other_models(connection))
     connection.execute("SET VARIABLE sweep_id = ?", [sweep_id])
     connection.execute("INSERT INTO ids FROM read_ids; INSERT INTO reply_ids FROM identified")
-    rowids = [rowid for (rowid,) in connection.execute("FROM repeating").fetchall()]
+    rowids = [rowid for (rowid,) in connection.execute("FROM repeated_replies").fetchall()]
     for first in range(0, len(rowids), REPLIES_AT_ONCE):  # a chunk is in memory at once
         replies = connection.execute(REPLIES, [rowids[first : first + REPLIES_AT_ONCE]]).fetchall()
         append(connection, "contents", [(rowid, _content(reply)) for rowid, reply in replies])

