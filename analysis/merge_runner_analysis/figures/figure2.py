@@ -187,26 +187,26 @@ def published_gap_line(velocity_mps: float) -> tuple[Array, Array]:
 
 def _draw_traces(axis: Axes, study: StudyResults, group: Group, first: str, styles: Styles) -> None:
     traces = left_traces(study, group, first)
-    shown = [traces.get(velocity, []) for velocity in styles]
-    count = sum(map(len, shown))
-    if not count:
+    lines = [
+        (line, look["color"])
+        for velocity, look in styles.items()
+        for line in traces.get(velocity, ())
+    ]
+    if not lines:
         _say(axis, "no such trial" if group.measured else MISSING)
         return
     # Many traces must not be one blot, nor a large file.
+    count = len(lines)
     alpha, is_raster = min(0.4, max(0.06, 25 / count)), count > MANY_TRACES
-    lines = LineCollection(
-        [line for of_velocity in shown for line in of_velocity],
-        colors=[
-            look["color"]
-            for of_velocity, look in zip(shown, styles.values(), strict=True)
-            for _ in of_velocity
-        ],
+    collection = LineCollection(
+        [line for line, _ in lines],
+        colors=[colour for _, colour in lines],
         lw=0.4,
         alpha=alpha,
         rasterized=is_raster,
     )
-    lines.set(capstyle="projecting", joinstyle="round")
-    axis.add_collection(lines)
+    collection.set(capstyle="projecting", joinstyle="round")
+    axis.add_collection(collection)
     # The vehicle that goes first drives faster, which leaves room below its traces. The one that
     # goes second leaves room above.
     y, va = (0.04, "bottom") if first == "left" else (0.96, "top")

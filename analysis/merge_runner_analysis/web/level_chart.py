@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import ceil, floor, log10
 
@@ -83,27 +83,13 @@ def level_chart(
     lines: list[Line] = []
     y, heads = float(HEAD), set[str]()
     for (factor, name), of_level in levels.items():
-        points: list[Point] = []
         y += ROW if factor in heads or not lines else 1.5 * ROW
-        for row in of_level:
-            ci = interval_of(row)
-            driver, value = row.values["driver"] or "all drivers", number(value_of(row, "value"))
-            k, n = (row.values.get(name) for name in ("k", "n"))
-            counts = "" if k is None else f"{k} of {n}, "
-            says = f"{driver}: {counts}{value} {brackets(ci)}".rstrip()
-            points.append(
-                Point(
-                    shapes.get(str(row.values["driver"]), SHAPES[0]),
-                    x(value_of(row, "value")),
-                    None if ci is None else (x(ci[0]), x(ci[1])),
-                    y + APART * len(points),
-                    says,
-                )
-            )
+        points = [_point(row, shapes, x, y + APART * place) for place, row in enumerate(of_level)]
+        height = APART * (len(points) - 1)
         head = "" if factor in heads or TIMES in factor else factor
-        lines.append(Line(y + APART * (len(points) - 1) / 2, head, names[factor, name], points))
+        lines.append(Line(y + height / 2, head, names[factor, name], points))
         heads.add(factor)
-        y += APART * (len(points) - 1)
+        y += height
     ticks = [low + step * place for place in range(round((high - low) / step) + 1)]
     percent = metric.endswith("_percent")
     even = 50.0 if metric == LEFT_FIRST.name and low < 50 < high else None
@@ -115,6 +101,15 @@ def level_chart(
         y + ROW + 16,
         indent,
     )
+
+
+def _point(row: Row, shapes: dict[str, str], x: Callable[[float], float], y: float) -> Point:
+    ci, value = interval_of(row), value_of(row, "value")
+    driver, k, n = (row.values.get(name) for name in ("driver", "k", "n"))
+    counts = "" if k is None else f"{k} of {n}, "
+    says = f"{driver or 'all drivers'}: {counts}{number(value)} {brackets(ci)}".rstrip()
+    ends = None if ci is None else (x(ci[0]), x(ci[1]))
+    return Point(shapes.get(str(driver), SHAPES[0]), x(value), ends, y, says)
 
 
 def _axis(low: float, high: float) -> tuple[float, float, float]:

@@ -126,29 +126,17 @@ def finished_figures(study: StudyResults, say: Callable[[str], object] = str) ->
 
 def report_html(study: StudyResults, tables: list[Table], figures: dict[str, str]) -> str:
     """Return the report as one HTML document; ``figures`` maps names to SVG in Base64."""
-    # Rows with equal sources share a number.
-    numbers: dict[tuple[Source, ...], int] = {}
-    links: dict[tuple[str, str], str] = {}
-
-    def number(table: Table, row: Row, _column: Column) -> str:
-        if (place := (table.name, row.id)) not in links:
-            of_sources = numbers.setdefault(sources_of(study, table, row), len(numbers) + 1)
-            links[place] = f"#source-{of_sources}"
-        return links[place]
-
     origin = provenance(study.db)
-    finished = next((table for table in tables if table.name == TABLE), None)
     descriptions, levels, prompts = design(study)
-    rows = (finished or verdicts(study)).rows
+    made = {table.name: table for table in tables}
+    rows = (made[TABLE] if TABLE in made else verdicts(study)).rows
     headline, *others = sentences(rows)
     apart = _apart(study)
     kinds = {row.values["kind"] for row in rows} - {HUMANS}
     if apart and kinds == {LANGUAGE_MODEL}:  # two models are the question
         headline = f"{apart.claim} {headline}"
-    made = {table.name: table for table in tables}
     question = answer_of(made.get("effects"), made.get("levels"))
-    compared = (against(table, study) if table.name in FILES else table for table in tables)
-    views = [table_view(table, number) for table in compared]
+    views, numbers = _views(study, tables)
     if study.groups == study.baselines:  # it would stand there twice
         figures = {name: data for name, data in figures.items() if name != "figure2-variants"}
     inlined = inlined_texts([STYLE])
@@ -190,6 +178,27 @@ def report_html(study: StudyResults, tables: list[Table], figures: dict[str, str
         trials=len(study.frames.trials),
         digest=digest_of(study.db, study.state),
     )
+
+
+def _views(
+    study: StudyResults, tables: list[Table]
+) -> tuple[list[dict[str, object]], dict[tuple[Source, ...], int]]:
+    """Return the tables as templates need them, and the sources of their rows, numbered from 1.
+
+    Rows with equal sources share a number.
+    """
+    numbers: dict[tuple[Source, ...], int] = {}
+
+    links: dict[tuple[str, str], str] = {}
+
+    def link(table: Table, row: Row, _column: Column) -> str:
+        if (place := (table.name, row.id)) not in links:
+            number = numbers.setdefault(sources_of(study, table, row), len(numbers) + 1)
+            links[place] = f"#source-{number}"
+        return links[place]
+
+    compared = (against(table, study) if table.name in FILES else table for table in tables)
+    return [table_view(table, link) for table in compared], numbers
 
 
 def _apart(study: StudyResults) -> Comparison | None:
