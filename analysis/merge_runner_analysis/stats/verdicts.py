@@ -136,8 +136,9 @@ def compared(study: StudyResults, group: Group) -> tuple[Comparison, ...]:
 
 @remembered
 def of_humans(study: StudyResults) -> dict[str, Estimate]:
-    """Return the humans by measure, over all conditions."""
-    both = Both(study.human, study.human)
+    """Return the humans by measure, over all conditions; a few imported trials change none."""
+    human = study.human
+    both = Both(human if _imported(human) else replace(human, trials=human.outcomes), human)
     return {name: statistic.human(both) for name, statistic in STATISTICS.items()}
 
 

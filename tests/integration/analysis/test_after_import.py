@@ -1,12 +1,13 @@
 """What changes in tables and figures once human recordings are imported."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.frames import SPEEDS
-from merge_runner_analysis.grouping import of_trials
+from merge_runner_analysis.grouping import humans_of, of_trials
 from merge_runner_analysis.metrics import GAP
 from merge_runner_analysis.stats.held import measure_profiles
 from merge_runner_analysis.stats.indicators import (
@@ -17,7 +18,7 @@ from merge_runner_analysis.stats.indicators import (
     score,
 )
 from merge_runner_analysis.stats.measures import estimate
-from merge_runner_analysis.stats.verdicts import human_gap
+from merge_runner_analysis.stats.verdicts import human_gap, of_humans
 from merge_runner_analysis.tables import make_tables
 from tests.support.tables import by_id, notes_with
 
@@ -43,6 +44,16 @@ def test_human_rows_come_from_the_traces(imported, after):
         human.finished.groupby("pair")["gap_m"].mean().mean()
     )
     assert notes_with(after["who-first"], "66 of 990 trials")
+
+
+def test_two_imported_trials_leave_published_values_as_they_are(imported):
+    trials = imported.human.trials
+    few, published = (
+        of_humans(SimpleNamespace(human=humans_of(rows))) for rows in (trials[:2], trials[:0])
+    )
+    assert published["gap"].value == pytest.approx(3.85)
+    assert all(few[name].value == value.value for name, value in published.items())
+    assert all(few[name].bounds() == value.bounds() for name, value in published.items())
 
 
 @pytest.mark.parametrize(
