@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
@@ -47,7 +47,7 @@ DECIDED = f"""
 SELECT driver || '/' || variant, model, sum(invalid)::BIGINT, sum(asked)::BIGINT
 FROM ({ASKED_DECISIONS}) JOIN (SELECT trial_id, spec_hash, variant FROM trials)
     USING (trial_id, spec_hash)
-JOIN trial_drivers USING (trial_id, spec_hash) SEMI JOIN audited USING (trial_id, spec_hash)
+JOIN drivers USING (trial_id, spec_hash) SEMI JOIN audited USING (trial_id, spec_hash)
 GROUP BY driver, variant, model, spec_hash ORDER BY ALL
 """  # noqa: S608 # constants
 # Calls of one sweep, or of all.
@@ -60,6 +60,8 @@ REPLIES_BETWEEN = f"""
 SELECT rowid, reply::VARCHAR FROM {AUDITED_CALLS} AND rowid BETWEEN $first AND $last
 """  # noqa: S608 # constants
 CALL_FINDINGS = ("served_findings", "attempt_findings", "exchanged_findings", "shared_findings")
+STAND_INS = "attempts answered by a scripted stand-in"
+"""The column of ``counts`` with the replies of mock models."""
 ENTRIES_AT_ONCE = 100
 FINDINGS_SHOWN = 20
 REPLIES_AT_ONCE = 4_000
@@ -135,7 +137,7 @@ def audited_database(
 
 def prepare(connection: duckdb.DuckDBPyConnection, sweep_id: str | None = None) -> None:
     """Create the views of checks.sql, and read the reply ids of a sweep, or of all."""
-    make_views(connection)
+    make_views(connection, "checks.sql")
     append(connection, "other_models", other_models(connection))
     parameters = {"sweep_id": sweep_id}
     rowids = [rowid for (rowid,) in connection.execute(CALL_ROWIDS, parameters).fetchall()]
@@ -168,15 +170,21 @@ def _reply_contents(rowid: int, reply: str | None) -> tuple[int, str | None, str
     return rowid, reply_id, content, json.dumps(body.get(ANSWERED_FIELD))
 
 
-def make_views(connection: duckdb.DuckDBPyConnection) -> None:
-    """Create the views of checks.sql; ``alike`` needs only the table ``audited``."""
-    connection.execute(files("merge_runner.audit").joinpath("checks.sql").read_text("utf-8"))
+def make_views(connection: duckdb.DuckDBPyConnection, file: str) -> None:
+    """Create the views of an SQL file of this package."""
+    connection.execute(files("merge_runner.audit").joinpath(file).read_text("utf-8"))
 
 
-def audit_sweep(path: Path, sweep_id: str, planned: Sequence[TrialKey], *, finished: bool) -> Audit:
-    """Audit a sweep after its run (``check_sweep``)."""
-    with audited_database(path, sweep_id) as connection:
-        return check_sweep(connection, sweep_id, planned, finished=finished)
+def sweep_facts(connection: duckdb.DuckDBPyConnection, sweep_id: str) -> dict[str, Any]:
+    """Count a sweep's trials, decisions and replies in an audited database."""
+    connection.execute("SET VARIABLE sweep_id = ?", [sweep_id])
+    make_views(connection, "facts.sql")
+    facts = next(by_name(connection.execute("FROM decided")))
+    for name in ("outcomes", "failed", "others", "stand_ins", "same_prompts"):
+        facts[name] = connection.execute(f"FROM {name}").fetchall()
+    for name in ("levels", "first_looks"):
+        facts[name] = list(by_name(connection.execute(f"FROM {name}")))
+    return facts
 
 
 def check_sweep(
@@ -197,9 +205,13 @@ def check_sweep(
     connection.execute(AUDITED)
     counts = {"trials": len(planned), **next(by_name(connection.execute("FROM counts")))}
     findings = _findings(connection, ("list_findings", *CALL_FINDINGS), sweep_id)
-    audit = Audit(sweep_id, counts, findings, [*_notes(connection)])
+    notes = [*_notes(connection, counts)]
+    missing, failed = counts["missing"], counts["failed"]
+    if not finished and missing + failed:
+        text = f"unfinished: {missing} of {len(planned)} trials are missing, {failed} failed"
+        notes.insert(0, f"{text}; the same command again plays them")
     connection.execute("INSERT INTO done FROM audited")
-    return audit
+    return Audit(sweep_id, counts, findings, notes)
 
 
 def check_rest(connection: duckdb.DuckDBPyConnection, path: Path) -> Audit:
@@ -207,6 +219,7 @@ def check_rest(connection: duckdb.DuckDBPyConnection, path: Path) -> Audit:
     connection.execute(
         "CREATE OR REPLACE TEMP TABLE audited AS SELECT trial_id, spec_hash FROM trials"
     )
+    make_views(connection, "rest.sql")
     sql = """
         FROM (SELECT count(*) AS sweeps FROM sweeps), (SELECT count(*) AS trials,
             count(*) FILTER (source = 'human') AS "human trials" FROM trials)
@@ -229,8 +242,15 @@ def _findings(
     ]
 
 
-def _notes(connection: duckdb.DuckDBPyConnection) -> Iterator[str]:
+def _notes(connection: duckdb.DuckDBPyConnection, counts: Mapping[str, int]) -> Iterator[str]:
     yield from (text for (text,) in connection.execute("FROM notes").fetchall())
+    if not counts[STAND_INS]:  # the emulator has only a few phrases
+        [(answers,)] = connection.execute("FROM alike").fetchall()
+        if answers:
+            yield (
+                f"all {answers} answers to prompts that were asked before are word for word as "
+                "before: are they samples?"
+            )
     for group, model, invalid, asked in connection.execute(DECIDED).fetchall():
         if reason := not_judged(model, invalid, asked):
             yield f"{group}: {reason}"
@@ -263,10 +283,10 @@ def audit_recording(file: Path) -> Audit:
         append(connection, "sweeps", rows)  # for the aliases of models
         prepare(connection)
         connection.execute("INSERT INTO audited SELECT trial_id, spec_hash FROM trials")
-        columns = 'calls, attempts, "reply ids"'
-        counts = next(by_name(connection.execute(f"SELECT {columns} FROM counts")))  # noqa: S608 # constants
+        counts = next(by_name(connection.execute("FROM counts")))
+        shown = {name: counts[name] for name in ("calls", "attempts", "reply ids")}
         findings = _findings(connection, CALL_FINDINGS)
-        return Audit(str(file), counts, findings, notes=[*_notes(connection)])
+        return Audit(str(file), shown, findings, notes=[*_notes(connection, counts)])
 
 
 def _fill(connection: duckdb.DuckDBPyConnection, entries: Iterator[CachedCall]) -> None:

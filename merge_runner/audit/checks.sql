@@ -5,6 +5,7 @@ CREATE OR REPLACE TEMP TABLE subject (sweep_id VARCHAR, finished BOOLEAN, known 
 CREATE OR REPLACE TEMP TABLE planned (trial_id VARCHAR, spec_hash VARCHAR);
 CREATE OR REPLACE TEMP TABLE audited AS SELECT trial_id, spec_hash FROM trials LIMIT 0;
 CREATE OR REPLACE TEMP TABLE done AS FROM audited;
+CREATE OR REPLACE TEMP TABLE drivers AS SELECT trial_id, spec_hash, driver FROM trial_drivers;
 CREATE OR REPLACE TEMP TABLE other_models (model_requested VARCHAR, model_served VARCHAR);
 
 -- The sweep's list of trials.
@@ -37,24 +38,6 @@ UNION ALL SELECT 'config', NULL, 'its id is not made of its name, its drivers an
 FROM sweeps SEMI JOIN subject USING (sweep_id)
 WHERE json_valid(config) AND sweep_id <> concat_ws(
     '-', name, config->>'$.model', strftime(started_at, '%Y%m%dT%H%M%S%f'));
-
--- Orphan rows of the whole database; the hash of a spec is that of its text.
-CREATE OR REPLACE TEMP VIEW orphans AS
-SELECT 'orphan' AS kind, trial_id, 'no sweep has this trial' AS text FROM trials
-ANTI JOIN sweep_trials USING (trial_id, spec_hash) WHERE source <> 'human'
-UNION ALL SELECT 'orphan', trial_id, 'its spec is not stored' FROM trials
-ANTI JOIN specs USING (spec_hash)
-UNION ALL SELECT 'orphan', trial_id, 'it is listed by a sweep that is not stored' FROM sweep_trials
-ANTI JOIN sweeps USING (sweep_id)
-UNION ALL SELECT 'orphan', trial_id, format('{} rows of {} belong to no trial', count(*), name)
-FROM (
-    SELECT 'states' AS name, trial_id, spec_hash FROM states
-    UNION ALL SELECT 'decisions', trial_id, spec_hash FROM decisions
-    UNION ALL SELECT 'calls', trial_id, spec_hash FROM calls
-    UNION ALL SELECT 'trial_factors', trial_id, spec_hash FROM trial_factors
-) ANTI JOIN trials USING (trial_id, spec_hash) GROUP BY name, trial_id
-UNION ALL SELECT 'spec', NULL, format('the spec stored as {} has another hash', spec_hash)
-FROM specs WHERE left(sha256(spec::VARCHAR), 16) <> spec_hash;
 
 -- Calls and their replies. Replies are read in chunks, since each may have many megabytes: the id of
 -- each, a hash of its answer, and the request that it answers, if it names one.
@@ -125,7 +108,7 @@ CREATE OR REPLACE TEMP VIEW shared AS
 SELECT 'its call is also that of' AS text,
     list(DISTINCT (trial_id, side, decision) ORDER BY (trial_id, side, decision)) AS places,
     list(DISTINCT (trial_id, spec_hash)) AS trials
-FROM decisions JOIN trial_drivers USING (trial_id, spec_hash)
+FROM decisions JOIN drivers USING (trial_id, spec_hash)
 WHERE call_key IS NOT NULL GROUP BY spec_hash, driver, call_key HAVING count(*) > 1
 UNION ALL SELECT 'its answer, with the provider''s id of it, is also that of',
     list(place ORDER BY place), list(DISTINCT trial)
@@ -165,22 +148,6 @@ FROM (
     ) GROUP BY model_left, model_right, side, prompt_hash
 );
 
--- Identical requests of the same slot.
-CREATE OR REPLACE TEMP VIEW calls_in_common AS
-WITH used AS (
-    SELECT DISTINCT call_key, spec_hash, driver || '/' || variant AS name
-    FROM decisions JOIN trials USING (trial_id, spec_hash)
-    JOIN trial_drivers USING (trial_id, spec_hash) WHERE call_key IS NOT NULL
-)
-SELECT if(a.name = b.name, format('{} ({})', a.name, a.spec_hash), a.name),
-    if(a.name = b.name, format('{} ({})', b.name, b.spec_hash), b.name),
-    count(DISTINCT call_key) AS calls
-FROM used AS a JOIN used AS b USING (call_key)
-WHERE (a.name, a.spec_hash) < (b.name, b.spec_hash)
-    AND (a.spec_hash IN (SELECT spec_hash FROM audited)
-        OR b.spec_hash IN (SELECT spec_hash FROM audited))
-GROUP BY a.name, a.spec_hash, b.name, b.spec_hash ORDER BY ALL;
-
 CREATE OR REPLACE TEMP VIEW counts AS
 FROM (SELECT count(*) AS stored FROM linked SEMI JOIN trials USING (trial_id, spec_hash)),
     (SELECT count(*) FILTER (NOT elsewhere) AS missing FROM unplayed),
@@ -206,10 +173,7 @@ FROM linked JOIN sweep_trials USING (trial_id, spec_hash) JOIN sweeps AS earlier
 WHERE earlier.started_at < own.started_at;
 
 CREATE OR REPLACE TEMP VIEW notes AS
-SELECT format('unfinished: {} of {} trials are missing, {} failed; the same command again plays them',
-    missing, (SELECT count(*) FROM planned), failed) AS text
-FROM counts, subject WHERE NOT finished AND missing + failed > 0
-UNION ALL SELECT format('goes on from {} of {}: {} of its trials were stored before',
+SELECT format('goes on from {} of {}: {} of its trials were stored before',
     if(count(DISTINCT earlier) = 1, 'the run', format('{} runs, the first', count(DISTINCT earlier))),
     strftime(min(began_at), '%Y-%m-%d %H:%M'), count(DISTINCT (trial_id, spec_hash)))
 FROM played_before WHERE resumed GROUP BY sweep_id
@@ -231,8 +195,4 @@ UNION ALL SELECT format('{} replies of {} at {} have an id that the server gave 
     coalesce(nullif(endpoint, ''), 'its endpoint'))
 FROM reply_ids SEMI JOIN audited USING (trial_id, spec_hash)
 JOIN repeated_ids USING (endpoint, model_requested, reply_id)
-WHERE NOT telling GROUP BY model_requested, endpoint
--- Without replies of the emulator, which has only a few phrases.
-UNION ALL SELECT format('all {} answers to prompts that were asked before are word for word as before: '
-    'are they samples?', answers)
-FROM alike, counts WHERE answers > 0 AND "attempts answered by a scripted stand-in" = 0;
+WHERE NOT telling GROUP BY model_requested, endpoint;

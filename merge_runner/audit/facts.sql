@@ -1,7 +1,5 @@
--- Facts of a sweep's summary. The views read the trials of the sweep in the variable sweep_id, and the
--- pairs of models (requested, served) that do not match.
-CREATE OR REPLACE TEMP TABLE other_models (model_requested VARCHAR, model_served VARCHAR);
-
+-- Facts of a sweep's summary. The views read the trials of the sweep in the variable sweep_id, and two
+-- tables of checks.sql: drivers and other_models.
 CREATE OR REPLACE TEMP TABLE played AS
 FROM trials SEMI JOIN (FROM sweep_trials WHERE sweep_id = getvariable('sweep_id'))
     USING (trial_id, spec_hash);
@@ -85,5 +83,5 @@ JOIN (
     SELECT trial_id, spec_hash, side, min_by(acceleration_mps2, step) AS action_mps2
     FROM states SEMI JOIN asked USING (trial_id, spec_hash) WHERE time_s > 0 GROUP BY ALL
 ) USING (trial_id, spec_hash, side)
-JOIN trial_drivers USING (trial_id, spec_hash)
+JOIN drivers USING (trial_id, spec_hash)
 GROUP BY ALL ORDER BY ALL;
