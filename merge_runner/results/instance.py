@@ -107,8 +107,8 @@ def merge_small_groups(connection: duckdb.DuckDBPyConnection, added: int) -> Non
     file is held twice as long.
     """
     [(calls, path)] = connection.execute(
-        "SELECT estimated_size, path FROM duckdb_tables() JOIN duckdb_databases() "
-        "USING (database_name) WHERE table_name = 'calls' AND database_name = current_database()"
+        "SELECT (SELECT count(*) FROM calls), path FROM duckdb_databases() "
+        "WHERE database_name = current_database()"
     ).fetchall()
     most_bytes = calls * BYTES_OF_A_CALL + MERGED_BYTES
     merges = added < MANY_CALLS and Path(path).stat().st_size <= most_bytes
