@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 import sys
-import tempfile
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -33,6 +32,8 @@ def sql(
 
     Example: merge-runner sql "select status, count(*) from trials group by all"
     """
+    import tempfile
+
     from merge_runner.results import database, export, store
 
     writers = {"text": export.write_table, "csv": export.write_csv, "json": export.write_json}
