@@ -1,4 +1,4 @@
-"""Audits in SQL (checks.sql): of a sweep, of orphan rows, and of a recording."""
+"""Audits in SQL (checks.sql): of a sweep, and of orphan rows."""
 
 from __future__ import annotations
 
@@ -7,23 +7,18 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from datetime import datetime
 from importlib.resources import files
-from itertools import islice
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import duckdb
 
-from merge_runner.errors import RecordingError, StoreError
-from merge_runner.llm.store import CachedCall
-from merge_runner.records import ANSWERED_FIELD, SIDES, canonical_json
-from merge_runner.results.database import append, by_name, read_database, schema_sql
-from merge_runner.results.instance import SETTINGS, in_memory, limit_memory
-from merge_runner.results.recorded_sweeps import described_sweeps
-from merge_runner.results.recording import read_provenance, read_recording
-from merge_runner.results.rows import Row, TrialKey, call_row
+from merge_runner.errors import StoreError
+from merge_runner.records import ANSWERED_FIELD
+from merge_runner.results.database import append, by_name, read_database
+from merge_runner.results.instance import limit_memory
+from merge_runner.results.rows import TrialKey
 from merge_runner.served_model import other_models
 from merge_runner.text_safety import first_line
 
@@ -62,10 +57,8 @@ SELECT rowid, reply::VARCHAR FROM {AUDITED_CALLS} AND rowid BETWEEN $first AND $
 CALL_FINDINGS = ("served_findings", "attempt_findings", "exchanged_findings", "shared_findings")
 STAND_INS = "attempts answered by a scripted stand-in"
 """The column of ``counts`` with the replies of mock models."""
-ENTRIES_AT_ONCE = 100
 FINDINGS_SHOWN = 20
 REPLIES_AT_ONCE = 4_000
-NEVER = datetime(1970, 1, 1)  # noqa: DTZ001 # times of the database have no zone
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,8 +197,8 @@ def check_sweep(
     append(connection, "planned", planned)
     connection.execute(AUDITED)
     counts = {"trials": len(planned), **next(by_name(connection.execute("FROM counts")))}
-    findings = _findings(connection, ("list_findings", *CALL_FINDINGS), sweep_id)
-    notes = [*_notes(connection, counts)]
+    findings = findings_of(connection, ("list_findings", *CALL_FINDINGS), sweep_id)
+    notes = [*notes_of(connection, counts)]
     missing, failed = counts["missing"], counts["failed"]
     if not finished and missing + failed:
         text = f"unfinished: {missing} of {len(planned)} trials are missing, {failed} failed"
@@ -227,10 +220,10 @@ def check_rest(connection: duckdb.DuckDBPyConnection, path: Path) -> Audit:
     counts = next(by_name(connection.execute(sql)))
     shared = connection.execute("FROM calls_in_common").fetchall()
     notes = [f"{first} and {second} share {calls} calls" for first, second, calls in shared]
-    return Audit(str(path), counts, _findings(connection, ["orphans"]), notes)
+    return Audit(str(path), counts, findings_of(connection, ["orphans"]), notes)
 
 
-def _findings(
+def findings_of(
     connection: duckdb.DuckDBPyConnection, views: Iterable[str], sweep_id: str | None = None
 ) -> list[Finding]:
     """Return the rows of the views, one query each: a joint query would need their joint memory."""
@@ -242,7 +235,8 @@ def _findings(
     ]
 
 
-def _notes(connection: duckdb.DuckDBPyConnection, counts: Mapping[str, int]) -> Iterator[str]:
+def notes_of(connection: duckdb.DuckDBPyConnection, counts: Mapping[str, int]) -> Iterator[str]:
+    """Yield the notes of an audit with these ``counts``."""
     yield from (text for (text,) in connection.execute("FROM notes").fetchall())
     if not counts[STAND_INS]:  # the emulator has only a few phrases
         [(answers,)] = connection.execute("FROM alike").fetchall()
@@ -264,53 +258,3 @@ def not_judged(model: str, invalid: int, asked: int) -> str:
         f"not judged: {invalid} of the {asked} decisions of {model} are invalid "
         f"({100 * invalid / asked:.1f} %, more than {100 * MOST_INVALID_SHARE:.0f} %)"
     )
-
-
-def audit_recording(file: Path) -> Audit:
-    """Audit a recording; damage is a finding. Raises UsageError without a file.
-
-    Its calls are written into a database in memory, with the checks of a database.
-    """
-    with in_memory(SETTINGS) as connection:
-        connection.execute(schema_sql())
-        try:
-            _fill(connection, read_recording(file))
-            sweeps = described_sweeps(read_provenance(file))
-        except RecordingError as exc:
-            return Audit(str(file), findings=[Finding("recording", str(exc))])
-        configs = (canonical_json({"models": sweep.models}) for sweep in sweeps)
-        rows = ((n, "", NEVER, None, None, c, None, None, "{}") for n, c in enumerate(configs))
-        append(connection, "sweeps", rows)  # for the aliases of models
-        prepare(connection)
-        connection.execute("INSERT INTO audited SELECT trial_id, spec_hash FROM trials")
-        counts = next(by_name(connection.execute("FROM counts")))
-        shown = {name: counts[name] for name in ("calls", "attempts", "reply ids")}
-        findings = _findings(connection, CALL_FINDINGS)
-        return Audit(str(file), shown, findings, notes=[*_notes(connection, counts)])
-
-
-def _fill(connection: duckdb.DuckDBPyConnection, entries: Iterator[CachedCall]) -> None:
-    """Fill the tables with the calls of a recording.
-
-    Each endpoint becomes a spec, and each repetition of a condition a trial: a recording does not
-    have the prompt variant of a call.
-    """
-    specs: dict[str, str] = {}
-    trials: dict[TrialKey, Row] = {}
-    while chunk := list(islice(entries, ENTRIES_AT_ONCE)):
-        rows: list[Row] = []
-        for entry in chunk:
-            slot, endpoint = entry.request.slot, entry.request.endpoint
-            specs[endpoint] = canonical_json({side: {"endpoint": endpoint} for side in SIDES})
-            suffix = f"/set{slot.sample_set}" if slot.sample_set else ""
-            key = (f"{slot.condition}/rep{slot.repetition:02d}{suffix}", endpoint)
-            trials[key] = (
-                *(*key, None, "llm", None, None, None, slot.condition, 0.0, 0.0),
-                *(slot.repetition, slot.sample_set, "finished", None, 0.0, None, False, None),
-            )
-            rows += [
-                call_row(key, entry.request, attempt, cached=True) for attempt in entry.attempts
-            ]
-        append(connection, "calls", rows)
-    append(connection, "specs", specs.items())
-    append(connection, "trials", trials.values())

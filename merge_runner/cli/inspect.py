@@ -80,7 +80,7 @@ def audit(
 
     Example: merge-runner audit --recording baseline.parquet
     """
-    from merge_runner.audit.checks import audit_recording
+    from merge_runner.audit.recording import audit_recording
     from merge_runner.run.stored_replay import NOT_REPLAYED, audit_database
 
     cli.use_study(study, trust=trust)
