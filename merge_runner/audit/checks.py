@@ -22,7 +22,16 @@ from merge_runner.results.rows import TrialKey
 from merge_runner.served_model import other_models
 from merge_runner.text_safety import first_line
 
-AUDITED = """
+TRIALS = """
+CREATE OR REPLACE TEMP TABLE linked AS
+SELECT trial_id, spec_hash, count(*) AS links FROM sweep_trials SEMI JOIN subject USING (sweep_id)
+GROUP BY ALL;
+CREATE OR REPLACE TEMP TABLE unplayed AS
+SELECT trial_id, trials.status IS NOT NULL AS elsewhere
+FROM planned ANTI JOIN linked USING (trial_id)
+LEFT JOIN (
+    FROM trials SEMI JOIN sweep_trials USING (trial_id, spec_hash) WHERE status <> 'failed'
+) AS trials USING (trial_id, spec_hash);
 CREATE OR REPLACE TEMP TABLE audited AS
 SELECT trial_id, spec_hash FROM linked SEMI JOIN trials USING (trial_id, spec_hash)
 ANTI JOIN done USING (trial_id, spec_hash)
@@ -140,7 +149,9 @@ def prepare(connection: duckdb.DuckDBPyConnection, sweep_id: str | None = None) 
         replies = connection.execute(REPLIES_BETWEEN, span).fetchall()
         rows = [row for rowid, reply in replies if (row := _reply_contents(rowid, reply))]
         append(connection, "reply_contents", rows)
-    connection.execute("INSERT INTO reply_ids FROM identified")
+    connection.execute(
+        "INSERT INTO reply_ids FROM identified; INSERT INTO repeated_ids FROM repeating"
+    )
 
 
 def _reply_contents(rowid: int, reply: str | None) -> tuple[int, str | None, str, str] | None:
@@ -195,7 +206,7 @@ def check_sweep(
     connection.execute("DELETE FROM subject; DELETE FROM planned")
     append(connection, "subject", [(sweep_id, finished, bool(planned))])
     append(connection, "planned", planned)
-    connection.execute(AUDITED)
+    connection.execute(TRIALS)
     counts = {"trials": len(planned), **next(by_name(connection.execute("FROM counts")))}
     findings = findings_of(connection, ("list_findings", *CALL_FINDINGS), sweep_id)
     notes = [*notes_of(connection, counts)]

@@ -1,26 +1,17 @@
 -- Checks that a replay cannot make. The views read the tables of a database and these: the audited
--- sweep, its planned trials (if subject.known), its stored trials, the trials that were audited before,
--- and pairs of models that do not match.
+-- sweep, its planned trials (if subject.known), its list of trials, the planned ones that it does not
+-- list (elsewhere: another sweep played it after this one stopped), its stored trials, the trials that
+-- were audited before, and pairs of models that do not match.
 CREATE OR REPLACE TEMP TABLE subject (sweep_id VARCHAR, finished BOOLEAN, known BOOLEAN);
 CREATE OR REPLACE TEMP TABLE planned (trial_id VARCHAR, spec_hash VARCHAR);
+CREATE OR REPLACE TEMP TABLE linked (trial_id VARCHAR, spec_hash VARCHAR, links BIGINT);
+CREATE OR REPLACE TEMP TABLE unplayed (trial_id VARCHAR, elsewhere BOOLEAN);
 CREATE OR REPLACE TEMP TABLE audited AS SELECT trial_id, spec_hash FROM trials LIMIT 0;
 CREATE OR REPLACE TEMP TABLE done AS FROM audited;
 CREATE OR REPLACE TEMP TABLE drivers AS SELECT trial_id, spec_hash, driver FROM trial_drivers;
 CREATE OR REPLACE TEMP TABLE other_models (model_requested VARCHAR, model_served VARCHAR);
 
 -- The sweep's list of trials.
-
-CREATE OR REPLACE TEMP VIEW linked AS
-SELECT trial_id, spec_hash, count(*) AS links FROM sweep_trials SEMI JOIN subject USING (sweep_id)
-GROUP BY ALL;
-
--- Trials that another sweep played after this one stopped are not missing.
-CREATE OR REPLACE TEMP VIEW unplayed AS
-SELECT trial_id, trials.status IS NOT NULL AS elsewhere
-FROM planned ANTI JOIN linked USING (trial_id)
-LEFT JOIN (
-    FROM trials SEMI JOIN sweep_trials USING (trial_id, spec_hash) WHERE status <> 'failed'
-) AS trials USING (trial_id, spec_hash);
 
 CREATE OR REPLACE TEMP VIEW list_findings AS
 SELECT 'missing' AS kind, trial_id, 'it was not played' AS text
@@ -92,7 +83,7 @@ CREATE OR REPLACE TEMP TABLE reply_ids AS FROM identified LIMIT 0;
 -- Some servers draw ids out of a thousand, or have only one. An id with different answers proves
 -- nothing; neither does an id of a server most of whose repeated ids are such, nor an id of a local
 -- server, which need not be unique.
-CREATE OR REPLACE TEMP VIEW repeated_ids AS
+CREATE OR REPLACE TEMP VIEW repeating AS
 SELECT endpoint, model_requested, reply_id, same AND provider <> 'local'
     AND count(*) FILTER (same) OVER server >= count(*) FILTER (NOT same) OVER server AS telling
 FROM (
@@ -100,6 +91,7 @@ FROM (
         min(content) = max(content) AS same
     FROM reply_ids GROUP BY ALL HAVING min(call_key) <> max(call_key)
 ) WINDOW server AS (PARTITION BY endpoint, model_requested);
+CREATE OR REPLACE TEMP TABLE repeated_ids AS FROM repeating LIMIT 0;
 
 -- Two slots of one spec with one call, and two calls of any spec with one reply: a caching proxy
 -- answers a repetition, or a new sample set, with an old reply. Drivers of a study may make the same
