@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import hashlib
 import re
 import sys
 from types import SimpleNamespace
@@ -33,6 +31,8 @@ LONGEST_IN_A_NAME = 40
 
 def in_a_name(text: str) -> str:
     """Return a text as a part of a trial's id; a changed text gets a hash at its end."""
+    import hashlib  # loads OpenSSL
+
     plain = _NOT_IN_A_NAME.sub("_", text)[:LONGEST_IN_A_NAME]
     return plain if plain == text else f"{plain}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
@@ -49,6 +49,8 @@ def csv_writer(file: TextIO) -> Any:  # noqa: ANN401 # the library does not name
 
     With that line end the csv module itself would leave a CR within a value unquoted.
     """
+    import csv
+
     lines = SimpleNamespace(write=lambda row: file.write(row.removesuffix("\r\n") + "\n"))
     return csv.writer(lines)
 

@@ -1,33 +1,36 @@
-"""Audits in SQL (checks.sql): of a sweep, of orphan rows, and of a recording."""
+"""Audits in SQL (checks.sql): of a sweep, and of orphan rows."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from datetime import datetime
 from importlib.resources import files
-from itertools import islice
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import duckdb
 
-from merge_runner.errors import RecordingError, StoreError
-from merge_runner.llm.store import CachedCall
-from merge_runner.records import SIDES, canonical_json
-from merge_runner.results.database import append, by_name, read_database, schema_sql
-from merge_runner.results.instance import SETTINGS, in_memory, limit_memory
-from merge_runner.results.recorded_sweeps import described_sweeps
-from merge_runner.results.recording import read_provenance, read_recording
-from merge_runner.results.rows import Row, TrialKey, call_row
+from merge_runner.errors import StoreError
+from merge_runner.results.database import append, by_name, read_database
+from merge_runner.results.instance import limit_memory
+from merge_runner.results.rows import TrialKey
 from merge_runner.served_model import other_models
 from merge_runner.text_safety import first_line
 
-AUDITED = """
+TRIALS = """
+CREATE OR REPLACE TEMP TABLE linked AS
+SELECT trial_id, spec_hash, count(*) AS links FROM sweep_trials SEMI JOIN subject USING (sweep_id)
+GROUP BY ALL;
+CREATE OR REPLACE TEMP TABLE unplayed AS
+SELECT trial_id, trials.status IS NOT NULL AS elsewhere
+FROM planned ANTI JOIN linked USING (trial_id)
+LEFT JOIN (
+    FROM trials SEMI JOIN sweep_trials USING (trial_id, spec_hash) WHERE status <> 'failed'
+) AS trials USING (trial_id, spec_hash);
 CREATE OR REPLACE TEMP TABLE audited AS
 SELECT trial_id, spec_hash FROM linked SEMI JOIN trials USING (trial_id, spec_hash)
 ANTI JOIN done USING (trial_id, spec_hash)
@@ -47,15 +50,15 @@ DECIDED = f"""
 SELECT driver || '/' || variant, model, sum(invalid)::BIGINT, sum(asked)::BIGINT
 FROM ({ASKED_DECISIONS}) JOIN (SELECT trial_id, spec_hash, variant FROM trials)
     USING (trial_id, spec_hash)
-JOIN trial_drivers USING (trial_id, spec_hash) SEMI JOIN audited USING (trial_id, spec_hash)
+JOIN drivers USING (trial_id, spec_hash) SEMI JOIN audited USING (trial_id, spec_hash)
 GROUP BY driver, variant, model, spec_hash ORDER BY ALL
 """  # noqa: S608 # constants
 REPLIES = "SELECT rowid, reply::VARCHAR FROM calls WHERE rowid IN (SELECT unnest(?))"
 CALL_FINDINGS = ("served_findings", "attempt_findings", "exchanged_findings", "shared_findings")
-ENTRIES_AT_ONCE = 100
+OF_MOCKS = "attempts answered by a mock model"
+"""The column of ``counts`` with the replies of mock models."""
 FINDINGS_SHOWN = 20
 REPLIES_AT_ONCE = 4_000
-NEVER = datetime(1970, 1, 1)  # noqa: DTZ001 # times of the database have no zone
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +133,7 @@ def prepare(connection: duckdb.DuckDBPyConnection, sweep_id: str | None = None) 
 
     Replies whose id is repeated are compared.
     """
-    make_views(connection)
+    make_views(connection, "checks.sql")
     append(connection, "other_models", other_models(connection))
     connection.execute("SET VARIABLE sweep_id = ?", [sweep_id])
     connection.execute("INSERT INTO ids FROM read_ids; INSERT INTO reply_ids FROM identified")
@@ -138,6 +141,7 @@ def prepare(connection: duckdb.DuckDBPyConnection, sweep_id: str | None = None) 
     for first in range(0, len(rowids), REPLIES_AT_ONCE):  # a chunk is in memory at once
         replies = connection.execute(REPLIES, [rowids[first : first + REPLIES_AT_ONCE]]).fetchall()
         append(connection, "contents", [(rowid, _content(reply)) for rowid, reply in replies])
+    connection.execute("INSERT INTO repeated_ids FROM repeating")
 
 
 def _content(reply: str) -> str:
@@ -152,15 +156,21 @@ def _content(reply: str) -> str:
     return hashlib.blake2b(answer, digest_size=16).hexdigest()
 
 
-def make_views(connection: duckdb.DuckDBPyConnection) -> None:
-    """Create the views of checks.sql; ``alike`` needs only the table ``audited``."""
-    connection.execute(files("merge_runner.audit").joinpath("checks.sql").read_text("utf-8"))
+def make_views(connection: duckdb.DuckDBPyConnection, file: str) -> None:
+    """Create the views of an SQL file of this package."""
+    connection.execute(files("merge_runner.audit").joinpath(file).read_text("utf-8"))
 
 
-def audit_sweep(path: Path, sweep_id: str, planned: Sequence[TrialKey], *, finished: bool) -> Audit:
-    """Audit a sweep after its run (``check_sweep``)."""
-    with audited_database(path, sweep_id) as connection:
-        return check_sweep(connection, sweep_id, planned, finished=finished)
+def sweep_facts(connection: duckdb.DuckDBPyConnection, sweep_id: str) -> dict[str, Any]:
+    """Count a sweep's trials, decisions and replies in an audited database."""
+    connection.execute("SET VARIABLE sweep_id = ?", [sweep_id])
+    make_views(connection, "facts.sql")
+    facts = next(by_name(connection.execute("FROM decided")))
+    for name in ("outcomes", "failed", "others", "stand_ins", "same_prompts"):
+        facts[name] = connection.execute(f"FROM {name}").fetchall()
+    for name in ("levels", "first_looks"):
+        facts[name] = list(by_name(connection.execute(f"FROM {name}")))
+    return facts
 
 
 def check_sweep(
@@ -178,12 +188,16 @@ def check_sweep(
     connection.execute("DELETE FROM subject; DELETE FROM planned")
     append(connection, "subject", [(sweep_id, finished, bool(planned))])
     append(connection, "planned", planned)
-    connection.execute(AUDITED)
+    connection.execute(TRIALS)
     counts = {"trials": len(planned), **next(by_name(connection.execute("FROM counts")))}
-    findings = _findings(connection, ("list_findings", *CALL_FINDINGS), sweep_id)
-    audit = Audit(sweep_id, counts, findings, [*_notes(connection)])
+    findings = findings_of(connection, ("list_findings", *CALL_FINDINGS), sweep_id)
+    notes = [*notes_of(connection, counts)]
+    missing, failed = counts["missing"], counts["failed"]
+    if not finished and missing + failed:
+        text = f"unfinished: {missing} of {len(planned)} trials are missing, {failed} failed"
+        notes.insert(0, f"{text}; the same command again plays them")
     connection.execute("INSERT INTO done FROM audited")
-    return audit
+    return Audit(sweep_id, counts, findings, notes)
 
 
 def check_rest(connection: duckdb.DuckDBPyConnection, path: Path) -> Audit:
@@ -191,6 +205,7 @@ def check_rest(connection: duckdb.DuckDBPyConnection, path: Path) -> Audit:
     connection.execute(
         "CREATE OR REPLACE TEMP TABLE audited AS SELECT trial_id, spec_hash FROM trials"
     )
+    make_views(connection, "rest.sql")
     sql = """
         FROM (SELECT count(*) AS sweeps FROM sweeps), (SELECT count(*) AS trials,
             count(*) FILTER (source = 'human') AS "human trials" FROM trials)
@@ -198,10 +213,10 @@ def check_rest(connection: duckdb.DuckDBPyConnection, path: Path) -> Audit:
     counts = next(by_name(connection.execute(sql)))
     shared = connection.execute("FROM calls_in_common").fetchall()
     notes = [f"{first} and {second} share {calls} calls" for first, second, calls in shared]
-    return Audit(str(path), counts, _findings(connection, ["orphans"]), notes)
+    return Audit(str(path), counts, findings_of(connection, ["orphans"]), notes)
 
 
-def _findings(
+def findings_of(
     connection: duckdb.DuckDBPyConnection, views: Iterable[str], sweep_id: str | None = None
 ) -> list[Finding]:
     """Return the rows of the views, one query each: a joint query would need their joint memory."""
@@ -213,8 +228,16 @@ def _findings(
     ]
 
 
-def _notes(connection: duckdb.DuckDBPyConnection) -> Iterator[str]:
+def notes_of(connection: duckdb.DuckDBPyConnection, counts: Mapping[str, int]) -> Iterator[str]:
+    """Yield the notes of an audit with these ``counts``."""
     yield from (text for (text,) in connection.execute("FROM notes").fetchall())
+    if not counts[OF_MOCKS]:  # the emulator has only a few phrases
+        [(answers,)] = connection.execute("FROM alike").fetchall()
+        if answers:
+            yield (
+                f"all {answers} replies to prompts that were asked before are word for word as "
+                "before: are they samples?"
+            )
     for group, model, invalid, asked in connection.execute(DECIDED).fetchall():
         if reason := not_judged(model, invalid, asked):
             yield f"{group}: {reason}"
@@ -228,53 +251,3 @@ def not_judged(model: str, invalid: int, asked: int) -> str:
         f"not judged: {invalid} of the {asked} decisions of {model} are invalid "
         f"({100 * invalid / asked:.1f} %, more than {100 * MOST_INVALID_SHARE:.0f} %)"
     )
-
-
-def audit_recording(file: Path) -> Audit:
-    """Audit a recording; damage is a finding. Raises UsageError without a file.
-
-    Its calls are written into a database in memory, with the checks of a database.
-    """
-    with in_memory(SETTINGS) as connection:
-        connection.execute(schema_sql())
-        try:
-            _fill(connection, read_recording(file))
-            sweeps = described_sweeps(read_provenance(file))
-        except RecordingError as exc:
-            return Audit(str(file), findings=[Finding("recording", str(exc))])
-        configs = (canonical_json({"models": sweep.models}) for sweep in sweeps)
-        rows = ((n, "", NEVER, None, None, c, None, None, "{}") for n, c in enumerate(configs))
-        append(connection, "sweeps", rows)  # for the aliases of models
-        prepare(connection)
-        connection.execute("INSERT INTO audited SELECT trial_id, spec_hash FROM trials")
-        columns = 'calls, attempts, "reply ids"'
-        counts = next(by_name(connection.execute(f"SELECT {columns} FROM counts")))  # noqa: S608 # constants
-        findings = _findings(connection, CALL_FINDINGS)
-        return Audit(str(file), counts, findings, notes=[*_notes(connection)])
-
-
-def _fill(connection: duckdb.DuckDBPyConnection, entries: Iterator[CachedCall]) -> None:
-    """Fill the tables with the calls of a recording.
-
-    Each endpoint becomes a spec, and each repetition of a condition a trial: a recording does not
-    have the prompt variant of a call.
-    """
-    specs: dict[str, str] = {}
-    trials: dict[TrialKey, Row] = {}
-    while chunk := list(islice(entries, ENTRIES_AT_ONCE)):
-        rows: list[Row] = []
-        for entry in chunk:
-            slot, endpoint = entry.request.slot, entry.request.endpoint
-            specs[endpoint] = canonical_json({side: {"endpoint": endpoint} for side in SIDES})
-            suffix = f"/set{slot.sample_set}" if slot.sample_set else ""
-            key = (f"{slot.condition}/rep{slot.repetition:02d}{suffix}", endpoint)
-            trials[key] = (
-                *(*key, None, "llm", None, None, None, slot.condition, 0.0, 0.0),
-                *(slot.repetition, slot.sample_set, "finished", None, 0.0, None, False, None),
-            )
-            rows += [
-                call_row(key, entry.request, attempt, cached=True) for attempt in entry.attempts
-            ]
-        append(connection, "calls", rows)
-    append(connection, "specs", specs.items())
-    append(connection, "trials", trials.values())

@@ -1,25 +1,17 @@
 -- Checks that a replay cannot make. The views read the tables of a database and these: the audited
--- sweep, its planned trials (if subject.known), its stored trials, the trials that were audited before,
--- and pairs of models that do not match.
+-- sweep, its planned trials (if subject.known), its list of trials, the planned ones that it does not
+-- list (elsewhere: another sweep played it after this one stopped), its stored trials, the trials that
+-- were audited before, and pairs of models that do not match.
 CREATE OR REPLACE TEMP TABLE subject (sweep_id VARCHAR, finished BOOLEAN, known BOOLEAN);
 CREATE OR REPLACE TEMP TABLE planned (trial_id VARCHAR, spec_hash VARCHAR);
+CREATE OR REPLACE TEMP TABLE linked (trial_id VARCHAR, spec_hash VARCHAR, links BIGINT);
+CREATE OR REPLACE TEMP TABLE unplayed (trial_id VARCHAR, elsewhere BOOLEAN);
 CREATE OR REPLACE TEMP TABLE audited AS SELECT trial_id, spec_hash FROM trials LIMIT 0;
 CREATE OR REPLACE TEMP TABLE done AS FROM audited;
+CREATE OR REPLACE TEMP TABLE drivers AS SELECT trial_id, spec_hash, driver FROM trial_drivers;
 CREATE OR REPLACE TEMP TABLE other_models (model_requested VARCHAR, model_served VARCHAR);
 
 -- The sweep's list of trials.
-
-CREATE OR REPLACE TEMP VIEW linked AS
-SELECT trial_id, spec_hash, count(*) AS links FROM sweep_trials SEMI JOIN subject USING (sweep_id)
-GROUP BY ALL;
-
--- Trials that another sweep played after this one stopped are not missing.
-CREATE OR REPLACE TEMP VIEW unplayed AS
-SELECT trial_id, trials.status IS NOT NULL AS elsewhere
-FROM planned ANTI JOIN linked USING (trial_id)
-LEFT JOIN (
-    FROM trials SEMI JOIN sweep_trials USING (trial_id, spec_hash) WHERE status <> 'failed'
-) AS trials USING (trial_id, spec_hash);
 
 CREATE OR REPLACE TEMP VIEW list_findings AS
 SELECT 'missing' AS kind, trial_id, 'it was not played' AS text
@@ -37,24 +29,6 @@ UNION ALL SELECT 'config', NULL, 'its id is not made of its name, its drivers an
 FROM sweeps SEMI JOIN subject USING (sweep_id)
 WHERE json_valid(config) AND sweep_id <> concat_ws(
     '-', name, config->>'$.model', strftime(started_at, '%Y%m%dT%H%M%S%f'));
-
--- Orphan rows of the whole database; a spec's hash is the hash of its text.
-CREATE OR REPLACE TEMP VIEW orphans AS
-SELECT 'orphan' AS kind, trial_id, 'no sweep has this trial' AS text FROM trials
-ANTI JOIN sweep_trials USING (trial_id, spec_hash) WHERE source <> 'human'
-UNION ALL SELECT 'orphan', trial_id, 'its spec is not stored' FROM trials
-ANTI JOIN specs USING (spec_hash)
-UNION ALL SELECT 'orphan', trial_id, 'it is listed by a sweep that is not stored' FROM sweep_trials
-ANTI JOIN sweeps USING (sweep_id)
-UNION ALL SELECT 'orphan', trial_id, format('{} rows of {} belong to no trial', count(*), name)
-FROM (
-    SELECT 'states' AS name, trial_id, spec_hash FROM states
-    UNION ALL SELECT 'decisions', trial_id, spec_hash FROM decisions
-    UNION ALL SELECT 'calls', trial_id, spec_hash FROM calls
-    UNION ALL SELECT 'trial_factors', trial_id, spec_hash FROM trial_factors
-) ANTI JOIN trials USING (trial_id, spec_hash) GROUP BY name, trial_id
-UNION ALL SELECT 'spec', NULL, format('the spec stored as {} has another hash', spec_hash)
-FROM specs WHERE left(sha256(spec::VARCHAR), 16) <> spec_hash;
 
 -- Calls and their replies.
 
@@ -125,7 +99,7 @@ CREATE OR REPLACE TEMP TABLE contents (call_rowid BIGINT, content VARCHAR);
 -- Some servers draw ids out of a thousand, or have only one. An id with different answers proves
 -- nothing; neither does an id of a server most of whose repeated ids are such, nor an id of a local
 -- server, which need not be unique.
-CREATE OR REPLACE TEMP VIEW repeated_ids AS
+CREATE OR REPLACE TEMP VIEW repeating AS
 SELECT endpoint, model_requested, reply_id, same AND provider <> 'local'
     AND count(*) FILTER (same) OVER server >= count(*) FILTER (NOT same) OVER server AS telling
 FROM (
@@ -133,6 +107,7 @@ FROM (
         min(content) = max(content) AS same
     FROM reply_ids JOIN contents USING (call_rowid) GROUP BY ALL
 ) WINDOW server AS (PARTITION BY endpoint, model_requested);
+CREATE OR REPLACE TEMP TABLE repeated_ids AS FROM repeating LIMIT 0;
 
 -- Two slots of one spec with one call, and two calls of any spec with one reply: a caching proxy
 -- answers a repetition, or a new sample set, with an old reply. Drivers of a study may make the same
@@ -143,7 +118,7 @@ SELECT 'shares its call with' AS text,
     list(DISTINCT (trial_id, spec_hash)) AS trials
 FROM decisions SEMI JOIN (
     SELECT call_key FROM decisions GROUP BY call_key HAVING count(*) > 1
-) USING (call_key) JOIN trial_drivers USING (trial_id, spec_hash)
+) USING (call_key) JOIN drivers USING (trial_id, spec_hash)
 GROUP BY spec_hash, driver, call_key HAVING count(*) > 1
 UNION ALL SELECT 'shares its reply, and the provider''s id of it, with',
     list(place ORDER BY place), list(DISTINCT trial)
@@ -183,22 +158,6 @@ FROM (
     ) GROUP BY model_left, model_right, side, prompt_hash
 );
 
--- Identical requests of the same slot.
-CREATE OR REPLACE TEMP VIEW calls_in_common AS
-WITH used AS (
-    SELECT DISTINCT call_key, spec_hash, driver || '/' || variant AS name
-    FROM decisions JOIN trials USING (trial_id, spec_hash)
-    JOIN trial_drivers USING (trial_id, spec_hash) WHERE call_key IS NOT NULL
-)
-SELECT if(a.name = b.name, format('{} ({})', a.name, a.spec_hash), a.name),
-    if(a.name = b.name, format('{} ({})', b.name, b.spec_hash), b.name),
-    count(DISTINCT call_key) AS calls
-FROM used AS a JOIN used AS b USING (call_key)
-WHERE (a.name, a.spec_hash) < (b.name, b.spec_hash)
-    AND (a.spec_hash IN (SELECT spec_hash FROM audited)
-        OR b.spec_hash IN (SELECT spec_hash FROM audited))
-GROUP BY a.name, a.spec_hash, b.name, b.spec_hash ORDER BY ALL;
-
 CREATE OR REPLACE TEMP VIEW counts AS
 FROM (SELECT count(*) AS stored FROM linked SEMI JOIN trials USING (trial_id, spec_hash)),
     (SELECT count(*) FILTER (NOT elsewhere) AS missing FROM unplayed),
@@ -224,10 +183,7 @@ FROM linked JOIN sweep_trials USING (trial_id, spec_hash) JOIN sweeps AS earlier
 WHERE earlier.started_at < own.started_at;
 
 CREATE OR REPLACE TEMP VIEW notes AS
-SELECT format('unfinished: {} of {} trials are missing, {} failed; the same command again plays them',
-    missing, (SELECT count(*) FROM planned), failed) AS text
-FROM counts, subject WHERE NOT finished AND missing + failed > 0
-UNION ALL SELECT format('goes on from {} of {}: {} of its trials were stored before',
+SELECT format('goes on from {} of {}: {} of its trials were stored before',
     if(count(DISTINCT earlier) = 1, 'the run', format('{} runs, the first', count(DISTINCT earlier))),
     strftime(min(began_at), '%Y-%m-%d %H:%M'), count(DISTINCT (trial_id, spec_hash)))
 FROM played_before WHERE resumed GROUP BY sweep_id
@@ -249,8 +205,4 @@ UNION ALL SELECT format('{} replies of {} at {} have an id that the server gave 
     coalesce(nullif(endpoint, ''), 'its endpoint'))
 FROM reply_ids JOIN repeated_ids USING (endpoint, model_requested, reply_id)
 SEMI JOIN audited USING (trial_id, spec_hash)
-WHERE NOT telling GROUP BY model_requested, endpoint
--- Without replies of the emulator, which has only a few phrases.
-UNION ALL SELECT format('all {} replies to prompts that were asked before are word for word as before: '
-    'are they samples?', answers)
-FROM alike, counts WHERE answers > 0 AND "attempts answered by a mock model" = 0;
+WHERE NOT telling GROUP BY model_requested, endpoint;

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 import sys
-import tempfile
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -33,6 +32,8 @@ def sql(
 
     Example: merge-runner sql "select status, count(*) from trials group by all"
     """
+    import tempfile
+
     from merge_runner.results import database, export, store
 
     writers = {"text": export.write_table, "csv": export.write_csv, "json": export.write_json}
@@ -79,7 +80,7 @@ def audit(
 
     Example: merge-runner audit --recording baseline.parquet
     """
-    from merge_runner.audit.checks import audit_recording
+    from merge_runner.audit.recording import audit_recording
     from merge_runner.run.stored_replay import NOT_REPLAYED, audit_database
 
     cli.use_study(study, trust=trust)

@@ -189,9 +189,10 @@ def _play_all(
 def _plans(name: str, *, selection: dict[str, Any], options: Options, trust: bool) -> list[Plan]:
     """Return the plan of a study, or those in a recording, which is played whole."""
     from merge_runner.run.plan import make_plan
-    from merge_runner.run.recorded_plans import recorded_plans
 
     if name.endswith(".parquet"):
+        from merge_runner.run.recorded_plans import recorded_plans
+
         _check_whole(name, chosen=any(selection.values()), replay=options.replay)
         return [*recorded_plans(Path(name), db=options.db, trust=trust)]
     plan = make_plan(name, **selection, db=options.db, trust=trust)

@@ -113,8 +113,8 @@ def merge_small_groups(connection: duckdb.DuckDBPyConnection, added: int) -> Non
     merges = False
     if added < MANY_CALLS:
         [(calls, path)] = connection.execute(
-            "SELECT estimated_size, path FROM duckdb_tables() JOIN duckdb_databases() USING "
-            "(database_name) WHERE table_name = 'calls' AND database_name = current_database()"
+            "SELECT (SELECT count(*) FROM calls), path FROM duckdb_databases() "
+            "WHERE database_name = current_database()"
         ).fetchall()
         merges = Path(path).stat().st_size <= calls * BYTES_OF_A_CALL + MERGED_BYTES
     connection.execute(f"SET max_vacuum_tasks = {100 * merges}")

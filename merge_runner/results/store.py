@@ -43,6 +43,11 @@ from merge_runner.results.rows import (
 from merge_runner.scenarios.merge.measures import measures_sql
 from merge_runner.trial_records import TrialRecord, TrialSpec
 
+# Whether a file may have tables. To list those of a new file is slow: DuckDB loads its own views.
+IS_WRITTEN = """
+SELECT total_blocks > 0 OR wal_size <> '0 bytes' FROM pragma_database_size()
+WHERE database_name = current_database()
+"""
 # Columns that depend on the run: whether it made an attempt itself, and when.
 RUN_COLUMNS = frozenset({"cached", "started_at", "latency_s"})
 # The first and the third column order the rows of a trial. A digest has the value that the source
@@ -69,7 +74,8 @@ class Store:
         except OSError as exc:
             raise UsageError(f"{path.parent} cannot be made: {exc}") from exc
         with unreadable_is_usage(), write_database(self.path) as connection:
-            if connection.execute("SHOW TABLES").fetchall():
+            written = connection.execute(IS_WRITTEN).fetchone()
+            if written == (True,) and connection.execute("SHOW TABLES").fetchall():
                 check_schema(connection, path)
                 if not has_these_measures(connection):
                     connection.execute(measures_sql())
@@ -262,6 +268,8 @@ def results_digest(path: Path, sweep_ids: Sequence[str] | None = None) -> tuple[
 
 
 def _add_factors(connection: duckdb.DuckDBPyConnection, rows: Sequence[Row]) -> None:
+    if not rows:
+        return
     keys = [row[:2] for row in rows]
     columns = "trial_id, spec_hash, factor"
     stored = set(rows_of_trials(connection, columns, "trial_factors", keys).fetchall())

@@ -1,4 +1,4 @@
-"""Queries about stored sweeps, and their deletion."""
+"""Stored sweeps and their calls, and their deletion."""
 
 from __future__ import annotations
 
@@ -9,12 +9,9 @@ from typing import Any
 
 from merge_runner.errors import UsageError, unknown_name
 from merge_runner.registry import require
-from merge_runner.results.database import append, by_name, read_database, write_database
-from merge_runner.results.instance import limit_memory
+from merge_runner.results.database import by_name, read_database, write_database
 from merge_runner.results.rows import KEY_COLUMNS
-from merge_runner.served_model import other_models
 
-FACTS = Path(__file__).with_name("facts.sql")
 ALL_SWEEPS = "FROM sweeps ORDER BY started_at"
 # Trials that only the sweeps to delete have.
 TO_DELETE = """
@@ -58,21 +55,6 @@ def sweeps_to_export(
         if not newest_first:
             raise UsageError(f"{path} holds no sweep: there is nothing to record")
         return newest_first[0]
-
-
-def sweep_facts(path: Path, sweep_id: str) -> dict[str, Any]:
-    """Count a sweep's trials, decisions and replies, by the views of facts.sql."""
-    with read_database(path) as connection:
-        limit_memory(connection)
-        connection.execute("SET VARIABLE sweep_id = ?", [sweep_id])
-        connection.execute(FACTS.read_text(encoding="utf-8"))
-        append(connection, "other_models", other_models(connection))
-        facts = next(by_name(connection.execute("FROM decided")))
-        for name in ("outcomes", "failed", "others", "stand_ins", "same_prompts"):
-            facts[name] = connection.execute(f"FROM {name}").fetchall()
-        for name in ("levels", "first_looks"):
-            facts[name] = list(by_name(connection.execute(f"FROM {name}")))
-        return facts
 
 
 def to_forget(db: Path, patterns: Sequence[str]) -> tuple[list[str], str]:

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import asyncio
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-from merge_runner.audit.checks import Audit, audit_sweep
+from merge_runner.audit.checks import Audit, audited_database, check_sweep, sweep_facts
 from merge_runner.errors import MergeRunnerError, NoValidDecision, StoreError
 from merge_runner.paths import DEFAULT_DB, command_at
 from merge_runner.records import canonical_json
 from merge_runner.results.database import in_thread
 from merge_runner.results.provenance import git_state, versions
 from merge_runner.results.store import Store
-from merge_runner.results.sweeps import sweep_facts
 from merge_runner.run.guard import FirstDecisions
 from merge_runner.run.session import Session
 
@@ -82,8 +80,13 @@ async def check(
 
 async def _read_back(session: Session, db: Path, sweep_id: str) -> tuple[dict[str, Any], Audit]:
     keys = [spec.key for spec in (*session.stored, *session.todo)]
-    audited = partial(audit_sweep, db, sweep_id, keys, finished=session.exit_code == 0)
+    finished = session.exit_code == 0
+
+    def read() -> tuple[dict[str, Any], Audit]:
+        with audited_database(db, sweep_id) as connection:
+            facts = sweep_facts(connection, sweep_id)
+            return facts, check_sweep(connection, sweep_id, keys, finished=finished)
+
     if not session.options.replay:
         session.ledger.read()
-    facts = await in_thread(partial(sweep_facts, db, sweep_id))
-    return facts, await in_thread(audited)
+    return await in_thread(read)

@@ -13,7 +13,6 @@ from merge_runner.llm.ledger import Cap, Ledger, scopes
 from merge_runner.providers import resolve_endpoint
 from merge_runner.records import ReplayMiss
 from merge_runner.results.database import unreadable_is_usage
-from merge_runner.results.recording import spilled
 from merge_runner.results.replay_misses import Miss, explain
 from merge_runner.results.store import Store
 from merge_runner.run.options import Options
@@ -82,7 +81,11 @@ async def open_session(
         from merge_runner.run.clients import check_batches
 
         check_batches(plan, options)
-    recorded = partial(spilled, options.recordings) if options.recordings else None
+    recorded = None
+    if options.recordings:
+        from merge_runner.results.recording import spilled
+
+        recorded = partial(spilled, options.recordings)
     with closing(ResponseCache(options.cache, overlay=recorded)) as cache:
         plan = await with_names(plan, options, cache, say)
         specs = {spec.key: spec for spec in plan.trial_specs()}

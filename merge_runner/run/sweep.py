@@ -17,7 +17,6 @@ from merge_runner.paths import SHIPPED_RECORDINGS
 from merge_runner.providers import UNNAMED
 from merge_runner.registry import using
 from merge_runner.results.database import unreadable_is_usage
-from merge_runner.results.recorded_sweeps import recorded_part
 from merge_runner.results.replay_misses import described
 from merge_runner.results.store import Store
 from merge_runner.run.estimate import Estimate, earlier_answers, estimate, usual_latencies_s
@@ -62,7 +61,8 @@ async def play(
             if not has_replies:  # a user's replies are never mixed with other people's
                 options = replace(options, recordings=(shipped,))
                 say(f"The replies are from the recording that ships with merge-runner: {shipped}")
-        part = plan if whole else _recorded_part(plan, options.recordings)
+        is_part = options.recordings and not whole
+        part = _recorded_part(plan, options.recordings) if is_part else plan
         if part.trials < plan.trials:
             say(f"note: the recording holds {part.trials} of the plan's {plan.trials} trials")
         plan = part
@@ -201,6 +201,8 @@ def _recorded_part(plan: Plan, recordings: Sequence[Path]) -> Plan:
 
     A sweep's recording also holds its first decisions.
     """
+    from merge_runner.results.recorded_sweeps import recorded_part
+
     names = {plan.study.name, plan.name}
     recorded = recorded_part(recordings, names, plan.model, plan.sample_set)
     if recorded is None:

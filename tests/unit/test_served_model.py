@@ -5,8 +5,7 @@ import json
 import duckdb
 import pytest
 
-from merge_runner.audit.checks import audit_sweep
-from merge_runner.results.sweeps import sweep_facts
+from merge_runner.audit.checks import audited_database, check_sweep, sweep_facts
 from merge_runner.served_model import others_among
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.provenance import provenance, tally
@@ -42,11 +41,12 @@ def db(tmp_path):
 
 
 def test_all_that_tell_of_other_models_tell_the_same(db):
-    assert sorted(served for _, served, _ in sweep_facts(db, "sweep-1")["others"]) == OTHERS
+    with audited_database(db, "sweep-1") as connection:
+        facts = sweep_facts(connection, "sweep-1")
+        findings = check_sweep(connection, "sweep-1", [], finished=True).findings
+    assert sorted(served for _, served, _ in facts["others"]) == OTHERS
     assert sorted(provenance(db).mismatches.served) == OTHERS
-    found = [
-        f.text for f in audit_sweep(db, "sweep-1", [], finished=True).findings if f.kind == "served"
-    ]
+    found = [finding.text for finding in findings if finding.kind == "served"]
     assert sorted(text.split(": ")[0] for text in found) == [f"o3 -> {name}" for name in OTHERS]
     catalogue = Catalogue(db)
     *_, run = list_runs(catalogue)

@@ -16,7 +16,7 @@ import pytest
 from aiohttp import web
 
 from merge_runner.audit import checks
-from merge_runner.audit.checks import audit_sweep
+from merge_runner.audit.checks import audited_database, check_sweep
 from merge_runner.errors import UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.store import CachedCall
@@ -112,7 +112,8 @@ def test_the_audit_at_the_end_of_a_run_reads_that_run_s_replies(made):
     )
     assert len(rows) == 3
     for sweep, replies in rows:
-        found = audit_sweep(db, sweep, [], finished=True)
+        with audited_database(db, sweep) as connection:
+            found = check_sweep(connection, sweep, [], finished=True)
         assert (found.findings, found.counts["reply ids"]) == ([], replies)
 
 
@@ -220,7 +221,8 @@ def test_what_an_unfinished_sweep_lacks_is_a_note(db):
     found = audit("--db", db)
     assert found.code == 0
     assert "unfinished: 1 of 8 trials are missing, 0 failed" in found.notes
-    (finding,) = audit_sweep(db, sweep, planned, finished=True).findings
+    with audited_database(db, sweep) as connection:
+        (finding,) = check_sweep(connection, sweep, planned, finished=True).findings
     assert (finding.kind, finding.trial) == ("missing", PAIR)
 
 

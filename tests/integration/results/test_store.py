@@ -2,6 +2,7 @@
 
 import asyncio
 import math
+import shutil
 import subprocess
 import sys
 from contextlib import contextmanager
@@ -13,13 +14,14 @@ from pathlib import Path
 import duckdb
 import pytest
 
+from merge_runner.audit.checks import audited_database, sweep_facts
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import StoreLocked, UsageError
 from merge_runner.results.database import append, in_thread, open_database
 from merge_runner.results.instance import Instance
 from merge_runner.results.store import Store, query, results_digest
-from merge_runner.results.sweeps import sweep_facts, sweeps_to_export
+from merge_runner.results.sweeps import sweeps_to_export
 from merge_runner.run.writer import Flusher
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.trial import Trial, play_trial
@@ -75,7 +77,9 @@ def test_a_trial_is_stored_whole_once_and_instead_of_one_that_had_failed(store, 
     error = TrialRecord(record.spec, "failed", None, 1.0, "it broke", record.states[:4], ())
     store.write("s1", [error], patience_s=1)
     assert store.ended_trials(keyed(record)) == set()
-    assert sweep_facts(path, "s1")["failed"] == [("m/baseline/L_4_0/rep01", "it broke")]
+    with audited_database(path, "s1") as connection:
+        failed = sweep_facts(connection, "s1")["failed"]
+    assert failed == [("m/baseline/L_4_0/rep01", "it broke")]
     for again in (record, record, error):
         assert store.write("s1", [again], patience_s=1) == {}
     assert query(path, "select status, error from trials")[1] == [("finished", None)]
@@ -204,6 +208,16 @@ def test_another_program_s_database_is_refused(tmp_path):
         connection.execute("CREATE TABLE mine (a INTEGER)")
     with pytest.raises(UsageError, match="not a database of merge-runner"):
         Store(tmp_path / "foreign.duckdb")
+
+
+def test_another_program_s_database_is_refused_if_all_of_it_is_in_its_log(tmp_path):
+    used, copied = tmp_path / "used.duckdb", tmp_path / "copied.duckdb"
+    with duckdb.connect(str(used)) as connection:
+        connection.execute("CREATE TABLE theirs (a INTEGER)")
+        for suffix in ("", ".wal"):  # as after a power cut
+            shutil.copy(f"{used}{suffix}", f"{copied}{suffix}")
+    with pytest.raises(UsageError, match="not a database of merge-runner"):
+        Store(copied)
 
 
 @pytest.fixture

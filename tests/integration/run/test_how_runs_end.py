@@ -84,9 +84,9 @@ async def test_a_writer_that_breaks_ends_the_run_before_more_is_asked(options, m
 @pytest.mark.parametrize(
     ("what", "fault"),
     [
-        ("sweep_facts", StoreLocked("a viewer holds it")),
-        ("audit_sweep", StoreError("no view")),
-        ("audit_sweep", KeyError("a fault of ours")),
+        ("audited_database", StoreLocked("a viewer holds it")),
+        ("audited_database", StoreError("no view")),
+        ("check_sweep", KeyError("a fault of ours")),
     ],
 )
 async def test_a_run_that_could_not_be_audited_has_ended(options, monkeypatch, fault, what):

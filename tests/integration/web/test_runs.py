@@ -11,11 +11,11 @@ from urllib.parse import parse_qs, urlsplit
 import duckdb
 import pytest
 
+from merge_runner.audit.checks import audited_database, sweep_facts
 from merge_runner.errors import UsageError
 from merge_runner.records import ANSWERS
 from merge_runner.results.database import write_database
 from merge_runner.results.store import Store, query
-from merge_runner.results.sweeps import sweep_facts
 from merge_runner.run.progress_file import remove_snapshot, write_snapshot
 from merge_runner.run.stored_replay import audit_database
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -108,7 +108,8 @@ def running(db, ended=None, **changes):
 
 
 def test_the_page_has_the_numbers_of_the_database_and_every_rate_leads_to_its_trials(written):
-    facts = sweep_facts(written, "sweep-1")
+    with audited_database(written) as connection:
+        facts = sweep_facts(connection, "sweep-1")
     with duckdb.connect(str(written), read_only=True) as connection:
         ((answers, attempts, failures),) = connection.execute(
             "SELECT (SELECT count(*) FROM calls WHERE http_status = 200), count(*), "

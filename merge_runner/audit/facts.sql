@@ -1,15 +1,8 @@
--- Facts of a sweep's summary. The views read the trials of the sweep in the variable sweep_id, and the
--- pairs of models (requested, served) that do not match.
-CREATE OR REPLACE TEMP TABLE other_models (model_requested VARCHAR, model_served VARCHAR);
-
+-- Facts of a sweep's summary. The views read the trials of the sweep in the variable sweep_id, and two
+-- tables of checks.sql: drivers and other_models.
 CREATE OR REPLACE TEMP TABLE played AS
 FROM trials SEMI JOIN (FROM sweep_trials WHERE sweep_id = getvariable('sweep_id'))
     USING (trial_id, spec_hash);
-
--- Attempts of these trials, with the name of the called driver.
-CREATE OR REPLACE TEMP VIEW tried AS
-SELECT *, driver_name(model, spec->>('$.' || side || '.endpoint')) AS driver
-FROM attempts LEFT JOIN specs USING (spec_hash) SEMI JOIN played USING (trial_id, spec_hash);
 
 CREATE OR REPLACE TEMP VIEW outcomes AS
 SELECT status, count(*) AS trials FROM played GROUP BY ALL ORDER BY ALL;
@@ -40,9 +33,11 @@ WHERE http_status = 200 GROUP BY ALL ORDER BY ALL;
 
 -- Drivers with replies of a mock model: these replies, and all replies.
 CREATE OR REPLACE TEMP VIEW stand_ins AS
-SELECT driver, model, provider, count(*) FILTER (scripted) AS scripted, count(*) AS answers
-FROM tried WHERE fate IN ('driven', 'fallback')
-GROUP BY driver, model, provider HAVING bool_or(tried.scripted) ORDER BY ALL;
+SELECT driver_name(model, spec->>('$.' || side || '.endpoint')) AS driver, model, provider,
+    count(*) FILTER (attempts.scripted) AS scripted, count(*) AS answers
+FROM attempts LEFT JOIN specs USING (spec_hash) SEMI JOIN played USING (trial_id, spec_hash)
+WHERE fate IN ('driven', 'fallback')
+GROUP BY ALL HAVING bool_or(attempts.scripted) ORDER BY ALL;
 
 -- Prompt variants with identical trials of mock models, which read nothing that differs.
 CREATE OR REPLACE TEMP VIEW same_prompts AS
@@ -85,5 +80,5 @@ JOIN (
     SELECT trial_id, spec_hash, side, min_by(acceleration_mps2, step) AS action_mps2
     FROM states SEMI JOIN asked USING (trial_id, spec_hash) WHERE time_s > 0 GROUP BY ALL
 ) USING (trial_id, spec_hash, side)
-JOIN trial_drivers USING (trial_id, spec_hash)
+JOIN drivers USING (trial_id, spec_hash)
 GROUP BY ALL ORDER BY ALL;
