@@ -48,8 +48,16 @@ VERDICTS = {
 }
 TENDENCY = "same tendency as people"  # its sign alone, and no difference in size is shown
 DIRECTIONS = {
-    "headway": {SHOWN: TENDENCY},
-    "velocity": {SHOWN: TENDENCY},
+    "headway": {
+        SHOWN: TENDENCY,
+        WEAKER: "depends less on who is ahead",
+        STRONGER: "depends more on who is ahead",
+    },
+    "velocity": {
+        SHOWN: TENDENCY,
+        WEAKER: "depends less on who is slower",
+        STRONGER: "depends more on who is slower",
+    },
     "gap-headway": {SHOWN: TENDENCY},
     "collisions": {WEAKER: "fewer than people's", STRONGER: "more than people's"},
     "gap": {WEAKER: "smaller than people's", STRONGER: "larger than people's"},
@@ -59,9 +67,10 @@ VERDICT_RULES = (
     "Like people (crashes, gap): the whole interval of the difference lies within 5 points, or 1 m",
     "Same tendency as people (who goes first): the one ahead or, side by side, the slower one goes "
     "first more often, with p below .05 in a logistic regression (Firth) over all trials without a "
-    "crash, not by the counts shown",
-    "Fewer, more, smaller, larger, unlike: a difference is shown, with p below .05, corrected "
-    "(Holm) for a driver's {tests}tests",
+    "crash, not by the counts; and no difference is shown",
+    "Fewer, more, smaller, larger, unlike, depends less or more: a difference is shown, with p "
+    "below .05, corrected (Holm) for a driver's {tests}tests; in who goes first, of that "
+    "regression's slopes",
     f"Cannot tell: neither is shown. No verdict: fewer than {ENOUGH} trials are counted, or fewer "
     "than half of those that ended",
 )
@@ -572,6 +581,12 @@ def shown_state(values: Values) -> str:
     return state
 
 
+def has_verdict(values: Values) -> bool:
+    """Return whether a measure has a state that rests on enough trials."""
+    n, ended = values.get("n") or 0, values.get("ended") or 0
+    return bool(values.get("state")) and (_suffice(n, ended) or bool(values.get("undecided")))
+
+
 def _is_within(values: Values) -> bool:
     """Return whether the interval of crashes or of a gap is within MARGINS of people's."""
     margin, ci = MARGINS.get(str(values.get("measure"))), values.get("difference_ci")
@@ -809,8 +824,7 @@ def equal_p(p: float) -> str:
 def verdict_word(values: Values) -> str:
     """Return a state in words, as it stands in a list of verdicts."""
     n = values.get("n") or 0
-    is_few = values.get("state") and not _suffice(n, values.get("ended") or 0)
-    if is_few and not values.get("undecided"):
+    if values.get("state") and not has_verdict(values):
         return f"fewer than {ENOUGH} trials" if n < ENOUGH else "too few without a crash"
     words = VERDICTS | DIRECTIONS.get(str(values.get("measure")), {})
     return words.get(shown_state(values), "not compared")

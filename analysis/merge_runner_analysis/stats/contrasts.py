@@ -156,7 +156,10 @@ def _detectable(cells: Cells, sign: int) -> float | None:
 
 
 def difference_of_contrasts(cells: Cells, others: Cells) -> Estimate:
-    """Return an interaction, with its interval and p by MOVER (Zou and Donner 2008)."""
+    """Return an interaction, with its interval and p by MOVER (Zou and Donner 2008).
+
+    Its error is 0 where nothing varies within any cell.
+    """
     differences = cells.difference, others.difference
     value = differences[0] - differences[1]
 
@@ -172,8 +175,8 @@ def difference_of_contrasts(cells: Cells, others: Cells) -> Estimate:
         z = float(optimize.brentq(left_out, 0.0, z))
     below, above = half(-1, Z), half(1, Z)
     least = Z_WITH_POWER / Z * min(below, above)
-    ends = value - below, value + above
-    return Estimate(value, *ends, se=least / Z_WITH_POWER, p=two_sided_p(z), detectable=least)
+    se = least / Z_WITH_POWER if cells.variance(0) or others.variance(0) else 0.0
+    return Estimate(value, value - below, value + above, se=se, p=two_sided_p(z), detectable=least)
 
 
 def detectable_rate(n: int, m: int, rate: float) -> float | None:

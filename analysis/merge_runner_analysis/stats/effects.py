@@ -67,6 +67,11 @@ class Effect:
         return f"{self.level.factor}{TIMES}{by}" if self.across else self.level.factor
 
     @property
+    def varies(self) -> bool:
+        """Return whether trials of a cell differ, or levels do: else no p could be below 1."""
+        return bool(self.difference.se or self.difference.value)
+
+    @property
     def key(self) -> tuple[frozenset[str], str, str]:
         """Identity of the comparison, whichever of two factors it is shown by."""
         level = self.level
@@ -316,7 +321,7 @@ def _interaction(frames: Sequence[Columns], metric: Metric) -> Estimate | None:
 
 
 def _with_corrected(study: StudyResults, effects: list[Effect]) -> list[Effect]:
-    """Correct p in both families; effects without variance and difference are in neither."""
+    """Correct p in both families; effects in which nothing varies are in neither."""
     of_model = {MODEL, DRIVER} if asks_of_models(study) else set()
     is_primary = [
         effect.metric is primary(study)
@@ -329,9 +334,7 @@ def _with_corrected(study: StudyResults, effects: list[Effect]) -> list[Effect]:
         family = {
             place: effect.difference.p
             for place, effect in enumerate(effects)
-            if is_primary[place] is of_primary
-            and effect.difference.p is not None
-            and (effect.difference.se or effect.difference.value)
+            if is_primary[place] is of_primary and effect.difference.p is not None and effect.varies
         }
         p |= dict(zip(family, contrasts.corrected([*family.values()]), strict=True))
     return [

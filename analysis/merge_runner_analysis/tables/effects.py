@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 from math import exp, isinf
@@ -97,8 +97,26 @@ def comparison(study: StudyResults, driver: str, reference: str) -> Table:
             *DIFFERENCE,
         ),
         [_compared_row(study, effect) for effect in differences if _is_shown(effect)],
-        (),
+        (_correction(study, differences),),
     )
+
+
+def _correction(study: StudyResults, effects: Sequence[Effect]) -> str:
+    """Describe the correction of these effects' p."""
+    tested = [effect for effect in effects if effect.difference.p is not None]
+    of_primary, others = _families(tested)
+    alone = f"; {_primary_name(study)}, the primary measure, is tested by itself"
+    return f"Corrected for {others} tests (Holm){_uncounted(tested)}{alone * bool(of_primary)}."
+
+
+def _uncounted(tested: Sequence[Effect]) -> str:
+    is_complete = all(effect.varies for effect in tested)
+    return "" if is_complete else ", without those in which nothing varies within a situation"
+
+
+def _primary_name(study: StudyResults) -> str:
+    measure = primary(study)
+    return METRIC_NAMES.get(measure.name, measure.heading)
 
 
 def _compared_row(study: StudyResults, effect: Effect) -> Row:
@@ -204,7 +222,7 @@ def _left_out(level: Level, metric: Metric) -> str:
 
 
 def _notes(study: StudyResults, by: str) -> Iterator[str]:
-    tested = any(effect.difference.p is not None for effect in effects(study, by))
+    tested = [of for of in effects(study, by) if of.difference.p is not None]
     every = levels_by_factor(study)
     if failure := unreadable(study):
         yield failure
@@ -221,10 +239,12 @@ def _notes(study: StudyResults, by: str) -> Iterator[str]:
         "factor, in the cells that all four have"
     )
     if tested:
-        measure, (of_primary, others) = primary(study), _families(study, by)
-        name = METRIC_NAMES.get(measure.name, measure.heading)
-        first = f"the {len(of_primary)} test{'s' * (len(of_primary) != 1)} of “{name}”"
-        rest = f"the {others} other tests of the table effects"
+        corrected = [effect for effect in tested if not (by and effect.across)]
+        of_primary, others = _families(corrected)
+        first = (
+            f"the {len(of_primary)} test{'s' * (len(of_primary) != 1)} of “{_primary_name(study)}”"
+        )
+        rest = f"the {others} other tests of the table effects{_uncounted(corrected)}"
         names = f" by {joined([*dict.fromkeys(of_primary)])}" if of_primary else ""
         yield f"{CORRECTED} {first}{names}, and apart from them for {rest}"
         yield "detectable: found at p < .05, before correction, with power .8"
@@ -242,17 +262,11 @@ def _notes(study: StudyResults, by: str) -> Iterator[str]:
     yield RULES_NOTE
 
 
-def _families(study: StudyResults, by: str) -> tuple[list[str], int]:
+def _families(tested: Sequence[Effect]) -> tuple[list[str], int]:
     """Return the factors of the tests of the primary measure, and the number of the others."""
-    tested = [
-        effect
-        for effect in effects(study, by)
-        if effect.difference.p is not None
-        and (effect.difference.se or effect.difference.value)
-        and not (by and effect.across)
-    ]
-    of_primary = [effect.factor for effect in tested if effect.primary]
-    return of_primary, len(tested) - len(of_primary)
+    counted = [effect for effect in tested if effect.varies]
+    of_primary = [effect.factor for effect in counted if effect.primary]
+    return of_primary, len(counted) - len(of_primary)
 
 
 def _planted(study: StudyResults) -> list[str]:

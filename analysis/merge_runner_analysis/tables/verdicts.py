@@ -37,6 +37,7 @@ from merge_runner_analysis.wording import (
     PROGRAM,
     TABLE,
     VERDICT_RULE,
+    has_verdict,
     note_of,
     sentences,
 )
@@ -136,8 +137,10 @@ def _driver_rows(study: StudyResults, group: Group) -> Iterator[Row]:
     for comparison in comparisons:
         row = _compared(group, driver, comparison, PLAYED_RULES[rule])
         # For the words of the state, which need half of the trials; it is no column.
-        ended = crashes.n + (crashes.undecided or 0)
-        yield replace(row, values={**row.values, "ended": ended}, copies=copies)
+        values = {**row.values, "ended": crashes.n + (crashes.undecided or 0)}
+        if not has_verdict(values):  # what could have been seen is of no use then
+            values["detectable"] = None
+        yield replace(row, values=values, copies=copies)
 
 
 @remembered

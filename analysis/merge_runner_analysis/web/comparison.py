@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -117,18 +117,9 @@ def comparison_of(
         unbroken(claim),
         unbroken(rest),
         [_difference(row, trials, _name(row, of_left)) for row in rows],
-        _corrected(rows),
+        table.notes[0],
         unbroken("; ".join(seen)),
     )
-
-
-def _corrected(rows: Sequence[Row]) -> str:
-    """Describe the correction of these rows' p."""
-    tested = [row for row in rows if row.values["p_corrected"] is not None]
-    primary = [name_of(row) for row in tested if row.values["primary"]]
-    many = f"Corrected for {len(tested) - len(primary)} tests (Holm)"
-    alone = f"; {primary[0]}, the primary measure, is tested by itself" if primary else ""
-    return f"{many}{alone}."
 
 
 def _name(row: Row, of_left: bool) -> str:

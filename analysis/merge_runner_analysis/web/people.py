@@ -76,12 +76,9 @@ def could_see(drivers: Sequence[Driver], short: Mapping[str, str]) -> str:
             driver: of["detectable"] for driver, of in values if of.get("detectable") is not None
         }
         if sizes:
-            ends = dict.fromkeys(
-                (min(sizes, key=sizes.__getitem__), max(sizes, key=sizes.__getitem__))
-            )
-            shown = [
-                f"{number(sizes[driver])}{f' ({driver})' * (len(sizes) > 1)}" for driver in ends
-            ]
+            ends = min(sizes, key=sizes.__getitem__), max(sizes, key=sizes.__getitem__)
+            named = {number(sizes[driver]): f" ({driver})" for driver in ends}
+            shown = [size + name * (len(named) > 1) for size, name in named.items()]
             parts.append(f"{' to '.join(shown)} {unit}")
         elif any(of.get("undecided") for _, of in values):
             unknown = "; in crashes unknown, as another crash rule ended some trials"
@@ -91,10 +88,11 @@ def could_see(drivers: Sequence[Driver], short: Mapping[str, str]) -> str:
 def verdict_rules(drivers: Sequence[Driver], gap: Mapping[str, Any]) -> list[str]:
     """Return the rule of a verdict, a line a state; ``gap`` is people's value."""
     tests = {sum(c.values.get("p_holm") is not None for c in of.cells.values()) for of in drivers}
-    numbers = " to ".join(map(str, dict.fromkeys((min(tests, default=0), max(tests, default=0)))))
-    likeness, *others = (rule.format(tests=f"{numbers} ") for rule in VERDICT_RULES)
-    if ends := gap.get("ci"):
-        half = _half(ends)
+    ends = dict.fromkeys((min(tests, default=0), max(tests, default=0)))
+    numbers = f"{' to '.join(map(str, ends))} " if any(ends) else ""
+    likeness, *others = (rule.format(tests=numbers) for rule in VERDICT_RULES)
+    if of_gap := gap.get("ci"):
+        half = _half(of_gap)
         if half > MARGINS["gap"] / 2:
             likeness += (
                 f" (people's gap is known to ± {number(half)} m, by nine pairs: more trials hardly "

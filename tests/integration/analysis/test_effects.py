@@ -16,6 +16,7 @@ from merge_runner_analysis.metrics import COLLISIONS, LEFT_FIRST, METRICS
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.stats.effects import driver_effects, effects, primary
 from merge_runner_analysis.study import StudyResults
+from merge_runner_analysis.tables.effects import comparison
 from tests.support.harness import FAST
 from tests.support.studies import changed, write_study, yielding
 from tests.support.tables import made, values_of
@@ -63,6 +64,24 @@ def test_two_models_differ_by_an_independent_test_with_one_p_on_every_page(two):
         values = effect.at_level.value, effect.at_reference.value
         assert (row["estimate"], row["estimate_reference"]) == values
         assert values[0] - values[1] == pytest.approx(found.value)
+
+
+def test_a_comparison_counts_the_tests_that_holm_counts(tmp_path):
+    drives = [*braking("one", 1.0), *braking("two", 0.8)]
+    study = StudyResults(write_study(tmp_path / "t.duckdb", drives))
+    table = comparison(study, *(group.id for group in study.models))
+    tests = [row.values for row in table.rows if row.values["p"] is not None]
+    surest = min(tests, key=lambda of: of["p"])
+    counted = round(surest["p_corrected"] / surest["p"])
+    (note,) = table.notes
+    same = [
+        of for of in tests if {round(of["value"]), round(of["value_reference"])} in ({0}, {100})
+    ]
+    assert (len(tests), len(same)) == (counted + 2, 2)
+    assert note == (
+        f"Corrected for {counted} tests (Holm), without those in which nothing varies within a "
+        "situation."
+    )
 
 
 def test_the_driver_that_is_named_first_is_the_reference(two):

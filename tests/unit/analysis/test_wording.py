@@ -15,7 +15,9 @@ from merge_runner_analysis.wording import (
     PROGRAM,
     RULES_MEAN,
     SHOWN,
+    STRONGER,
     TOO_FEW,
+    WEAKER,
     apart,
     crash_text,
     crashes,
@@ -363,4 +365,7 @@ def test_a_price_has_two_digits_at_least(value, text):
 def test_a_measure_of_a_sign_alone_has_another_word_than_one_with_a_margin():
     for name in ("headway", "velocity", "gap-headway"):
         assert verdict_word(row(name, SHOWN)) == "same tendency as people"
+    # Nor can a slope that is smaller be read as a smaller count.
+    assert verdict_word(row("velocity", WEAKER)) == "depends less on who is slower"
+    assert verdict_word(row("headway", STRONGER)) == "depends more on who is ahead"
     assert verdict_word(row("gap-velocity", SHOWN)) == "like people"

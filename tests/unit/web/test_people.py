@@ -4,7 +4,7 @@ import pytest
 
 from merge_runner_analysis.web.judged import Driver, noted
 from merge_runner_analysis.web.marks import Cell
-from merge_runner_analysis.web.people import could_see
+from merge_runner_analysis.web.people import could_see, verdict_rules
 from merge_runner_analysis.wording import PROGRAM
 
 
@@ -27,6 +27,7 @@ def least(**by_measure):
             [least(collisions=12.0), least(collisions=7.5), least(collisions=9.0), {}],
             "7.50 (b) to 12.00 (a) points in crashes",
         ),
+        ([least(collisions=6.221), least(collisions=6.219)], "6.22\xa0points in crashes"),
         (
             [least(collisions=12.0, gap=3.0), least(gap=2.0)],
             "12.00\xa0points in crashes, 2.00 (b) to 3.00 (a) m in the gap",
@@ -41,6 +42,20 @@ def least(**by_measure):
 def test_the_least_and_the_largest_detectable_differences_name_their_drivers(drivers, text):
     named = [driver(name, **of) for name, of in zip("abcd", drivers, strict=False)]
     assert could_see(named, {name: name for name in "abcd"}) == text
+
+
+@pytest.mark.parametrize(
+    ("drivers", "text"),
+    [
+        ([], "a driver's tests"),
+        ([{}], "a driver's tests"),
+        ([{"gap": {"p_holm": 0.3}}], "a driver's 1 tests"),
+        ([{"gap": {"p_holm": 0.3}}, {}], "a driver's 0 to 1 tests"),
+    ],
+)
+def test_the_rule_of_a_verdict_has_the_number_of_tests_where_it_is_known(drivers, text):
+    named = [driver(name, **of) for name, of in zip("ab", drivers, strict=False)]
+    assert text in verdict_rules(named, {})[2]
 
 
 def test_drivers_with_the_same_note_on_a_measure_share_it():

@@ -54,6 +54,7 @@ def test_few_collisions_are_tested_exactly_as_by_fisher(tmp_path):
     table = [[collided, n - collided], [humans.collided, sum(humans) - humans.collided]]
     assert found["p"] == pytest.approx(stats.fisher_exact(table).pvalue)
     assert (found["k"], found["n"]) == (collided, n)
+    assert found["detectable"] is None  # so few trials have no verdict
     low, high = found["difference_ci"]
     assert (found["p_holm"] < 0.05) == (not low <= 0 <= high)
 

@@ -199,6 +199,10 @@ def test_an_interaction_of_shares_is_excluded_at_the_level_of_its_p():
     all_of, none = np.array([1_000_000]), np.array([0])
     sure = Cells(all_of, all_of, none, all_of)
     assert difference_of_contrasts(sure, Cells(none, all_of, all_of, all_of)).p < 1e-190
+    same = Cells(all_of, all_of, all_of, all_of)
+    nothing = difference_of_contrasts(same, same)
+    assert (nothing.se, nothing.p) == (0, 1)
+    assert nothing.low < 0 < nothing.high
 
 
 def test_which_outcomes_fishers_test_rejects_is_known_beforehand():
