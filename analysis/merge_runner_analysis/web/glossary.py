@@ -19,7 +19,7 @@ USED = (
     ("interval [ ]", "interval", r"\["),
     ("p, corrected", "corrected p", "corrected"),
     ("prompt, Baseline", "prompt variant", "prompt"),
-    ("ahead, side by side, headway", "projected headway", "ahead|side by side|headway"),
+    ("ahead, side by side", "projected headway", "ahead|side by side"),
     ("crash", "collision", "crash"),
     ("valid reply, plan", "plan", "valid|plan"),
     ("gap at the merge point", "gap", r"\bgap\b"),
@@ -30,6 +30,7 @@ USED = (
 _ROW = re.compile(r"\| (.+?) \| (.+) \|")
 _MARKED = (
     (re.compile(r"\*\*(.+?)\*\*"), r"<strong>\1</strong>"),
+    (re.compile(r"\*(.+?)\*"), r"<em>\1</em>"),
     (re.compile(r"`(.+?)`"), r"<code>\1</code>"),
     (re.compile(r" \(\[[^]]+\]\([^)]+\)\)"), ""),
     (re.compile(r"\[(.+?)\]\(.+?\)"), r"\1"),

@@ -15,6 +15,7 @@ from merge_runner_analysis.wording import TIMES, brackets, number
 
 # The shapes that tell drivers apart in a chart, and more of them are not drawn.
 SHAPES = ("dot", "square", "ring", "triangle")
+REFERENCE = "ring"  # of a reference without an interval
 # Parts of a chart, and a letter of a name, in units of its drawing.
 LEFT, WIDTH, HEAD, ROW, APART, INDENT, LETTER = 90.0, 480.0, 12, 20, 14, 84.0, 7.5
 
@@ -66,8 +67,11 @@ def level_chart(
     ]
     if not drawn:
         return None
+    percent = metric.endswith("_percent")
     ends = [end for row in drawn for end in (interval_of(row) or (value_of(row, "value"),))]
     low, high, step = _axis(min(ends), max(ends))
+    if percent:  # the interval of a difference may end beyond
+        low, high = max(low, 0.0), min(high, 100.0)
 
     levels: dict[tuple[str, str], list[Row]] = {}
     for row in drawn:
@@ -78,6 +82,7 @@ def level_chart(
     left = min(WIDTH / 2, indent + max(LEFT, LETTER * max(map(len, names.values()))))
 
     def x(value: float) -> float:
+        value = min(max(value, low), high)
         return round(left + (WIDTH - left) * (value - low) / (high - low), 1)
 
     lines: list[Line] = []
@@ -93,7 +98,9 @@ def level_chart(
             says = f"{driver}: {counts}{value} {brackets(ci)}".rstrip()
             points.append(
                 Point(
-                    shapes.get(str(row.values["driver"]), SHAPES[0]),
+                    str(
+                        row.values.get("shape") or shapes.get(str(row.values["driver"]), SHAPES[0])
+                    ),
                     x(value_of(row, "value")),
                     None if ci is None else (x(ci[0]), x(ci[1])),
                     y + APART * len(points),
@@ -105,7 +112,6 @@ def level_chart(
         heads.add(factor)
         y += APART * (len(points) - 1)
     ticks = [low + step * place for place in range(round((high - low) / step) + 1)]
-    percent = metric.endswith("_percent")
     even = 50.0 if metric == LEFT_FIRST.name and low < 50 < high else None
     return Chart(
         title,

@@ -5,7 +5,7 @@ import pytest
 from merge_runner_analysis.web.judged import Driver, noted
 from merge_runner_analysis.web.marks import Cell
 from merge_runner_analysis.web.people import could_see
-from merge_runner_analysis.wording import PROGRAM
+from merge_runner_analysis.wording import OPEN, PROGRAM
 
 
 def driver(name, **verdicts):
@@ -14,7 +14,11 @@ def driver(name, **verdicts):
 
 
 def least(**by_measure):
-    return {name: {"detectable": size} for name, size in by_measure.items()}
+    """Verdicts with these detectable differences; without one, too few trials for a verdict."""
+    return {
+        name: {"detectable": size, "state": OPEN, "n": 110 if size else 11, "ended": 110}
+        for name, size in by_measure.items()
+    }
 
 
 @pytest.mark.parametrize(
@@ -36,6 +40,7 @@ def least(**by_measure):
             "3.00\xa0m in the gap; in crashes unknown, as another crash rule ended some trials",
         ),
         ([{"collisions": {"undecided": 4}}], ""),
+        ([{"gap": least(gap=3.0)["gap"] | {"n": 19, "ended": 19}}], ""),
     ],
 )
 def test_the_least_and_the_largest_detectable_differences_name_their_drivers(drivers, text):
