@@ -72,7 +72,7 @@ def next_steps(
         for name in HEADINGS
         if name != "gap"
     ]
-    if OPEN in states and not few:
+    if OPEN in states and not few and not is_rehearsal(drivers):
         steps.append((UNCLEAR, again("--reps", "N")))
     return steps
 

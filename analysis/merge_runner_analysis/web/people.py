@@ -117,12 +117,9 @@ def could_see(drivers: Sequence[Driver], short: Mapping[str, str]) -> str:
             if has_verdict(of) and of.get("detectable") is not None
         }
         if sizes:
-            ends = dict.fromkeys(
-                (min(sizes, key=sizes.__getitem__), max(sizes, key=sizes.__getitem__))
-            )
-            shown = [
-                f"{number(sizes[driver])}{f' ({driver})' * (len(sizes) > 1)}" for driver in ends
-            ]
+            ends = min(sizes, key=sizes.__getitem__), max(sizes, key=sizes.__getitem__)
+            named = {number(sizes[driver]): f" ({driver})" for driver in ends}
+            shown = [size + name * (len(named) > 1) for size, name in named.items()]
             parts.append(f"{' to '.join(shown)} {unit}")
         elif any(of.get("undecided") for _, of in values):
             unknown = "; in crashes unknown, as another crash rule ended some trials"

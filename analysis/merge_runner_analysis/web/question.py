@@ -105,14 +105,15 @@ class Answer:
     ``asked`` is the question in words, for a study that has none of its own; ``crossed`` a factor
     at whose levels another one may be shown. ``who`` says of which driver who goes first is
     counted, ``corrected`` for which tests p is corrected, and ``problem`` what is wrong with the
-    stored study. The charts are ``adjusted`` if their points are the values of the changes.
+    stored study. The charts are ``adjusted`` if their points are the values of the changes, and
+    ``is_cut`` if an interval ends beyond their axis.
     """
 
     asked: str
     claim: str
     rest: str
     measure: str
-    is_percent: bool
+    is_cut: bool
     drivers: list[tuple[str, str]]
     counted: str
     who: str
@@ -177,7 +178,8 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
         unbroken(claim),
         unbroken(rest),
         capital(name_of(primary)),
-        metric.endswith("_percent"),
+        any(end < 0 or end > 100 for row in single for end in interval_of(row) or ())
+        and metric.endswith("_percent"),
         [(short[driver], shape) for driver, shape in shapes.items()],
         _counted(_of_one_factor(shown, drawn), metric, effects.rows),
         capital(who),

@@ -134,14 +134,16 @@ NONE = "No language model drove here."
         ),
         (
             [
-                of_kind(PROGRAM, headway=SHOWN, gap=OPEN),
+                {"headway": row("headway", kind=PROGRAM, from_humans="yes")}
+                | of_kind(PROGRAM, gap=OPEN),
                 of_kind(PROGRAM, headway=SHOWN, gap="unlike"),
                 {"collisions": row("collisions", n=11, kind=PROGRAM, counted="11 of 11")},
                 {"collisions": row("collisions", OPEN, n=21, kind=PROGRAM, counted="9 of 21")},
             ],
             [
-                "Of 4 programs d0 is most like people: it agrees with them in 1 of 4 measures, and "
-                "is shown to differ in none. Most crashes: d3 crashed in 9 of 21 trials.",
+                "Of 4 programs d0 (it was made from the human data) is most like people: it agrees "
+                "with them in 1 of 4 measures, and is shown to differ in none. Most crashes: d3 "
+                "crashed in 9 of 21 trials.",
                 "2 of 2 drivers with enough trials let the one ahead go first, as people do; none "
                 "of 2 with enough trials leave gaps like people's. Cannot tell: crashes. No "
                 "verdict on who goes first side by side. Without a verdict: d2 crashed in 11 of 11 "
