@@ -59,10 +59,7 @@ from merge_runner_analysis.wording import (
 )
 
 # Reason for equal trials at both levels with a mock model.
-UNREAD = (
-    "not tested: the mock model does not read it, and no effect is planted for it; plant one in "
-    "the study's file, or run a language model"
-)
+UNREAD = "not tested: the mock model does not read it; plant an effect, or run a language model"
 SEEN = (COLLISIONS.name, GAP.name, RMSE.name)  # the most visible measures, in this order
 
 

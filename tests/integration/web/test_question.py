@@ -148,7 +148,9 @@ def test_likeness_to_people_is_said_in_counts_that_lead_to_their_trials(db):
         assert [*map(int, re.findall(r"(\d+) of (\d+)", people.text)[0])] == [28, 990]
         assert "675 of 704 95.88 %" in people.text
         assert "158 of 173 91.33 %" in people.text
-        pairs = re.findall(r"(\d+) of (\d+)", row.text)
+        bounds = f"0 to {counts[0]} of {counts[1]}, "  # by people's rule, before the played one
+        assert bounds in row.text.partition("by the rule played here: the vehicles' centres")[0]
+        pairs = re.findall(r"(\d+) of (\d+)", row.text.replace(bounds, ""))
         assert [int(count) for pair in pairs for count in pair] == [*counts]
         assert "cannot tell" in row.text
         assert "people's gap is known only to ± 0.9" in row.text
