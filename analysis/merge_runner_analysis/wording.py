@@ -62,24 +62,28 @@ DIRECTIONS = {
     "collisions": {WEAKER: "fewer than people's", STRONGER: "more than people's"},
     "gap": {WEAKER: "smaller than people's", STRONGER: "larger than people's"},
 }
-# The rule of a verdict, a line a state; ``{tests}`` is the number of a driver's tests, if known.
+# The rule of a verdict, a line a state; ``{tests}`` is the number of a driver's tests, if known,
+# and the name of a state its mark, where there are marks.
 VERDICT_RULES = (
-    "Like people (crashes, gap): the whole interval of the difference lies within 5 points, or 1 m",
-    "Same tendency as people (who goes first): the one ahead or, side by side, the slower one goes "
-    "first more often, with p below .05 in a logistic regression (Firth) over all trials without a "
-    "crash, not by the counts; and no difference is shown",
-    "Fewer, more, smaller, larger, unlike, depends less or more: a difference is shown, with p "
-    "below .05, corrected (Holm) for a driver's {tests}tests; in who goes first, of that "
-    "regression's slopes",
-    f"Cannot tell: neither is shown. No verdict: fewer than {ENOUGH} trials are counted, or fewer "
-    "than half of those that ended",
+    "{shown}Like people (crashes, gap): the whole interval of the difference lies within 5 points, "
+    "or 1 m",
+    "{shown}Same tendency as people (who goes first): the one ahead or, side by side, the slower "
+    "one goes first more often, with p below .05 in a logistic regression (Firth) over all trials "
+    "without a crash, not by the counts; and no difference is shown",
+    "{stronger}More, larger or depends more, {weaker}fewer, less, smaller or depends less, "
+    "{unlike}unlike: a difference is shown, with p below .05, corrected (Holm) for a driver's "
+    "{tests}tests; in who goes first, of that regression's slopes",
+    f"{{inconclusive}}Cannot tell: neither is shown. No verdict: fewer than {ENOUGH} trials are "
+    "counted, or fewer than half of those that ended",
 )
 FITTED_RULE = (
     "Same tendency as people in the gap by headway: more headway, more gap, with p below .05 in a "
     "linear regression. Like people in the gap by relative velocity: it moves the gap by less than "
     "1 m; in accelerations held: within half a standard deviation of people"
 )
-VERDICT_RULE = ". ".join((*VERDICT_RULES, FITTED_RULE)).format(tests="")
+VERDICT_RULE = ". ".join((*VERDICT_RULES, FITTED_RULE)).format(
+    tests="", **dict.fromkeys((SHOWN, WEAKER, STRONGER, UNLIKE, OPEN), "")
+)
 # Measures that the first page shows, with its headings.
 HEADINGS = {
     "collisions": "Crashes",
@@ -153,6 +157,8 @@ PEOPLES_RULE = "the vehicles' outlines overlap, checked every 0.05 s"
 CORRECTED = "p is corrected (Holm) for"
 # Of a rehearsal, with the planted effects.
 PLANTED = "planted in the mock model for this rehearsal"
+# Of a level, with its words.
+WORDS = "words of "
 # The vehicle that going first is counted for: (subject of a sentence, its meaning).
 LEFT = (
     "the left driver",
@@ -160,8 +166,7 @@ LEFT = (
 )
 EGO = (
     "the driver under study",
-    "goes first is counted for the driver under study. This is the one that alone gets a level's "
-    "words or settings, else the one named first",
+    "goes first is counted for the driver under study",
 )
 HALVES = (
     "Where two equal drivers get the same, a trial counts half for each, so that their share is "
@@ -490,11 +495,12 @@ def crashes(values: Values) -> str:
 
 def crash_text(rules: Sequence[tuple[str, Sequence[float]]]) -> str:
     """Return the meaning of a crash by the collision rules that were played, with their steps."""
-    return " or, by the scenario of the trial, ".join(
-        f"{RULES_MEAN[rule]}, checked every {' or '.join(map('{:g}'.format, steps_s))} s"
-        f"{'' if rule == 'rectangle' else f' ({PLAYED_RULES[rule]})'}"
-        for rule, steps_s in rules
-    )
+    texts = []
+    for rule, steps_s in rules:
+        text = f"{RULES_MEAN[rule]}, checked every {' or '.join(map('{:g}'.format, steps_s))} s"
+        text += ", by the driver" * (len(steps_s) > 1)
+        texts.append(text if rule == "rectangle" else f"{text} ({PLAYED_RULES[rule]})")
+    return " or, by the scenario of the trial, ".join(texts)
 
 
 def _percent(collisions: Values, count: int) -> float:
@@ -627,7 +633,7 @@ def _without_models(drivers: Mapping[str, Mapping[str, Values]]) -> tuple[str, s
     compared = {name: of for name, of in drivers.items() if "" not in of}
     if len(compared) < 2:
         return who, ""
-    claims = [_tally([*compared.values()]), _extremes(compared), who]
+    claims = [_tally([*compared.values()]), _extremes(compared), _few_trials(compared), who]
     if kinds == {PROGRAM}:
         claims.insert(0, _most_alike(compared))
     claim, *others = filter(None, claims)
@@ -648,16 +654,39 @@ def _most_alike(drivers: Mapping[str, Mapping[str, Values]]) -> str:
     if not like or len(names) == len(drivers):
         return ""
     is_one = len(names) == 1
+    named = [
+        f"{name} (it was made from the human data)" if _is_from_humans(drivers[name]) else name
+        for name in names
+    ]
     claim = (
-        f"Of {len(drivers)} programs {joined(names)} {'is' if is_one else 'are'} most like people: "
+        f"Of {len(drivers)} programs {joined(named)} {'is' if is_one else 'are'} most like people: "
         f"{'it agrees' if is_one else 'each agrees'} with them in {like} of {len(LIKENESS)} "
         f"measures, and is shown to differ in {-unlike or 'none'}."
     )
-    rates = _crash_rates(drivers)
+    rates = _crash_rates({name: of for name, of in drivers.items() if _is_judged(of)})
     most = [name for name, rate in rates.items() if rate == max(rates.values()) > 0]
     if len(most) != 1:
         return claim
     return f"{claim} Most crashes: {most[0]} {crashes(drivers[most[0]]['collisions'])}."
+
+
+def _is_from_humans(verdicts: Mapping[str, Values]) -> bool:
+    return any(values.get("from_humans") for values in verdicts.values())
+
+
+def _is_judged(verdicts: Mapping[str, Values]) -> bool:
+    """Return whether a driver has a verdict on crashes."""
+    return "collisions" in verdicts and has_verdict(verdicts["collisions"])
+
+
+def _few_trials(drivers: Mapping[str, Mapping[str, Values]]) -> str:
+    """Return the counts of crashes of drivers without a verdict on them."""
+    counts = [
+        f"{name} crashed in {of['collisions']['counted']} trials"
+        for name, of in drivers.items()
+        if not _is_judged(of) and of.get("collisions", {}).get("counted")
+    ]
+    return f"Without a verdict: {'; '.join(counts)}." if counts else ""
 
 
 def _crash_rates(drivers: Mapping[str, Mapping[str, Values]]) -> dict[str, float]:
@@ -668,29 +697,41 @@ def _crash_rates(drivers: Mapping[str, Mapping[str, Values]]) -> dict[str, float
 
 
 def _tally(drivers: Sequence[Mapping[str, Values]]) -> str:
-    like, unclear = list[str](), list[str]()
+    """Return how many of the drivers with a verdict are like people, by measure."""
+    like, unclear, unjudged = list[str](), list[str](), list[str]()
     for name, (does, what) in LIKENESS.items():
-        states = [shown_state(of[name]) for of in drivers if name in of]
-        if {*states} <= {"", OPEN}:
+        states = [shown_state(of[name]) for of in drivers if name in of and has_verdict(of[name])]
+        if not states:
+            unjudged.append(what)
+        elif {*states} == {OPEN}:
             unclear.append(what)
         else:
             who = " drivers" * (not like)
-            like.append(f"{states.count(SHOWN) or 'none'} of {len(drivers)}{who} {does}")
-    if not like:
+            few = " with enough trials" * (len(states) < len(drivers))
+            like.append(f"{states.count(SHOWN) or 'none'} of {len(states)}{who}{few} {does}")
+    if not (like or unclear):
         return f"For {len(drivers)} drivers no verdict on likeness to people is possible."
-    rest = f" No verdict is possible on {joined(unclear)}." if unclear else ""
-    return f"{capital('; '.join(like))}.{rest}"
+    parts = [f"{'; '.join(like)}."] if like else []
+    parts += [f"cannot tell: {joined(unclear)}."] if unclear else []
+    parts += [f"no verdict on {joined(unjudged)}."] if unjudged else []
+    return " ".join(map(capital, parts))
 
 
 def _extremes(drivers: Mapping[str, Mapping[str, Values]]) -> str:
-    """Return the fewest and most crashes, and the smallest and largest gap, of many drivers."""
+    """Return the fewest and most crashes, and the smallest and largest gap, of many drivers.
+
+    Drivers without a verdict are left out.
+    """
+    drivers = {name: of for name, of in drivers.items() if _is_judged(of)}
     crashed = {
         f"{drivers[name]['collisions']['counted']} trials ({name})": rate
         for name, rate in _crash_rates(drivers).items()
     }
     gaps = {}
     for name, of in drivers.items():
-        if (gap := of.get("gap", {}).get("estimate")) is not None:
+        values = of.get("gap", {})
+        gap = values.get("estimate")
+        if gap is not None and has_verdict(values):
             gaps[f"{number(gap)} m ({name})"] = gap
     parts = [
         f"{what} from {min(of, key=lambda text: of[text])} to {max(of, key=lambda text: of[text])}"
@@ -711,13 +752,16 @@ def _likeness(drivers: Mapping[str, Mapping[str, Values]], *, every: bool) -> tu
     alike = [name for name in drivers if name not in unlike]
     if not unlike:
         return f"No difference from people is shown for {joined(alike)}.", " ".join(untold)
-    name = min(unlike, key=lambda name: _seen_first(unlike[name][0]))
-    worst = unlike[name][0]
-    if len(drivers) == 1 or alike:
-        claim = f"{name} differs from people: {difference_sentence(worst, 'it')}."
+    names = sorted(unlike, key=lambda name: _seen_first(unlike[name][0]))
+    if len(names) == 1:
+        claim = f"{names[0]} differs from people: {difference_sentence(unlike[names[0]][0], 'it')}."
     else:
-        who = "All language models here" if every else joined([*drivers])
-        claim = f"{who} differ from people: {difference_sentence(worst, name)}."
+        is_all = every and not alike
+        count = "Both" if len(names) == 2 else f"All {len(names)}"
+        who = f"{count} language models here" if is_all else joined(names)
+        reasons = [difference_sentence(unlike[name][0], name) for name in names[:FEW]]
+        most = " most visibly" * (len(names) > FEW)
+        claim = f"{who} differ from people:{most} {'; '.join(reasons)}."
     if alike:
         untold.insert(0, f"No difference from people is shown for {joined(alike)}.")
     return claim, " ".join(untold)

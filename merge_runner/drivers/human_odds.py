@@ -107,5 +107,6 @@ PROGRAMS.register(
         settable=True,
         check=_check,
         chance=True,
+        from_humans=True,
     ),
 )

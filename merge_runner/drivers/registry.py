@@ -39,8 +39,9 @@ class Program:
     clock in s (the time between two decisions) that does not fit them.
 
     ``chance`` declares random draws from the seed of the context; of other programs the analysis
-    counts equal first decisions once. ``based_on`` is the program that a study has given other
-    parameters or another clock.
+    counts equal first decisions once. ``from_humans`` declares that the rule was made from the
+    data of the human experiment, so that its likeness to people is no finding. ``based_on`` is the
+    program that a study has given other parameters or another clock.
 
     ``data`` are imported human trials that the program replays: an object with their hash as
     ``digest``. Its ``read`` returns another one with the trials of an open database (None: there is
@@ -57,6 +58,7 @@ class Program:
     check_clock: Callable[[Mapping[str, Parameter], float], None] | None = None
     data: Any = None
     chance: bool = False
+    from_humans: bool = False
     based_on: str = ""
 
     def __post_init__(self) -> None:

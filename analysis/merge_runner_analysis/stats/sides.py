@@ -30,7 +30,7 @@ def level_estimate(study: StudyResults, level: Level, metric: Metric) -> Estimat
     """Return a metric of a level's trials; those that count for both sides have no variance."""
     group = level.pooled
     trials = group.trials
-    same = trials[metric.column].notna() & _have_same_prompts(trials)
+    same = trials[metric.column].notna() & have_same_prompts(trials)
     if metric is not LEFT_FIRST or not one_sided(study) or not same.any():
         return estimate(group, metric)
     varying = estimate(replace(group, trials=trials[~same]), metric)
@@ -49,12 +49,13 @@ def cells_seen(study: StudyResults, level: Level) -> set[Cell]:
     trials = level.pooled.ended
     seen = {*trials["cell"]}
     if one_sided(study):
-        same = trials.loc[_have_same_prompts(trials), "cell"].unique()
+        same = trials.loc[have_same_prompts(trials), "cell"].unique()
         seen |= {(_mirrored(study, condition), *others) for condition, *others in same}
     return seen
 
 
-def _have_same_prompts(trials: pd.DataFrame) -> pd.Series:
+def have_same_prompts(trials: pd.DataFrame) -> pd.Series:
+    """Return by trial whether two equal drivers are given the same."""
     return trials["focal"].isna() & _of_equals(trials)
 
 
@@ -69,7 +70,7 @@ def from_both_sides(study: StudyResults, frame: pd.DataFrame, trials: pd.DataFra
     images = [(_mirrored(study, cell[0]), *cell[1:], "right") for cell in frame["condition"]]
     cells, mirrored = (pd.Series(names, frame.index, dtype=object) for names in (sided, images))
     frame = frame.assign(condition=cells, value=frame["value"].astype(float))
-    return read_twice(frame, mirrored.where(_have_same_prompts(trials)))
+    return read_twice(frame, mirrored.where(have_same_prompts(trials)))
 
 
 def read_twice(frame: pd.DataFrame, images: pd.Series) -> pd.DataFrame:

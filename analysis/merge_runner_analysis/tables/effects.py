@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 from math import exp, isinf
+from textwrap import shorten
 
 from merge_runner.study.arms import PROMPT
 from merge_runner_analysis.metrics import (
@@ -36,6 +37,7 @@ from merge_runner_analysis.wording import (
     PLANTED,
     SAME_TRIALS,
     TIMES,
+    WORDS,
     joined,
     note_of,
 )
@@ -53,6 +55,12 @@ DIFFERENCE = (
     Optional("p_corrected", "p, corr.", "p", "corrected by Holm"),
     Optional("detectable", "detectable", "number", "at p < .05 with power .8"),
 )
+WORDS_SHOWN = 80  # characters of a level's words
+GIVEN_TO = {
+    "both": "to both drivers",
+    "ego": "to the driver under study",
+    "other": "to the other driver",
+}
 SIDES = ("", "_reference")  # of a comparison
 
 
@@ -228,6 +236,7 @@ def _notes(study: StudyResults, by: str) -> Iterator[str]:
         yield failure
     if planted := _planted(study):
         yield f"{PLANTED}: {'; '.join(planted)}"
+    yield from _words(study)
     if not tested and not every:
         yield "the trials of judged drivers differ in no factor"
         return
@@ -267,6 +276,19 @@ def _families(tested: Sequence[Effect]) -> tuple[list[str], int]:
     counted = [effect for effect in tested if effect.varies]
     of_primary = [effect.factor for effect in counted if effect.primary]
     return of_primary, len(counted) - len(of_primary)
+
+
+def _words(study: StudyResults) -> Iterator[str]:
+    """Yield the words of each level of a factor with texts, and the drivers that get them."""
+    for factor, levels in texts_of(study).items():
+        for level, text in levels.items():
+            changes = (*text.add, *text.replace.values())
+            words = " ".join(filter(None, (of.merge or of.straight for of in changes)))
+            shown = shorten(words, WORDS_SHOWN, placeholder=" …")
+            parts = [f"“{shown}”"] if words else []
+            parts += [f"with block {of.block}" for of in text.add if of.block]
+            parts += [f"without block {name}" for name in text.remove]
+            yield f"{WORDS}{factor}={level}: {', '.join(parts)}, {GIVEN_TO[text.given_to]}"
 
 
 def _planted(study: StudyResults) -> list[str]:

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import product
 
+import pandas as pd
+
+from merge_runner.records import SIDES
 from merge_runner.study.arms import MODEL, OPPONENT
 from merge_runner_analysis.metrics import COLLISIONS, GAP, RMSE, Metric
-from merge_runner_analysis.stats.effects import primary
+from merge_runner_analysis.stats.effects import primary, texts_of
 from merge_runner_analysis.stats.levels import Level, crossing, levels_by_factor
 from merge_runner_analysis.stats.measures import counts, estimate
-from merge_runner_analysis.stats.sides import level_estimate, one_sided
+from merge_runner_analysis.stats.sides import have_same_prompts, level_estimate, one_sided
 from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables.model import ENDED, Column, Optional, Row, Table, Value, interval
 from merge_runner_analysis.wording import EGO, HALVES, LEFT, TIMES
@@ -54,7 +57,21 @@ def _counted_driver(study: StudyResults) -> str:
     is_equal = all((of["model_left"] == of["model_right"]).all() for of in trials)
     if is_equal and all(of["focal"].isna().all() for of in trials):
         return LEFT[1]
-    return f"{EGO[1]}. {HALVES}" if one_sided(study) else EGO[1]
+    every = pd.concat(trials)
+    given = [
+        factor
+        for factor, levels in texts_of(study).items()
+        if any(text.given_to != "both" for text in levels.values())
+    ]
+    words = f"the words of {' or '.join(given)}" if given else "a level's words or settings"
+    alone = f"the one that alone gets {words}, else " if every["focal"].notna().any() else ""
+    sides = every.loc[~have_same_prompts(every), "ego"].value_counts()
+    left, right = (int(sides.get(side, 0)) for side in SIDES)
+    where = "left and right equally often"
+    if left != right:
+        where = f"on the left in {left} trials, on the right in {right}"
+    counted = f"{EGO[1]}: {alone}the one named first, who was {where}"
+    return f"{counted}. {HALVES}" if one_sided(study) else counted
 
 
 def varied(study: StudyResults) -> tuple[str, ...]:

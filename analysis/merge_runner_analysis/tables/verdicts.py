@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from merge_runner.config import ScenarioConfig
+from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner_analysis.cache import remembered
@@ -124,6 +125,16 @@ def _driver(group: Group, kind: str) -> dict[str, Value]:
     return {"driver": group.label, "setting": group.setting, "kind": kind}
 
 
+def _is_from_humans(group: Group, spec: Mapping[str, Any]) -> bool:
+    """Return whether a group's driver, of two the first, is a program made from human data."""
+    sides = [side for name in SIDES if "program" in (side := spec.get(name) or {})]
+    known = {
+        side["program"]: PROGRAMS.get(side.get("based_on") or side["program"]) for side in sides
+    }
+    program = known.get(group.driver.partition("+")[0])
+    return program is not None and program.from_humans
+
+
 def _driver_rows(study: StudyResults, group: Group) -> Iterator[Row]:
     spec = study.frames.specs.get(group.spec_hash, {})
     driver = _driver(group, _kind(group, spec))
@@ -131,13 +142,17 @@ def _driver_rows(study: StudyResults, group: Group) -> Iterator[Row]:
         yield Row(group.id, (group.id,), driver, group.unjudged)
         return
     rule = ScenarioConfig.model_validate(spec.get("scenario", {})).collision_rule
-    copies = _copies(study, group)
+    copies, from_humans = _copies(study, group), _is_from_humans(group, spec)
     comparisons = compared(study, distinct(study, group))
     crashes = next(of.driver for of in comparisons if of.measure.rests_on == BOXES.column)
     for comparison in comparisons:
         row = _compared(group, driver, comparison, PLAYED_RULES[rule])
-        # For the words of the state, which need half of the trials; it is no column.
-        values = {**row.values, "ended": crashes.n + (crashes.undecided or 0)}
+        # For words alone, so they are no columns; a state needs half of the trials that ended.
+        words = {
+            "ended": crashes.n + (crashes.undecided or 0),
+            "from_humans": "yes" if from_humans else None,
+        }
+        values = {**row.values, **words}
         if not has_verdict(values):  # what could have been seen is of no use then
             values["detectable"] = None
         yield replace(row, values=values, copies=copies)

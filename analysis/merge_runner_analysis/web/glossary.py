@@ -19,7 +19,8 @@ USED = (
     ("interval [ ]", "interval", r"\["),
     ("p, corrected", "corrected p", "corrected"),
     ("prompt, Baseline", "prompt variant", "prompt"),
-    ("ahead, side by side, headway", "projected headway", "ahead|side by side|headway"),
+    ("ahead, side by side", "projected headway", "ahead|side by side"),
+    ("headway", "headway", "headway"),
     ("crash", "collision", "crash"),
     ("valid reply, plan", "plan", "valid|plan"),
     ("gap at the merge point", "gap", r"\bgap\b"),
@@ -27,9 +28,11 @@ USED = (
     ("both change their speed", "joint contribution", "change their speed"),
     ("mock model", "mock model", "mock model"),
 )
+CRASH = "<em>crash</em> on pages"  # where a page explains it, it has this word
 _ROW = re.compile(r"\| (.+?) \| (.+) \|")
 _MARKED = (
     (re.compile(r"\*\*(.+?)\*\*"), r"<strong>\1</strong>"),
+    (re.compile(r"\*(.+?)\*"), r"<em>\1</em>"),
     (re.compile(r"`(.+?)`"), r"<code>\1</code>"),
     (re.compile(r" \(\[[^]]+\]\([^)]+\)\)"), ""),
     (re.compile(r"\[(.+?)\]\(.+?\)"), r"\1"),
@@ -58,4 +61,5 @@ def used_terms(html: str) -> list[tuple[str, Markup]]:
     """Return the words of a page that are terms, with their meanings."""
     text = re.sub("<[^>]*>", " ", html).lower()
     meanings = {word: meaning for words in sections().values() for word, meaning in words}
+    meanings["collision"] = meanings["collision"].removeprefix(f"{CRASH}. ")
     return [(words, meanings[term]) for words, term, used in USED if re.search(used, text)]

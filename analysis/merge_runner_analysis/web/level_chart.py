@@ -15,6 +15,7 @@ from merge_runner_analysis.wording import TIMES, brackets, number
 
 # The shapes that tell drivers apart in a chart, and more of them are not drawn.
 SHAPES = ("dot", "square", "ring", "triangle")
+REFERENCE = "ring"  # of a reference without an interval
 # Parts of a chart, and a letter of a name, in units of its drawing.
 LEFT, WIDTH, HEAD, ROW, APART, INDENT, LETTER = 90.0, 480.0, 12, 20, 14, 84.0, 7.5
 
@@ -66,8 +67,11 @@ def level_chart(
     ]
     if not drawn:
         return None
+    percent = metric.endswith("_percent")
     ends = [end for row in drawn for end in (interval_of(row) or (value_of(row, "value"),))]
     low, high, step = _axis(min(ends), max(ends))
+    if percent:  # the interval of a difference may end beyond
+        low, high = max(low, 0.0), min(high, 100.0)
 
     levels: dict[tuple[str, str], list[Row]] = {}
     for row in drawn:
@@ -78,6 +82,7 @@ def level_chart(
     left = min(WIDTH / 2, indent + max(LEFT, LETTER * max(map(len, names.values()))))
 
     def x(value: float) -> float:
+        value = min(max(value, low), high)
         return round(left + (WIDTH - left) * (value - low) / (high - low), 1)
 
     lines: list[Line] = []
@@ -91,7 +96,6 @@ def level_chart(
         heads.add(factor)
         y += height
     ticks = [low + step * place for place in range(round((high - low) / step) + 1)]
-    percent = metric.endswith("_percent")
     even = 50.0 if metric == LEFT_FIRST.name and low < 50 < high else None
     return Chart(
         title,
@@ -109,7 +113,8 @@ def _point(row: Row, shapes: dict[str, str], x: Callable[[float], float], y: flo
     counts = "" if k is None else f"{k} of {n}, "
     says = f"{driver or 'all drivers'}: {counts}{number(value)} {brackets(ci)}".rstrip()
     ends = None if ci is None else (x(ci[0]), x(ci[1]))
-    return Point(shapes.get(str(driver), SHAPES[0]), x(value), ends, y, says)
+    shape = row.values.get("shape") or shapes.get(str(driver), SHAPES[0])
+    return Point(str(shape), x(value), ends, y, says)
 
 
 def _axis(low: float, high: float) -> tuple[float, float, float]:

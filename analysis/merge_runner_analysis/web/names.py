@@ -24,7 +24,10 @@ PARTS = (
     (re.compile(r" (at [^\s+]+?)(?=/set\d+(?: |$)|[\s+]|$)"), "the server that the model ran on"),
     (re.compile(r"(/set\d+)"), "another series of samples of the same driver"),
     (re.compile(r" (\[[0-9a-f]{8}\])"), "with other settings of the task than its other trials"),
-    (re.compile(rf"\b({EMULATOR})\b"), "the mock model that comes with this program"),
+    (
+        re.compile(rf"\b({EMULATOR})\b"),
+        "the mock model that comes with this program; it draws who goes first as people do",
+    ),
     (re.compile(r"\b(random)\b"), "a mock model that answers by chance, whatever it reads"),
 )
 

@@ -15,6 +15,8 @@ from merge_runner_analysis.wording import (
     HEADINGS,
     MARGINS,
     OPEN,
+    PLAYED_RULES,
+    RULES_MEAN,
     SHOWN,
     STRONGER,
     UNLIKE,
@@ -22,7 +24,9 @@ from merge_runner_analysis.wording import (
     VERDICTS,
     WEAKER,
     brackets,
+    has_verdict,
     number,
+    share,
     shown_state,
     verdict_word,
 )
@@ -42,7 +46,8 @@ class Likeness:
     """One measure of a driver beside people's: a mark with its word, and what was counted.
 
     A count has ``k`` and ``n``, any other value a ``text``; ``row`` is the verdict's row, and
-    ``why`` says what keeps it open.
+    ``why`` says what keeps it open. Where the count is by another rule than people's, ``by_people``
+    has the bounds by theirs.
     """
 
     mark: str
@@ -52,6 +57,7 @@ class Likeness:
     text: str
     row: str
     why: str = ""
+    by_people: str = ""
 
 
 def likeness_of(driver: Driver) -> dict[str, Likeness]:
@@ -59,12 +65,45 @@ def likeness_of(driver: Driver) -> dict[str, Likeness]:
     return {name: _likeness(driver.cells[name]) for name in HEADINGS if name in driver.cells}
 
 
-def counted(driver: Driver) -> int | None:
-    """Return the number of a driver's compared trials; None if all are compared."""
-    crashes = driver.cells["collisions"].values if "collisions" in driver.cells else {}
-    n = int(str(crashes.get("counted") or "0 of 0").split(" of ")[1])
-    is_all = driver.facts is not None and driver.facts["trials"] == n
-    return None if is_all or not driver.cells else n
+def counted(driver: Driver, conditions: Mapping[str, Any]) -> str:
+    """Return how many of a driver's trials are compared, and why no more; empty if all are."""
+    if not driver.cells or driver.facts is None:
+        return ""
+    repeats, shared = repeated(driver, conditions)
+    cells = _cells_of(driver, conditions)
+    ended = sum(cell["ended"] for cell in cells if cell)
+    reasons = {
+        "repeat another one": repeats,
+        "in situations that nobody drove": ended - shared,
+        "did not end": driver.facts["trials"] - ended,
+    }
+    why = ", ".join(f"{k} {reason}" for reason, k in reasons.items() if k)
+    return f"{shared - repeats} counted: {why}" if why else ""
+
+
+def repeated(driver: Driver, conditions: Mapping[str, Any]) -> tuple[int, int]:
+    """Return how many ended trials repeat another one, of those in situations people drove."""
+    counted = str(driver.cells["collisions"].values.get("counted") or "0 of 0")
+    pairs = zip(_cells_of(driver, conditions), conditions["humans"], strict=True)
+    shared = sum(cell["ended"] for cell, human in pairs if cell and human)
+    return shared - int(counted.split(" of ")[1]), shared
+
+
+def _cells_of(driver: Driver, conditions: Mapping[str, Any]) -> list[Any]:
+    return next(cells for of, cells in conditions["rows"] if of is driver)
+
+
+def gap_weights(drivers: Sequence[Driver], short: Mapping[str, str]) -> str:
+    """Return of which trials people's gap in their row is, and its range beside other drivers."""
+    with_gap = [of for of in drivers if "gap" in of.cells]
+    gaps = [of.cells["gap"].values for of in with_gap if has_verdict(of.cells["gap"].values)]
+    ends = dict.fromkeys(number(pick(of["human"] for of in gaps)) for pick in (min, max) if gaps)
+    if len(ends) < 2:
+        return ""
+    return unbroken(
+        "Each driver is compared with people's gap in the situations as it drove them, "
+        f"{' to '.join(ends)} m; the row of people has that of {short[drivers[0].name]}"
+    )
 
 
 def could_see(drivers: Sequence[Driver], short: Mapping[str, str]) -> str:
@@ -73,7 +112,9 @@ def could_see(drivers: Sequence[Driver], short: Mapping[str, str]) -> str:
     for name, unit in {"collisions": "points in crashes", "gap": "m in the gap"}.items():
         values = [(short[of.name], of.cells[name].values) for of in drivers if name in of.cells]
         sizes = {
-            driver: of["detectable"] for driver, of in values if of.get("detectable") is not None
+            driver: of["detectable"]
+            for driver, of in values
+            if has_verdict(of) and of.get("detectable") is not None
         }
         if sizes:
             ends = min(sizes, key=sizes.__getitem__), max(sizes, key=sizes.__getitem__)
@@ -90,13 +131,14 @@ def verdict_rules(drivers: Sequence[Driver], gap: Mapping[str, Any]) -> list[str
     tests = {sum(c.values.get("p_holm") is not None for c in of.cells.values()) for of in drivers}
     ends = dict.fromkeys((min(tests, default=0), max(tests, default=0)))
     numbers = f"{' to '.join(map(str, ends))} " if any(ends) else ""
-    likeness, *others = (rule.format(tests=numbers) for rule in VERDICT_RULES)
+    marks = {state: f"{mark} " for state, mark in MARKS.items()}
+    likeness, *others = (rule.format(tests=numbers, **marks) for rule in VERDICT_RULES)
     if of_gap := gap.get("ci"):
         half = _half(of_gap)
         if half > MARGINS["gap"] / 2:
             likeness += (
-                f" (people's gap is known to ± {number(half)} m, by nine pairs: more trials hardly "
-                "help)"
+                f". In the gap hardly any driver can be shown to be so, however many trials it "
+                f"has: people's is known only to ± {number(half)} m, by nine pairs"
             )
     return [likeness, *others]
 
@@ -115,11 +157,14 @@ def _likeness(cell: Cell) -> Likeness:
             why = f"people's gap is known only to ± {number(half)} m"
     if counted:
         k, n = map(int, str(counted).split(" of "))
-        share = f"{number(100 * k / n)} %"
-        if undecided := values.get("undecided"):  # it is not by people's rule
+        text, by_people = unbroken(f"{number(100 * k / n)} %"), ""
+        if undecided := values.get("undecided"):
             surely = values["k"] or 0
-            share += f" by {values['counted_by']}; {surely} to {surely + undecided} by people's"
-        return Likeness(mark, word, k, n, unbroken(share), row)
+            bounds = f"{surely} to {surely + undecided} of {n}, {share(values)} %"
+            by_people = unbroken(f"{bounds} by people's rule")
+            (rule,) = (of for of, name in PLAYED_RULES.items() if name == values["counted_by"])
+            text += f" by the rule played here: {RULES_MEAN[rule]}"
+        return Likeness(mark, word, k, n, text, row, "", by_people)
     estimate = values.get("estimate")
     known = cell.measure.name == "gap" and estimate is not None
     ends = brackets(values.get("ci"))

@@ -22,6 +22,7 @@ from merge_runner_analysis.web.effect_rows import (
     ends_of,
     estimate_text,
     factors_of,
+    interval_of,
     interval_text,
     is_copied,
     is_interaction,
@@ -35,7 +36,7 @@ from merge_runner_analysis.web.effect_rows import (
     unit_of,
     value_of,
 )
-from merge_runner_analysis.web.level_chart import SHAPES, Chart, level_chart
+from merge_runner_analysis.web.level_chart import REFERENCE, SHAPES, Chart, level_chart
 from merge_runner_analysis.web.marks import Mark
 from merge_runner_analysis.web.names import short_names
 from merge_runner_analysis.wording import (
@@ -50,23 +51,29 @@ from merge_runner_analysis.wording import (
     SAME_TRIALS,
     TIMES,
     UNREADABLE,
+    WORDS,
     capital,
     joined,
+    number,
     p_value,
 )
 
 # Reason for equal trials at both levels with a mock model.
-UNREAD = "not tested: the mock model does not read it, and no effect is planted for it"
+UNREAD = "not tested: the mock model does not read it; plant an effect, or run a language model"
 SEEN = (COLLISIONS.name, GAP.name, RMSE.name)  # the most visible measures, in this order
 
 
 @dataclass(frozen=True, slots=True)
 class Side:
-    """The value of a level in the shared situations; counts of all its trials, and their cells."""
+    """The value of a level in the shared situations; counts of all its trials, and their cells.
+
+    Where some trials count half, ``halves`` has the count.
+    """
 
     text: str
     name: str = ""
     k: int | None = None
+    halves: str = ""
     n: int | None = None
     row: str = ""
     columns: tuple[str, str] = ("k", "n")
@@ -95,18 +102,21 @@ class Answer:
     ``asked`` is the question in words, for a study that has none of its own; ``crossed`` a factor
     at whose levels another one may be shown. ``who`` says of which driver who goes first is
     counted, ``corrected`` for which tests p is corrected, and ``problem`` what is wrong with the
-    stored study.
+    stored study. The charts are ``adjusted`` if their points are the values of the changes, and
+    ``is_cut`` if an interval ends beyond their axis.
     """
 
     asked: str
     claim: str
     rest: str
     measure: str
+    is_cut: bool
     drivers: list[tuple[str, str]]
     counted: str
     who: str
     corrected: str
     charts: list[Chart]
+    adjusted: bool
     crossed: str
     crossings: str
     changes: list[Change]
@@ -146,28 +156,37 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
     drawn = drivers if len(drivers) <= len(SHAPES) else []
     shapes = dict(zip(drawn, SHAPES, strict=False))
     shown = [row for row in known if not _untested(effects.rows) & factors_of(row)]
+    tested = [row for row in of_metric if is_tested(row)]
+    single = [row for row in shown if len(factors_of(row)) == 1]
+    if is_adjusted := len(drawn) < 2:
+        single = _adjusted(single, of_metric)
+    words = dict(
+        note.removeprefix(WORDS).split(": ", 1) for note in effects.notes if note.startswith(WORDS)
+    )
     charts = [
-        level_chart("By factor", [r for r in shown if len(factors_of(r)) == 1], shapes, metric),
+        level_chart("By factor", single, shapes, metric),
         level_chart(
             _crossing_of(shown), [r for r in shown if len(factors_of(r)) > 1], shapes, metric
         ),
     ]
-    tested = [row for row in of_metric if is_tested(row)]
     names = _factors(asked)
     return Answer(
         f"{'Does' if len(names) == 1 else 'Do'} {joined(names)} change {_changed(primary)}?",
         unbroken(claim),
         unbroken(rest),
         capital(name_of(primary)),
+        any(end < 0 or end > 100 for row in single for end in interval_of(row) or ())
+        and metric.endswith("_percent"),
         [(short[driver], shape) for driver, shape in shapes.items()],
         _counted(_of_one_factor(shown, drawn), metric, effects.rows),
         capital(who),
         next((note for note in effects.notes if note.startswith(CORRECTED)), ""),
         [chart for chart in charts if chart],
+        is_adjusted,
         OPPONENT if OPPONENT in names[1:] else names[-1] if len(names) > 1 else "",
         unbroken(_interactions(tested, {str(row.values["factor"]) for row in known})),
-        _changes(tested, sides, metric),
-        _changes(others, sides, metric),
+        _changes(tested, sides, metric, words),
+        _changes(others, sides, metric, {}),
         unbroken(_could([*tested, *others])),
         next((note for note in effects.notes if note.startswith(UNREADABLE)), ""),
     )
@@ -332,16 +351,55 @@ def _named(row: Row) -> str:
     return capital(str(row.values["factor"]).replace(TIMES, " and "))
 
 
-def _changes(rows: Sequence[Row], sides: dict[str, Row], primary: str) -> list[Change]:
-    """Return the effects with both sides of each; effects on one measure share an axis."""
+def _adjusted(levels: Sequence[Row], effects: Sequence[Row]) -> list[Row]:
+    """Return levels with their values in the effects; the interval is that of the difference.
+
+    A reference has a row for each value that it has beside other levels, and no interval.
+    """
+    adjusted: dict[tuple[str, str], Row] = {}
+    for row in levels:
+        name = f"{row.values['factor']}={row.values['level']}"
+        for effect in effects:
+            if is_interaction(effect) or effect.values.get("estimate") is None:
+                continue
+            base = value_of(effect, "estimate_reference")
+            values: dict[str, Any] = {"k": None}
+            if name == level_text(effect):
+                ends = interval_of(effect)
+                ci = ends and tuple(base + end for end in ends)
+                values |= {"value": effect.values["estimate"], "ci": ci}
+            elif name == f"{effect.values['factor']}={_reference(effect)}":
+                values |= {"value": base, "ci": None, "shape": REFERENCE}
+            else:
+                continue
+            adjusted[row.id, number(values["value"])] = replace(
+                row, values={**row.values, **values}
+            )
+    return [*adjusted.values()]
+
+
+def _reference(row: Row) -> str:
+    """Return the reference of an effect, marked as its level is."""
+    mark = " [scripted]"
+    return f"{row.values['reference']}{mark * str(row.values['level']).endswith(mark)}"
+
+
+def _changes(
+    rows: Sequence[Row], sides: dict[str, Row], primary: str, words: dict[str, str]
+) -> list[Change]:
+    """Return the effects with both sides of each; effects on one measure share an axis.
+
+    ``words`` has those of levels, of which it is said once.
+    """
     ends = ends_of(rows)
-    return [_change(row, sides, ends[metric_of(row)], primary) for row in rows]
+    return [_change(row, sides, ends[metric_of(row)], primary, words) for row in rows]
 
 
-def _change(row: Row, sides: dict[str, Row], end: float, primary: str) -> Change:
+def _change(
+    row: Row, sides: dict[str, Row], end: float, primary: str, words: dict[str, str]
+) -> Change:
     of, base, metric = row.values["level"], row.values["reference"], metric_of(row)
     factor = str(row.values["factor"])
-    mark = " [scripted]" if str(of).endswith(" [scripted]") else ""
     is_own = metric == primary
     reference, level = (
         None
@@ -354,7 +412,7 @@ def _change(row: Row, sides: dict[str, Row], end: float, primary: str) -> Change
             is_own,
             metric,
         )
-        for name, side in (("estimate_reference", f"{base}{mark}"), ("estimate", of))
+        for name, side in (("estimate_reference", _reference(row)), ("estimate", of))
     )
     detail = ""
     if is_interaction(row):  # whose id has the level of the second factor, too
@@ -366,6 +424,8 @@ def _change(row: Row, sides: dict[str, Row], end: float, primary: str) -> Change
             f"{second}={otherwise}"
         )
     detail = detail or (_called(factor, of) if is_own else f"{factor}: {_called(factor, of)}")
+    if of_level := words.get(level_text(row).removesuffix(" [scripted]")):
+        detail += f": {of_level}"
     return Change(
         capital(factor) if is_own else capital(name_of(row)),
         detail,
@@ -386,7 +446,11 @@ def _side(side: Side, counts: Row | None, is_own: bool, metric: str) -> Side:
     if counts is None or not (is_own or metric == COLLISIONS.name):
         return side
     values: Any = counts.values
-    return replace(side, k=values[columns[0]], n=values[columns[1]], row=counts.id, columns=columns)
+    k, n = (values[column] for column in columns)
+    halves = ""
+    if k is None and metric == LEFT_FIRST.name and values["value"] is not None:
+        halves = f"{round(values['value'] * n / 50) / 2:g}"
+    return replace(side, k=k, n=n, halves=halves, row=counts.id, columns=columns)
 
 
 def _untested(effects: Sequence[Row]) -> set[str]:

@@ -148,7 +148,9 @@ def test_likeness_to_people_is_said_in_counts_that_lead_to_their_trials(db):
         assert [*map(int, re.findall(r"(\d+) of (\d+)", people.text)[0])] == [28, 990]
         assert "675 of 704 95.88 %" in people.text
         assert "158 of 173 91.33 %" in people.text
-        pairs = re.findall(r"(\d+) of (\d+)", row.text)
+        bounds = f"0 to {counts[0]} of {counts[1]}, "  # by people's rule, before the played one
+        assert bounds in row.text.partition("by the rule played here: the vehicles' centres")[0]
+        pairs = re.findall(r"(\d+) of (\d+)", row.text.replace(bounds, ""))
         assert [int(count) for pair in pairs for count in pair] == [*counts]
         assert "cannot tell" in row.text
         assert "people's gap is known only to ± 0.9" in row.text
@@ -202,14 +204,25 @@ def test_the_first_screen_answers_a_study_of_two_factors(page, db, outcomes):
     expect(answer).to_contain_text(said_first, timeout=1000 * HANGS_S)
     said = answer.inner_text().replace("\N{NO-BREAK SPACE}", " ")
     points = page.locator(".levels .point title").all_text_contents()
-    for factors in ("persona", "hurry", ["persona", "hurry"]):
-        for _, rows in outcomes.groupby(factors):
-            share = 100 * rows["first"].mask(rows["both"], 0.5).mean()
-            assert any(f"{share:.2f}" in text for text in points)
+    effects = values_of(StudyResults(db), "effects")
+    for level in ("persona=taxi", "hurry=yes"):
+        row = effects[f"{level}/left_first_percent"]
+        low, high = (row["estimate_reference"] + end for end in row["ci"])
+        assert f"emulator: {row['estimate']:.2f} [{low:.2f}, {high:.2f}]" in points
+        assert f"emulator: {row['estimate_reference']:.2f}" in points
+    for _, rows in outcomes.groupby(["persona", "hurry"]):
+        share = 100 * rows["first"].mask(rows["both"], 0.5).mean()
+        assert any(f"{share:.2f}" in text for text in points)
     every = readings(outcomes)
     slope = 100 * fitted(every, "hurry", ("persona", "opponent"))["C(hurry)[T.yes]"]
     beside = page.locator("main").inner_text().replace("\N{NO-BREAK SPACE}", " ")
     assert f"The difference is +{slope:.2f} points" in beside
+    assert "yes: “You are late.”, to the driver under study" in beside
+    assert "the one that alone gets the words of persona or hurry, else the one named" in beside
+    assert "who was left and right equally often" in beside
+    first = outcomes[outcomes["hurry"] == "no"]
+    halves = first["first"].mask(first["both"], 0.5).sum()
+    assert f"no: {halves:g} of {len(first)}, where some count half" in beside
     assert "persona=taxi turns a 50 % chance of going first into 55 %, and 95 % into 96 %" in beside
     assert "chance of going first into 82 %, and 95 % into 99 %" in beside
     (shown,) = re.findall(r"(\d+) trials without a crash, (\d+) with one", beside)

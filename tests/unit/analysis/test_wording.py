@@ -120,43 +120,50 @@ NONE = "No language model drove here."
         (
             [OPEN_GAP, SHOWN_HEADWAY],
             [
-                "1 of 2 drivers let the one ahead go first, as people do. No verdict is possible "
-                "on crashes, who goes first side by side and the gap.",
+                "1 of 1 drivers with enough trials let the one ahead go first, as people do. "
+                "Cannot tell: the gap. No verdict on crashes and who goes first side by side.",
                 NONE,
             ],
         ),
         (
             [of_kind(PROGRAM, headway="unlike"), of_kind(PROGRAM, collisions="unlike")],
             [
-                "None of 2 drivers crash as often as people; none of 2 let the one ahead go "
-                "first, as people do. No verdict is possible on who goes first side by side and "
-                "the gap.",
+                "None of 1 drivers with enough trials crash as often as people; none of 1 with "
+                "enough trials let the one ahead go first, as people do. No verdict on who goes "
+                "first side by side and the gap.",
                 NONE,
             ],
         ),
         (
             [
-                of_kind(PROGRAM, headway=SHOWN, gap=OPEN),
+                {"headway": row("headway", kind=PROGRAM, from_humans="yes")}
+                | of_kind(PROGRAM, gap=OPEN),
                 of_kind(PROGRAM, headway=SHOWN, gap="unlike"),
                 {"collisions": row("collisions", n=11, kind=PROGRAM, counted="11 of 11")},
+                {"collisions": row("collisions", OPEN, n=21, kind=PROGRAM, counted="9 of 21")},
             ],
             [
-                "Of 3 programs d0 is most like people: it agrees with them in 1 of 4 measures, and "
-                "is shown to differ in none. Most crashes: d2 crashed in 11 of 11 trials.",
-                "2 of 3 drivers let the one ahead go first, as people do; none of 3 leave gaps "
-                "like people's. No verdict is possible on crashes and who goes first side by side. "
-                f"{NONE}",
+                "Of 4 programs d0 (it was made from the human data) is most like people: it agrees "
+                "with them in 1 of 4 measures, and is shown to differ in none. Most crashes: d3 "
+                "crashed in 9 of 21 trials.",
+                "2 of 2 drivers with enough trials let the one ahead go first, as people do; none "
+                "of 2 with enough trials leave gaps like people's. Cannot tell: crashes. No "
+                "verdict on who goes first side by side. Without a verdict: d2 crashed in 11 of 11 "
+                f"trials. {NONE}",
             ],
         ),
         (
-            [OPEN_GAP, {"headway": row("headway", n=19, kind="mock")}],
+            [{name: row(name, n=19, kind="mock")} for name in ("gap", "headway")],
             ["For 2 drivers no verdict on likeness to people is possible.", NONE],
         ),
         (
-            [of_kind(PROGRAM, gap=OPEN) | {"collisions": row("collisions", n=11, counted=counted)}
-             for counted in ("11 of 11", "2 of 10", "1 of 11", "0 of 9")],
-            ["For 4 drivers no verdict on likeness to people is possible.",
-             f"Crashes range from 0 of 9 trials (d3) to 11 of 11 trials (d0). {NONE}"],
+            [of_kind(PROGRAM, gap=OPEN)
+             | {"collisions": row("collisions", OPEN, n=n, counted=f"{k} of {n}")}
+             for k, n in ((21, 21), (2, 20), (1, 21), (0, 29), (9, 9))],
+            ["Cannot tell: crashes and the gap. No verdict on who goes first with one ahead and "
+             "who goes first side by side.",
+             "Crashes range from 0 of 29 trials (d3) to 21 of 21 trials (d0). Without a verdict: "
+             f"d4 crashed in 9 of 9 trials. {NONE}"],
         ),
     ],
 )  # fmt: skip
@@ -186,7 +193,7 @@ def test_two_drivers_are_told_apart_with_names_and_numbers():
 
 def test_a_crash_is_explained_by_the_rules_that_were_played():
     assert crash_text([("rectangle", [0.05, 0.2])]) == (
-        "the vehicles' outlines overlap, checked every 0.05 or 0.2 s"
+        "the vehicles' outlines overlap, checked every 0.05 or 0.2 s, by the driver"
     )
     both = crash_text([(rule, [0.2]) for rule in RULES_MEAN])
     assert " or, by the scenario of the trial, " in both
@@ -244,9 +251,14 @@ def test_several_drivers_are_told_together():
     few = {"gpt": driver(7, undecided=15), "o4": driver(2)}
     assert headline(few)[0] == f"{TOO_FEW}: gpt 7 of 22 and o4 2 of 2."
     both = {"a": WILD, "b": WILD}
-    crashed = "from people: a crashed in 24 of 110 trials, people in 28 of 990."
-    assert headline(both)[0] == f"All language models here differ {crashed}"
-    assert headline({**both, **few})[0] == f"a and b differ {crashed}"
+    crashed = "crashed in 24 of 110 trials, people in 28 of 990"
+    told = f"differ from people: a {crashed}; b {crashed}."
+    assert headline(both)[0] == f"Both language models here {told}"
+    assert headline({**both, **few})[0] == f"a and b {told}"
+    assert headline({**both, "o3": driver()})[0] == f"a and b {told}"
+    four = dict.fromkeys("abcd", WILD)
+    most = f"differ from people: most visibly a {crashed}; b {crashed}; c {crashed}."
+    assert headline(four)[0] == f"All 4 language models here {most}"
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,20 @@
 """What the first page says of drivers beside people, with the notes on their numbers."""
 
+from dataclasses import replace
+
 import pytest
 
 from merge_runner_analysis.web.judged import Driver, noted
 from merge_runner_analysis.web.marks import Cell
-from merge_runner_analysis.web.people import could_see, verdict_rules
-from merge_runner_analysis.wording import PROGRAM
+from merge_runner_analysis.web.next_steps import is_found, next_steps
+from merge_runner_analysis.web.people import (
+    could_see,
+    counted,
+    gap_weights,
+    likeness_of,
+    verdict_rules,
+)
+from merge_runner_analysis.wording import MEASURES, MOCK, OPEN, PROGRAM, SHOWN, WEAKER
 
 
 def driver(name, **verdicts):
@@ -14,7 +23,11 @@ def driver(name, **verdicts):
 
 
 def least(**by_measure):
-    return {name: {"detectable": size} for name, size in by_measure.items()}
+    """Verdicts with these detectable differences; without one, too few trials for a verdict."""
+    return {
+        name: {"detectable": size, "state": OPEN, "n": 110 if size else 11, "ended": 110}
+        for name, size in by_measure.items()
+    }
 
 
 @pytest.mark.parametrize(
@@ -37,6 +50,7 @@ def least(**by_measure):
             "3.00\xa0m in the gap; in crashes unknown, as another crash rule ended some trials",
         ),
         ([{"collisions": {"undecided": 4}}], ""),
+        ([{"gap": least(gap=3.0)["gap"] | {"n": 19, "ended": 19}}], ""),
     ],
 )
 def test_the_least_and_the_largest_detectable_differences_name_their_drivers(drivers, text):
@@ -73,3 +87,117 @@ def test_drivers_with_the_same_note_on_a_measure_share_it():
     assert noted(drivers, {"gap": "gap"}, {"gap": "not posed"}) == [
         (["a", "b", "c", "d"], "gap", "Not posed")
     ]
+
+
+NAMES = {"a": "a", "b": "b"}
+
+
+def played(*, trials, n, ended, human=(True, False)):
+    """A driver with n of its trials counted, and how many ended in two situations."""
+    crashes = {"state": OPEN, "n": n, "ended": n, "counted": f"0 of {n}"}
+    others = {name: {"state": SHOWN, "n": n, "ended": n} for name in ("headway", "velocity", "gap")}
+    of = replace(driver("a", collisions=crashes, **others), facts={"trials": trials})
+    cells = [{"ended": number} for number in ended]
+    humans = [{"ended": 90} if is_so else None for is_so in human]
+    return of, {"rows": [(of, cells)], "humans": humans}
+
+
+@pytest.mark.parametrize(
+    ("of", "says"),
+    [
+        (played(trials=20, n=20, ended=(10, 10), human=(True, True)), ""),
+        (
+            played(trials=20, n=3, ended=(10, 8)),
+            "3 counted: 7 repeat another one, 8 in situations that nobody drove, 2 did not end",
+        ),
+        (
+            played(trials=20, n=11, ended=(10, 10), human=(True, True)),
+            "11 counted: 9 repeat another one",
+        ),
+    ],
+)
+def test_trials_that_are_not_counted_have_a_reason(of, says):
+    assert counted(*of) == says
+
+
+def test_crashes_that_another_rule_ended_are_given_by_peoples_rule_first():
+    values = {"measure": "collisions", "state": OPEN, "n": 98, "k": 2, "undecided": 12, "row": "a",
+              "ended": 110, "counted": "14 of 110", "counted_by": "the paper's rule"}  # fmt: skip
+    cell = Cell(MEASURES["collisions"], values, None, "", "", "", "")
+    shown = likeness_of(replace(driver("a"), cells={"collisions": cell}))["collisions"]
+    assert shown.by_people.replace("\xa0", " ") == (
+        "2 to 14 of 110, 1.82 to 12.73 % by people's rule"
+    )
+    assert (shown.k, shown.n, shown.text.replace("\xa0", " ")) == (
+        14,
+        110,
+        "12.73 % by the rule played here: the vehicles' centres are closer than a vehicle length",
+    )
+
+
+def test_people_s_gap_is_given_as_each_driver_is_compared_with_it():
+    of = [driver(name, gap={"state": OPEN, "n": 30, "human": gap}) for name, gap in
+          (("a", 3.851), ("b", 3.869))]  # fmt: skip
+    assert gap_weights(of, NAMES).replace("\xa0", " ") == (
+        "Each driver is compared with people's gap in the situations as it drove them, 3.85 to "
+        "3.87 m; the row of people has that of a"
+    )
+    assert gap_weights(of[:1], NAMES) == ""
+
+
+def test_every_mark_has_its_rule():
+    rules = verdict_rules([driver("a", gap={"p_holm": 0.5})], {"ci": (2.0, 4.0)})
+    assert [rule.split()[0] for rule in rules] == ["●", "●", "▲", "○"]
+    assert "▼ fewer, less or smaller, ✕ unlike" in rules[2]
+    assert rules[0].endswith("people's is known only to ± 1.00 m, by nine pairs")
+
+
+TYPED = ["sweep", "s.toml", "--model", "emulator", "--yes"]
+
+
+@pytest.mark.parametrize(
+    ("of", "kind", "typed", "steps"),
+    [
+        (
+            played(trials=10, n=10, ended=(10, 0)),
+            MOCK,
+            TYPED,
+            [
+                ("This was a rehearsal", "m sweep s.toml --yes --model MODEL --dry-run"),
+                ("a: fewer than 20 counted", "m sweep s.toml --yes --reps N"),
+            ],
+        ),
+        (
+            played(trials=110, n=11, ended=(110, 0)),
+            PROGRAM,
+            TYPED,
+            [("a: fewer than 20 different trials", "")],
+        ),
+        (
+            played(trials=110, n=110, ended=(110, 0)),
+            PROGRAM,
+            [],
+            [("Likeness to people cannot be told", "m sweep STUDY --reps N")],
+        ),
+        (played(trials=110, n=110, ended=(110, 0)), MOCK, [], [("This was", "m sweep STUDY --mo")]),
+    ],
+)
+def test_the_next_steps_follow_from_the_result(of, kind, typed, steps):
+    a, conditions = of
+    a = replace(a, kind=kind)
+    conditions = conditions | {"rows": [(a, conditions["rows"][0][1])]}
+    given = next_steps("m", typed, [a], NAMES, conditions, None)
+    assert len(given) == len(steps)
+    for (text, command), (begins, run) in zip(given, steps, strict=True):
+        assert text.startswith(begins)
+        assert command.startswith(run)
+        assert bool(command) == bool(run)
+
+
+@pytest.mark.parametrize(
+    ("state", "kind", "is_so"),
+    [(WEAKER, PROGRAM, True), (WEAKER, MOCK, False), (OPEN, PROGRAM, False)],
+)
+def test_a_difference_from_people_is_found_where_no_mock_model_drove(state, kind, is_so):
+    values = {"measure": "headway", "state": state, "n": 110, "ended": 110}
+    assert is_found([replace(driver("a", headway=values), kind=kind)], None) is is_so

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from merge_runner_analysis.tables.model import Column, Row, Table
 from merge_runner_analysis.web import effect_rows
 from merge_runner_analysis.web.question import UNREAD, answer_of, answered
-from merge_runner_analysis.wording import EGO, LEFT, PLANTED, SAME_TRIALS
+from merge_runner_analysis.wording import EGO, LEFT, PLANTED, SAME_TRIALS, WORDS
 
 GOES_FIRST, GAP, COST = "goes first (%)", "gap (m)", "cost (USD)"
 METRICS = {GOES_FIRST: "left_first_percent", "coll. (%)": "collided_percent", GAP: "gap_m",
@@ -189,12 +189,41 @@ def test_a_side_has_its_count_and_the_chart_the_axis_of_its_data():
     )
     (chart,) = made.charts
     assert chart.title == "By factor"
+    assert not made.adjusted
     assert [line.name for line in chart.lines] == ["no", "yes"]
     assert [point.shape for point in chart.lines[0].points] == ["dot", "square"]
     places = [tick[0] for tick in chart.ticks]
     for line in chart.lines:
         for point in line.points:
             assert min(places) <= point.ends[0] < point.x < point.ends[1] <= max(places)
+
+
+def test_the_chart_of_a_driver_has_the_values_and_the_interval_of_the_table():
+    rows = [effect(), effect(level="much", difference=42.0, estimate=94.0, estimate_reference=52.0)]
+    levels = [*levels_of("hurry"), *levels_of("hurry")[1:]]
+    levels[2] = replace(levels[2], id="more", values=levels[2].values | {"level": "much"})
+    made = answer(rows, levels)
+    assert made.adjusted
+    assert made.is_cut
+    points = [(point.shape, point.says) for line in made.charts[0].lines for point in line.points]
+    assert points == [
+        ("ring", "all drivers: 50.00"),
+        ("ring", "all drivers: 52.00"),
+        ("dot", "all drivers: 63.00 [56.00, 70.00]"),
+        ("dot", "all drivers: 94.00 [87.00, 101.00]"),
+    ]
+    assert not answer([effect()], levels_of("hurry")).is_cut
+
+
+def test_a_level_has_its_words_and_halves_are_counted():
+    levels = levels_of("hurry")
+    levels[0] = replace(
+        levels[0], values=levels[0].values | {"k": None, "n": 27, "value": 50 / 0.9}
+    )
+    made = answer([effect()], levels, f"{WORDS}hurry=yes: “Be late: go.”, to both drivers")
+    (change,) = made.changes
+    assert change.detail == "yes: “Be late: go.”, to both drivers"
+    assert (change.reference.k, change.reference.halves, change.reference.n) == (None, "15", 27)
 
 
 def test_levels_that_are_not_tested_are_not_drawn():

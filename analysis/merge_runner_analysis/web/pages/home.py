@@ -10,10 +10,12 @@ from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.effect_rows import MIDDLE
 from merge_runner_analysis.web.judged import Driver, by_condition, by_kind, humans_of, judged, noted
 from merge_runner_analysis.web.names import PLAYED, names_mean, opponents_text, short_names
+from merge_runner_analysis.web.next_steps import is_found, is_rehearsal, next_steps
 from merge_runner_analysis.web.people import (
     UNPOSED,
     could_see,
     counted,
+    gap_weights,
     likeness_of,
     people_of,
     verdict_rules,
@@ -22,9 +24,11 @@ from merge_runner_analysis.web.question import Answer, answer_of
 from merge_runner_analysis.web.runs import standing_of
 from merge_runner_analysis.web.scope import Bar, Scope, descriptions_of, scope_of, unmarked
 from merge_runner_analysis.web.site import Site, news_of
-from merge_runner_analysis.wording import HEADINGS, LANGUAGE_MODEL, MOCK, headline
+from merge_runner_analysis.wording import HEADINGS, LANGUAGE_MODEL, MOCK, PROGRAM, headline
 
 FACTOR_TABLES = ("effects", "levels")  # of what a study's factors change
+# Kinds of drivers whose identical trials count once.
+ONCE = {PROGRAM: "program", MOCK: "mock model"}
 Jobs = list[Job]
 
 
@@ -73,11 +77,15 @@ def _beside_people(
     return {
         "headline": headline(verdicts),
         "likeness": [
-            (driver, likeness_of(driver), counted(driver))
+            (driver, likeness_of(driver), counted(driver, conditions))
             for kind in by_kind(drivers).values()
             for driver in kind
         ],
         "verdict_rules": verdict_rules(drivers, gap.values if gap else {}),
+        "gap_weights": gap_weights(drivers, short),
+        "kinds_once": " or ".join(
+            f"a {text}" for kind, text in ONCE.items() if by_kind(drivers)[kind]
+        ),
         "is_undecided": is_undecided,
         "notes": noted(drivers, headings, unposed),
         "likeness_headings": HEADINGS,
@@ -110,6 +118,7 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
     short = short_names(names)
     # People's gap covers the situations in which the first driver finished.
     human = humans_of(values["table"], next(iter(shown), None))
+    typed = standing[0]["config"].get("typed") or () if standing else ()
     return site.render(
         "home.html",
         view="index",
@@ -122,14 +131,16 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         standing=standing,
         seen=seen,
         descriptions=descriptions_of(site),
-        is_rehearsal={driver.kind for driver in shown} == {MOCK},
+        is_rehearsal=is_rehearsal(shown),
         question=question,
         apart=apart,
+        steps=next_steps(site.program, typed, shown, short, conditions, question or apart),
+        found=is_found(shown, question or apart),
+        prompted=any(driver.kind != PROGRAM for driver in shown),
         asking=asking,
         middle=MIDDLE,
         linked=True,
         titles=dict(bar.prompts),
-        first=next(iter(names), ""),
         pair=names if len(names) == 2 and not apart else (),
         conditions=conditions,
     )

@@ -1,0 +1,99 @@
+"""Steps to take after a study, by its results: a sentence and a command for each."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from merge_runner_analysis.web.comparison import Comparison
+from merge_runner_analysis.web.judged import Driver
+from merge_runner_analysis.web.marks import Mark
+from merge_runner_analysis.web.people import repeated
+from merge_runner_analysis.web.question import Answer
+from merge_runner_analysis.wording import (
+    DIFFERS,
+    ENOUGH,
+    HEADINGS,
+    MOCK,
+    OPEN,
+    has_verdict,
+    joined,
+    shown_state,
+)
+
+REHEARSED = (
+    "This was a rehearsal: no conclusion rests on it. Run the study with a language model, first "
+    "with --dry-run, which estimates the cost"
+)
+REPEATED = (
+    f"{{}}: fewer than {ENOUGH} different trials, and more repetitions would be the same again. "
+    "Add situations, or another driver"
+)
+FEW = f"{{}}: fewer than {ENOUGH} counted trials. Add repetitions"
+UNSHOWN = "No effect is shown. Estimate how many trials one would need"
+UNCLEAR = "Likeness to people cannot be told in every measure. More trials narrow all but the gap"
+
+
+def next_steps(
+    program: str,
+    typed: Sequence[str],
+    drivers: Sequence[Driver],
+    short: Mapping[str, str],
+    conditions: Mapping[str, Any],
+    answers: Answer | Comparison | None,
+) -> list[tuple[str, str]]:
+    """Return sentences with commands; ``typed`` are the arguments of the newest run, if known."""
+    sweep = list(typed) or ["sweep", "STUDY"]
+
+    def again(*options: str) -> str:
+        return shlex.join([program, *sweep, *options])
+
+    steps = []
+    if is_rehearsal(drivers):
+        while "--model" in sweep:  # an option and its value
+            place = sweep.index("--model")
+            del sweep[place : place + 2]
+        steps.append((REHEARSED, again("--model", "MODEL", "--dry-run")))
+    judged = [driver for driver in drivers if driver.cells]
+    few = [of for of in judged if not has_verdict(of.cells["collisions"].values)]
+    same = [short[of.name] for of in few if repeated(of, conditions)[0]]
+    others = [short[of.name] for of in few if short[of.name] not in same]
+    if same:
+        steps.append((REPEATED.format(joined(same)), ""))
+    if others:
+        steps.append((FEW.format(joined(others)), again("--reps", "N")))
+    if isinstance(answers, Answer) and not _shown([row.mark for row in answers.changes]):
+        steps.append((UNSHOWN, shlex.join([program, "power", sweep[1]])))
+    states = [
+        shown_state(of.cells[name].values)
+        for of in judged
+        if of not in few
+        for name in HEADINGS
+        if name != "gap"
+    ]
+    if OPEN in states and not few and not is_rehearsal(drivers):
+        steps.append((UNCLEAR, again("--reps", "N")))
+    return steps
+
+
+def is_rehearsal(drivers: Sequence[Driver]) -> bool:
+    """Return whether mock models alone drove."""
+    return {driver.kind for driver in drivers} == {MOCK}
+
+
+def is_found(drivers: Sequence[Driver], answers: Answer | Comparison | None) -> bool:
+    """Return whether a difference is shown: of levels, of drivers, or from people."""
+    if is_rehearsal(drivers):
+        return False
+    if isinstance(answers, Answer):
+        return _shown([row.mark for row in (*answers.changes, *answers.others)])
+    if answers and _shown([row.mark for row in answers.rows]):
+        return True
+    return any(
+        shown_state(cell.values) in DIFFERS for driver in drivers for cell in driver.cells.values()
+    )
+
+
+def _shown(marks: Sequence[Mark | None]) -> bool:
+    return any(mark is not None and mark.shape == "like" for mark in marks)
