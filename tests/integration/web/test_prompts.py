@@ -90,7 +90,10 @@ def test_pairs_are_found_although_an_effect_is_planted_with_the_prompt(db):
     assert differing > 0
     with client_of(db) as client:
         page = Page(client.get("/prompts").text)
-        (to,) = [to for to, name in page.to("/discordant") if name == "emulator: hurry=yes"]
+        links = page.to("/discordant")
+        (to,) = [to for to, name in links if "variant=hurry%3Dyes" in to]
         text = Page(client.get(to).text).text
+    assert f"emulator: hurry=yes, {differing} of {pairs} pairs" in page.text
+    assert "emulator: persona=taxi, " not in page.text  # these ended as with the baseline
     assert "No driver was run with another prompt" not in page.text
     assert f"{differing} of {pairs} ended differently" in text
