@@ -25,7 +25,7 @@ from tests.support.studies import Said, changed, write_study, yielding
 WORST = "L_0_-8"
 COLUMNS = {
     "o3": ("estimate", "ci"),
-    "humans": ("human", "human_ci"),
+    "people": ("human", "human_ci"),
     "difference": ("difference", "difference_ci"),
     "80 % power from": ("detectable", ""),
 }
