@@ -75,10 +75,9 @@ class CallLabel:
 
 
 APART = (
-    "A ledger and a run's replies may cost different sums: the ledger has all that was paid for a "
-    "sweep, over all its runs and also for replies that no stored trial uses, and reserves the "
-    "worst case of attempts of unknown cost; the replies of a run may have been paid by another "
-    "sweep."
+    "A ledger has all that was paid for a sweep, also for replies that no stored trial uses, and "
+    "attempts of unknown cost at their worst case; a run has the cost of its trials' replies, "
+    "whoever paid."
 )
 """Explains why two sums differ that are shown side by side."""
 

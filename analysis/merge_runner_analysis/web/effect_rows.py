@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from math import floor, log10
 from typing import Any
 
@@ -76,8 +76,11 @@ def interval_text(row: Row) -> str:
     """Return ``[6.06, 19.60]``, or nothing."""
     if unit_of(row) == "USD":
         return brackets(interval_of(row), money)
-    ends = interval_of(row)
-    # An end that is not 0 does not read as 0.
+    return ends_text(interval_of(row))
+
+
+def ends_text(ends: Sequence[float] | None) -> str:
+    """Return ``[0.12, 3.40]``, or nothing; an end that is not 0 does not read as 0."""
     least = min((abs(end) for end in ends or () if end), default=1.0)
     decimals = min(max(DECIMALS, -floor(log10(2 * least))), MOST_DECIMALS)
     return brackets(ends, lambda end: number(end, decimals))

@@ -16,16 +16,24 @@ from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.scope import Bar, Scope, carried, unmarked
 from merge_runner_analysis.web.site import Site
 from merge_runner_analysis.wording import (
+    HEADINGS,
     HUMANS,
     LANGUAGE_MODEL,
+    MEASURES,
     MOCK,
+    OPEN,
     PROGRAM,
     TABLE,
+    VERDICTS,
+    Values,
     by_group,
     capital,
     crash_text,
     sentence,
+    shown_state,
 )
+
+CANNOT = capital(VERDICTS[OPEN])
 
 KINDS = {
     LANGUAGE_MODEL: ("Language models", ""),
@@ -123,13 +131,38 @@ def drivers_of(site: Site, table: Table | None, scope: Scope) -> list[Driver]:
                 prompt,
                 kind,
                 cells(verdicts, measures),
-                sentence(verdicts) if verdicts else "",
+                summary_of(verdicts, of, kind),
                 of,
                 spec["endpoint"] if spec else "",
                 ", ".join(parameters),
             )
         )
     return drivers
+
+
+def summary_of(verdicts: Mapping[str, Values], facts: Row | None, kind: str) -> str:
+    """Return a driver's sentences, with every open measure, and the number of trials that count."""
+    if not verdicts:
+        return ""
+    text = sentence(verdicts)
+    if "" in verdicts:
+        return text
+    others = {name: values for name, values in verdicts.items() if name not in HEADINGS}
+    unclear = [MEASURES[name].label for name, of in others.items() if shown_state(of) == OPEN]
+    if unclear:
+        begin = f"{text.removesuffix('.')}; " if CANNOT in text else f"{text} {CANNOT}: "
+        text = f"{begin}{'; '.join(unclear)}."
+    n = int(str(verdicts["collisions"].get("counted") or "0 of 0").split(" of ")[1])
+    if facts and n and n != facts["trials"]:
+        once = {
+            MOCK: ", equal ones of a mock model once",
+            PROGRAM: ", equal ones of a program once",
+        }
+        text += (
+            f" {n} of its {facts['trials']} trials count: those that ended, in situations that "
+            f"people drove{once.get(kind, '')}."
+        )
+    return text
 
 
 def _kind(facts: Row | None) -> str:

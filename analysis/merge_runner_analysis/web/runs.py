@@ -157,10 +157,9 @@ def assessment_of(run: Row) -> tuple[str, str]:
         if why := not_judged(run["driver"], row["invalid"], row["asked"]):
             return "doubtful", f"{text}; {why}."
         troubles = {"failed requests (retried)": row["faults"], "invalid replies": row["invalid"]}
-        if met := ", ".join(f"{name} {times:,}" for name, times in troubles.items() if times):
-            text += f"; on the way: {met}"
-        else:
-            text += ", and no problems were found"
+        met = ", ".join(f"{name} {times:,}" for name, times in troubles.items() if times)
+        fine = ", every request was answered, and every reply has a valid plan"
+        text += f"; on the way: {met}" if met else fine * bool(row["asked"])
         if others := row["others"]:
             return "doubtful", f"{text}; but another model gave {others} answers."
         return "finished", f"{text}."

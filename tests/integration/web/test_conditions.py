@@ -66,9 +66,9 @@ def test_the_picture_has_a_line_for_each_trial_of_a_driver_that_leads_to_it(
     said = Page(text).text
     assert f"{len(there)} trials of drivers are drawn." in said
     assert "N_0_0: the drivers' trials beside the people's band" in said
-    assert "3 human trials: their median" in said
+    assert "3 trials of people: their median" in said
     without = client.get("/conditions/L_4_0").text
-    assert "No human trial of this condition is here." in without
+    assert "No trial of people in this situation is here." in without
     assert "beside the people" not in without
     for address in ("nothing", "N_0_0?variant=A9"):
         assert client.get(f"/conditions/{address}").status_code == 404

@@ -71,6 +71,15 @@ def test_what_each_driver_is_told_is_shown_where_the_two_differ(db):
     assert f"{told} {words}" in both
 
 
+def test_a_drivers_page_names_the_mock_model_and_how_people_are_weighted(db):
+    with client_of(db) as client:
+        client.site.awaited(("table", "verdicts", "", ""))
+        page = Page(client.get("/drivers/emulator?variant=baseline").text).text
+    assert re.search(r"Requests answered \d+ by the mock model \(", page)
+    assert "weighted as the trials of emulator" in page
+    assert "are not mirrored here" not in page  # no ego drove on the right
+
+
 def test_each_trial_says_which_driver_was_told_which_words(db):
     named = "SELECT trial_id, spec_hash FROM trials WHERE variant = 'persona=taxi hurry=yes'"
     columns, rows = query(db, named)
@@ -90,7 +99,10 @@ def test_pairs_are_found_although_an_effect_is_planted_with_the_prompt(db):
     assert differing > 0
     with client_of(db) as client:
         page = Page(client.get("/prompts").text)
-        (to,) = [to for to, name in page.to("/discordant") if name == "emulator: hurry=yes"]
+        links = page.to("/discordant")
+        (to,) = [to for to, name in links if "variant=hurry%3Dyes" in to]
         text = Page(client.get(to).text).text
+    assert f"emulator: hurry=yes, {differing} of {pairs} pairs" in page.text
+    assert "emulator: persona=taxi, " not in page.text  # these ended as with the baseline
     assert "No driver was run with another prompt" not in page.text
     assert f"{differing} of {pairs} ended differently" in text

@@ -122,6 +122,7 @@ def test_where_sides_are_counterbalanced_who_goes_first_is_said_of_the_ego(db):
     said = Page(driver).text
     for side, k, n in (left, right):
         assert f"Ego on the {side} goes first {k} of {n}" in said
+    assert "trials with the ego on the right are not mirrored here" in said
     (_, left_k, left_n), (_, right_k, right_n) = left, right
     assert f"{left_k + right_k} of {left_n + right_n} " in Page(condition).text
 

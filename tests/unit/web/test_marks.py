@@ -3,6 +3,7 @@
 import pytest
 
 from merge_runner_analysis.tables.model import Row, Table
+from merge_runner_analysis.web.effect_rows import ends_text
 from merge_runner_analysis.web.marks import cells, measures_of
 from merge_runner_analysis.web.pages.prompts import differences
 
@@ -17,6 +18,14 @@ def test_shares_of_crashes_that_differ_have_places_that_differ(crashed, places):
     marks = [cells(of, measures)["collisions"].mark for of in verdicts]
     assert [mark.at for mark in marks] == places
     assert not any(mark.arrow for mark in marks)
+
+
+@pytest.mark.parametrize(
+    ("ends", "text"),
+    [((-0.306, 0.003), "[−0.306, 0.003]"), ((-0.31, 0.0), "[−0.31, 0.00]"), (None, "")],
+)
+def test_an_end_beside_0_shows_its_side(ends, text):
+    assert ends_text(ends) == text
 
 
 @pytest.mark.parametrize(("p", "shape"), [(0.04, "like"), (0.05, "open"), (None, "open")])

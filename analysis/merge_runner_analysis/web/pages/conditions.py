@@ -23,7 +23,7 @@ CROSS = "m-5-5 10 10m0-10-10 10"
 PANELS = {
     "first_mps": "Speed of the vehicle that merged first (m/s)",
     "second_mps": "Speed of the second one (m/s)",
-    "headway_m": "Headway: how far the first is ahead (m)",
+    "headway_m": "How far the first is ahead (m)",
 }
 # Both vehicles of the trials $1 with the specs $2 at the sample under control that is nearest to
 # every 0.2 s, which is the step of most drivers, and at the last one. Where nobody merged first,

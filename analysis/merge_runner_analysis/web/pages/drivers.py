@@ -12,7 +12,7 @@ from merge_runner_analysis.tables.model import Row as TableRow
 from merge_runner_analysis.web.comparison import compared
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.display_text import with_minus
-from merge_runner_analysis.web.effect_rows import MIDDLE
+from merge_runner_analysis.web.effect_rows import MIDDLE, ends_text
 from merge_runner_analysis.web.judged import (
     by_condition,
     by_kind,
@@ -27,7 +27,7 @@ from merge_runner_analysis.wording import MEASURES
 
 # Outcomes and served models of the attempts of a driver's trials with a prompt.
 ATTEMPTS = """
-SELECT model_served AS served, outcome, count(*) AS times
+SELECT model_served AS served, scripted, outcome, count(*) AS times
 FROM calls SEMI JOIN (FROM listed WHERE model = ? AND variant = ?) USING (trial_id, spec_hash)
 GROUP BY ALL ORDER BY ALL
 """
@@ -77,6 +77,7 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         compared=job if is_awaited else None,
         apart=apart,
         linked=True,
+        ends_text=ends_text,
         middle=MIDDLE,
         others=[(other, other) for other in by_name if other != name],
         **values | {"human": humans_of(values["table"], driver)},
@@ -122,8 +123,9 @@ def _first(site: Site, driver: str, scope: Scope) -> tuple[Job | None, str]:
         is_compared = row.groups[0] in {f"{driver}/{scope.prompt}", HUMAN}
         if table and is_compared and row.values.get("slope_ci"):
             of = printed(table, row)
+            name = "People" if row.groups[0] == HUMAN else driver
             sentences.append(
-                f"{of['driver']}: {of['brake_percent']} % brake, {of['hold_percent']} % hold, "
+                f"{name}: {of['brake_percent']} % brake, {of['hold_percent']} % hold, "
                 f"{of['go_percent']} % speed up, of {of['n']}. Per m/s that they are faster, they "
                 f"{_harder(row)}."
             )

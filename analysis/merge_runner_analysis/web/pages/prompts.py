@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -18,6 +18,7 @@ from merge_runner_analysis.tables.model import Table
 from merge_runner_analysis.web.effect_rows import MIDDLE, difference_mark, ends_of, metric_of
 from merge_runner_analysis.web.judged import Driver, judged
 from merge_runner_analysis.web.phrases import UNKNOWN, block_meaning
+from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.scope import scope_of, unmarked
 from merge_runner_analysis.web.site import NotThere, Site
 from merge_runner_analysis.web.trial.prompt_parts import Part, digests_of, level_of, parts_of
@@ -78,6 +79,12 @@ def prompts_page(site: Site, asked: Mapping[str, str]) -> str:
         if unmarked(driver.name) in chosen:
             driven.setdefault(driver.name, []).append(driver)
     drivers, ends = differences(contrasts, chosen) if contrasts else ({}, {})
+    # Those that were played with several prompts, the baseline first.
+    kinds = {
+        name: sorted(prompts, key=lambda driver: driver.prompt != BASELINE)
+        for name, prompts in sorted(driven.items())
+        if len(prompts) > 1
+    }
     return site.render(
         "prompts.html",
         view="prompts",
@@ -90,15 +97,21 @@ def prompts_page(site: Site, asked: Mapping[str, str]) -> str:
         ends=ends,
         middle=MIDDLE,
         collisions=COLLISIONS.name,
-        baseline=BASELINE,
         reworded=any(driver.prompt != BASELINE for played in driven.values() for driver in played),
-        # Those that were played with several prompts, the baseline first.
-        kinds={
-            name: sorted(prompts, key=lambda driver: driver.prompt != BASELINE)
-            for name, prompts in sorted(driven.items())
-            if len(prompts) > 1
-        },
+        kinds=kinds,
+        otherwise=() if drivers else [*_ended_otherwise(site, kinds)],
     )
+
+
+def _ended_otherwise(
+    site: Site, kinds: Mapping[str, Sequence[Driver]]
+) -> Iterator[tuple[str, str, int, int]]:
+    """Yield drivers with prompts of which k of n trials ended otherwise than with the baseline."""
+    for name, (first, *others) in kinds.items():
+        for variant in others if first.prompt == BASELINE else ():
+            pairs, differing = pairs_of(site, name, variant.prompt)
+            if differing:
+                yield name, variant.prompt, len(differing), len(pairs)
 
 
 def _first_prompts(site: Site) -> dict[str, dict[str, list[Part]]]:
@@ -167,13 +180,18 @@ def _named(block: str) -> str:
     return block if meaning == UNKNOWN else f"{block}: {meaning}"
 
 
+def pairs_of(site: Site, driver: str, variant: str) -> tuple[list[Row], list[Row]]:
+    """Return a variant's pairs of trials with the baseline, and those that ended otherwise."""
+    pairs = site.catalogue.ask(PAIRS, WITHOUT_PROMPT, unmarked(driver), variant, BASELINE)
+    return pairs, [pair for pair in pairs if pair["outcome"] != pair["base_outcome"]]
+
+
 def discordant_page(site: Site, asked: Mapping[str, str]) -> str:
     """Return the pairs of trials that ended otherwise with a variant than with the baseline."""
     driver, variant = asked.get("model", ""), asked.get("variant", "")
     if not driver or not variant:
         raise NotThere("/discordant needs model=MODEL and variant=VARIANT")
-    pairs = site.catalogue.ask(PAIRS, WITHOUT_PROMPT, unmarked(driver), variant, BASELINE)
-    differing = [pair for pair in pairs if pair["outcome"] != pair["base_outcome"]]
+    pairs, differing = pairs_of(site, driver, variant)
     kinds = Counter((pair["base_outcome"], pair["outcome"]) for pair in differing)
     return site.render(
         "discordant.html",

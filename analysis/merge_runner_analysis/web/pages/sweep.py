@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from merge_runner.llm.ledger import APART
-from merge_runner_analysis.task import task_settings
+from merge_runner_analysis.task import RULE, task_settings
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.listing import MISSING
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.runs import duration, list_runs, numbers_of
 from merge_runner_analysis.web.scope import carried, scope_of
 from merge_runner_analysis.web.site import NothingNew, NotThere, Site, news_of
+from merge_runner_analysis.wording import PLAYED_RULES, RULES_MEAN
 
 CAUSES = """
 SELECT value AS cause, count(*) AS trials, sum(times)::BIGINT AS times
@@ -36,11 +37,11 @@ TRUST = [
          "an older plan was driven on, or none", {"validity": "fallbacks"}),
         ("missing decisions", "no_decision", "asked", "decisions asked",
          "a valid plan without the tactical decision that was asked for", {"cause": MISSING}),
-        ("failed requests (retried)", "faults", "attempts", "requests",
+        ("failed requests (retried)", "faults", "attempts", "requests, counted in each trial",
          "no answer came; a request is sent again, or its trial fails", {}),
-        ("wrong model", "others", "answers", "answers",
+        ("wrong model", "others", "answers", "answers, counted in each trial",
          "it is neither the one asked for nor a declared alias of it", {}),
-        ("reused replies", "shared", "replies", "replies",
+        ("reused replies", "shared", "replies", "replies, each counted once",
          "one reply decided in several trials, which are no separate samples there", {}),
     )
 ]  # fmt: skip
@@ -88,7 +89,7 @@ def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
         trust=TRUST,
         task=", ".join(
             dict.fromkeys(
-                setting
+                _in_words(setting)
                 for arm in run["config"].get("arms") or ()
                 for setting in task_settings(arm.get("scenario") or {})
             )
@@ -101,6 +102,12 @@ def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
         quiet=seen.startswith(f"{state}-"),
         heard=bool(seen),
     )
+
+
+def _in_words(setting: str) -> str:
+    """Return a setting of the driving task, the rule of crashes with its meaning."""
+    name, _, value = setting.partition(" = ")
+    return f"crashes by {PLAYED_RULES[value]} ({RULES_MEAN[value]})" if name == RULE else setting
 
 
 def audit_of(site: Site, runs: Sequence[Row]) -> Job | None:

@@ -33,8 +33,8 @@ from merge_runner_analysis.web.trial.sentences import (
 # Offers of a trial to compare with, and their rules.
 HUMAN, REPETITION = "nearest human", "next repetition"
 OFFERS = {
-    HUMAN: "the human trial of this condition, at such speeds, whose headway "
-    "stays closest to this one's until its first vehicle has merged (root mean square)",
+    HUMAN: "the human trial of this condition, at such speeds, in which the left "
+    "vehicle stays as far ahead as here until the first has merged (least root mean square)",
     REPETITION: "the next repetition with the same driver, prompt and condition",
 }
 REPLY = "select max_by(reply, attempt) as reply from calls where call_key = '{}'"

@@ -65,6 +65,7 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
         errors={row["number"]: causes_text(row["causes"]) for row in rows if row["causes"]},
         # A study's levels of words are among its factors.
         prompted=len({decomposed(row["variant"])[0] for row in rows if row["variant"]}) > 1,
+        paired=any(row["ego"] and row["model_left"] != row["model_right"] for row in rows),
         focal=any(row["focal"] for row in rows),
         factors={row["number"]: text for row in rows if (text := _factors(row))},
         scale=speed_range(rows),

@@ -160,12 +160,21 @@ def collision_class(course: Course, decisions: Decided) -> str:
 
 def judged_at(course: Course) -> int:
     """Return the last sample from which one driver alone avoids the collision, or the end."""
-    latest = -1
+    until, _, _ = last_escape(course)
+    return until
+
+
+def last_escape(course: Course) -> tuple[int, Side | None, float]:
+    """Return the last sample from which one driver alone avoids the collision: its side, action.
+
+    If there is none: the last sample, None and 0.
+    """
+    latest: tuple[int, Side | None, float] = -1, None, 0.0
     for side in SIDES:
         for action in (BRAKING, SPEEDING_UP):
-            later = course.last_chance(side, action, latest)
-            latest = latest if later is None else later
-    return course.last if latest < 0 else latest
+            later = course.last_chance(side, action, latest[0])
+            latest = latest if later is None else (later, side, action)
+    return latest if latest[1] else (course.last, None, 0.0)
 
 
 def _drove_no_plan_of_its_own(course: Course, decisions: Decided, side: Side) -> bool:
@@ -233,15 +242,16 @@ def account(course: Course, decisions: Decided, trial: Mapping[str, Any]) -> Acc
 
 
 def _collision(course: Course, name: str) -> str:
-    at = judged_at(course)
+    at, escaping, action = last_escape(course)
     changes = [course.change_mps(side, at) for side in SIDES]
     meaning = MEANINGS[name]
     if name == ONE_TOO_LITTLE and min(changes) > -ACTED_MPS:
         meaning = "One sped up, and nobody braked"
     left, right = (f"{abs(mps):.1f} m/s {'faster' if mps >= 0 else 'slower'}" for mps in changes)
-    when = f"{course.times_s[at]:.1f} s, when one driver alone could last have avoided it"
-    when += ", by braking or speeding up"
-    if at == course.last:
+    by = "braking" if action == BRAKING else "speeding up"
+    when = f"{course.times_s[at]:.1f} s, the last moment at which one driver alone could have "
+    when += f"avoided it (the {escaping} one, by {by} as hard as it can)"
+    if escaping is None:
         when = "the end; nobody alone could have avoided it"
     return (
         f"{meaning}. At {when}, the left vehicle was {left} and the right one {right} than "
@@ -250,13 +260,13 @@ def _collision(course: Course, name: str) -> str:
 
 
 def _avoidable(course: Course, side: Side, chance: int | None) -> str:
-    """Return a driver's last moment to avoid the collision, and the braking that it took."""
+    """Return a driver's last moment to avoid the collision by braking, and the braking needed."""
     if chance is None:
         return f"By braking alone the {side} driver could never have avoided it."
     done, _ = _braking(course, side, chance)
     return (
-        f"The {side} driver could still have avoided it at {course.times_s[chance]:.1f} s, by "
-        f"{done} from then on."
+        f"Until {course.times_s[chance]:.1f} s the {side} driver could have avoided it by {done} "
+        "from then on."
     )
 
 
@@ -295,3 +305,6 @@ def _marks(
         if chance is not None:
             _, text = _braking(course, side, chance)
             yield Mark(course.times_s[chance], side, "last chance", text)
+    until, escaping, action = last_escape(course) if chances else (0, None, 0.0)
+    if escaping and action == SPEEDING_UP:
+        yield Mark(course.times_s[until], escaping, "last chance", "last moment to speed up")

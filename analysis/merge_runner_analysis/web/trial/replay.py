@@ -75,7 +75,7 @@ def marks(row: Row, trial: Trial, account: Account | None) -> list[dict[str, Any
         if (reached_s := reaches_s(samples, TRACK.merge_point_m)) is not None
     ]
     if row["status"] == "collided":
-        moments.append((trial.end_s, "", "collision", "collision"))
+        moments.append((trial.end_s, "", "collision", "crash"))
     if account:
         moments += [(mark.time_s, mark.side, mark.kind, mark.text) for mark in account.marks]
     return [

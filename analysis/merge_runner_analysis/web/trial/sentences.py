@@ -34,11 +34,11 @@ def judged_text(scenario: ScenarioConfig) -> str:
     """Describe the outlines that the picture draws for the scenario's collision rule."""
     length = f"{scenario.vehicle_length_m:g} m"
     drawn = {
-        "euclid2d": f"circles of {length}, a vehicle's length, about the centres",
+        "euclid2d": f"circles {length} across, a vehicle's length, about the centres",
         "shared_lane": f"bars of {length} along the road, once a vehicle is past the merge point",
         "rectangle": f"outlines of {length} by {scenario.vehicle_width_m:g} m",
     }[scenario.collision_rule]
-    return f"{drawn}: it is a collision where they overlap"
+    return f"{drawn}: it is a crash where they overlap"
 
 
 def facts(row: Row) -> list[str]:

@@ -1,8 +1,12 @@
 "use strict";
 // The clock: it plays, stops and is set, and whatever shows the moment is told.
 replay.clock = (scene, { show, settled }) => {
-  const { at, sampled, minus } = replay;
+  const { at, sampled } = replay;
   const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
+  const toMerge = (x) => {
+    const left = scene.trial.track.merge - x;
+    return `${Math.abs(left).toFixed(1)} m ${left < 0 ? "past" : "to"} the merge point`;
+  };
   let last = 0;
   const tell = () => {
     const now = `${scene.now.toFixed(1)} s`;
@@ -13,9 +17,12 @@ replay.clock = (scene, { show, settled }) => {
     const sides = Object.entries(scene.trial.sides);
     const places = sides.map(([, { t, x }]) => sampled(t, x, scene.now));
     const said = sides.map(
-      ([side, { t, v }], i) => `${side} ${sampled(t, v, scene.now).toFixed(1)} m/s at ${places[i].toFixed(1)} m`,
+      ([side, { t, v }], i) => `${side} ${sampled(t, v, scene.now).toFixed(1)} m/s, ${toMerge(places[i])}`,
     );
-    if (sides.length > 1) said.push(`headway ${minus((places[0] - places[1]).toFixed(1))} m`);
+    if (sides.length > 1) {
+      const [left, right] = places;
+      said.push(`${left < right ? "right" : "left"} ${Math.abs(left - right).toFixed(1)} m ahead`);
+    }
     at("now").textContent = said.join("; ");
     show();
   };

@@ -57,7 +57,7 @@ replay.track = (track, scene) => {
   const crash = draw("g", { class: "crash" });
   if (trial.status === "collided") {
     const [[x, y], end] = SIDES.map((side) => place(side, trial.sides[side].x.at(-1)));
-    crash.append(svg("polyline", { points: `${x},${y} ${end}` }), svg("text", { x, y: 13.5 }, "✸ collision"));
+    crash.append(svg("polyline", { points: `${x},${y} ${end}` }), svg("text", { x, y: 13.5 }, "✸ crash"));
   }
   return {
     lay: (other) => build("ghost", other),
