@@ -114,7 +114,9 @@ def _correction(study: StudyResults, effects: Sequence[Effect]) -> str:
     tested = [effect for effect in effects if effect.difference.p is not None]
     of_primary, others = _families(tested)
     alone = f"; {_primary_name(study)}, the primary measure, is tested by itself"
-    return f"Corrected for {others} tests (Holm){_uncounted(tested)}{alone * bool(of_primary)}."
+    return (
+        f"Corrected for {len(others)} tests (Holm){_uncounted(tested)}{alone * bool(of_primary)}."
+    )
 
 
 def _uncounted(tested: Sequence[Effect]) -> str:
@@ -253,7 +255,9 @@ def _notes(study: StudyResults, by: str) -> Iterator[str]:
         first = (
             f"the {len(of_primary)} test{'s' * (len(of_primary) != 1)} of “{_primary_name(study)}”"
         )
-        rest = f"the {others} other tests of the table effects{_uncounted(corrected)}"
+        crossed = sum(effect.across is not None for effect in others)
+        rest = f"the {len(others)} other tests of the table effects"
+        rest += f", {crossed} of them of interactions" * bool(crossed) + _uncounted(corrected)
         names = f" by {joined([*dict.fromkeys(of_primary)])}" if of_primary else ""
         yield f"{CORRECTED} {first}{names}, and apart from them for {rest}"
         yield "detectable: found at p < .05, before correction, with power .8"
@@ -271,11 +275,11 @@ def _notes(study: StudyResults, by: str) -> Iterator[str]:
     yield RULES_NOTE
 
 
-def _families(tested: Sequence[Effect]) -> tuple[list[str], int]:
-    """Return the factors of the tests of the primary measure, and the number of the others."""
+def _families(tested: Sequence[Effect]) -> tuple[list[str], list[Effect]]:
+    """Return the factors of the tests of the primary measure, and the other effects."""
     counted = [effect for effect in tested if effect.varies]
     of_primary = [effect.factor for effect in counted if effect.primary]
-    return of_primary, len(counted) - len(of_primary)
+    return of_primary, [effect for effect in counted if not effect.primary]
 
 
 def _words(study: StudyResults) -> Iterator[str]:

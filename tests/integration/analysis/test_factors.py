@@ -208,7 +208,14 @@ def test_an_interaction_is_the_difference_of_the_differences_in_shared_cells(tmp
     low, high = found["difference_ci"]
     assert low < found["difference"] < high
     assert (found["p"] < 0.05) == (low > 0 or high < 0)
-    row = values_of(StudyResults(moody.db), "effects")["mood=late/prompt=A1/interaction/gap_m"]
+    effects = made(StudyResults(moody.db), "effects")
+    (note,) = notes_with(effects, "p is corrected")
+    # Of 13 others the 4 of crashes and both changing their speed vary nowhere, as 3 interactions.
+    assert note.endswith(
+        "for the 6 other tests of the table effects, 2 of them of interactions, without those in "
+        "which nothing varies within a situation"
+    )
+    row = by_id(effects)["mood=late/prompt=A1/interaction/gap_m"].values
     assert (row["level"], row["n"]) == ("A1 × late", 6)
     assert (row["reference"], row["n_reference"]) == ("baseline × early", 3)
     # By the other factor it is the same.

@@ -148,7 +148,7 @@ def test_people_s_gap_is_given_as_each_driver_is_compared_with_it():
 def test_every_mark_has_its_rule():
     rules = verdict_rules([driver("a", gap={"p_holm": 0.5})], {"ci": (2.0, 4.0)})
     assert [rule.split()[0] for rule in rules] == ["●", "●", "▲", "○"]
-    assert "▼ fewer, less or smaller, ✕ unlike" in rules[2]
+    assert "▼ fewer, less, smaller or depends less, ✕ unlike" in rules[2]
     assert rules[0].endswith("people's is known only to ± 1.00 m, by nine pairs")
 
 
