@@ -214,7 +214,8 @@ def test_time_moves_by_play_scrub_keys_and_charts_and_ends_at_a_collision(page):
     assert clock(page) == pytest.approx(4.5, abs=0.2)
     page.get_by_role("button", name="left merges").click()
     told = page.locator("#now").inner_text()
-    assert float(re.search(r"left \S+ m/s at (\S+) m", told)[1]) == pytest.approx(100, abs=0.1)
+    shown = r"left \S+ m/s, (\S+) m (?:to|past) the merge point; right .*; left \S+ m ahead"
+    assert float(re.search(shown, told)[1]) == pytest.approx(0, abs=0.1)
     expect(page.locator("#next-trial")).to_be_hidden()  # no list led here
     page.goto(f"/trials/{COLLIDED}?t=2")
     expect(page.locator("#lines .collision")).to_have_count(1)

@@ -167,8 +167,8 @@ def test_odd_rows_cost_no_other_row_its_page_and_levels_of_a_study_filter_the_li
     trial = client.get("/trials/cheap+sleepy/baseline/N_0_0/rep01/temperature=0.2").text
     assert "opponent=sleepy, temperature=0.2." in Page(trial).text
     listed = Page(client.get("/trials?factor.temperature=0.2&factor.opponent=sleepy").text).text
-    assert "column driver has the ego, the driver under study, first" in listed
-    assert "has the ego" not in Page(client.get("/trials?model=idm").text).text
+    assert "of drivers A+B, A is the ego, on either side" in listed
+    assert "A+B" not in Page(client.get("/trials?model=idm").text).text
     assert ("6 trials" in listed, "1.0 (6)" in listed) == (True, True)
     assert "0 trials" in Page(client.get("/trials?factor.mood=good").text).text
     rows = client.get("/trials.csv?factor.temperature=0.2").text.splitlines()
