@@ -245,6 +245,6 @@ class LlmClient:
         self.calls.answered.add(key)  # before others can find the reply in the cache
         kept = await reservation.book(attempt, partial(self.cache.keep, answered))
         if kept is not answered:  # an import has stored another reply first, which is used
-            return self.recorded.read(kept, call.earlier_attempts)
+            return self.recorded.read(kept, len(kept.attempts))
         text = outcome.reading.text
         return ChatReply(text, attempt.outcome, call.request, attempts, call.earlier_attempts)

@@ -116,9 +116,14 @@ class CacheFile:
         except FAILURES as exc:
             raise UsageError(f"the cache {folder} cannot be used: {exc}. {NEW_CACHE}") from exc
 
-    def rows(self, sql: str, *values: object) -> Rows:
-        """Return the rows of a query; raise CacheFailed, or RecordingError for invalid text."""
+    def rows(self, sql: str, *values: object, execute: Execute | None = None) -> Rows:
+        """Return the rows of a query, or by ``execute`` those that its transaction sees.
+
+        Raises CacheFailed, or RecordingError for invalid text.
+        """
         try:
+            if execute is not None:
+                return execute(sql, values).fetchall()
             with self._one_query:
                 return self.reading.execute(sql, values).fetchall()
         except FAILURES as exc:
@@ -263,7 +268,8 @@ class CallStore(CacheFile):
         text = _checksum(content) + content
         if not execute(_ADD, (key, text)).rowcount:
             try:
-                return self._entry(key) or entry
+                (row,) = self.rows(_GET, key, execute=execute)  # it may be of this transaction
+                return verified(key, text_of(*row))
             except RecordingError:
                 self._quarantine_row(key, execute)
                 execute(_ADD, (key, text))

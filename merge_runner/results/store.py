@@ -147,10 +147,10 @@ class Store:
         specs: Mapping[str, str] | None = None,
         *,
         patience_s: float = PATIENCE_S,
-    ) -> dict[str, list[str]]:
+    ) -> dict[TrialKey, list[str]]:
         """Store whole trials, replacing failed ones; compare those that are already stored.
 
-        They are linked to a sweep unless ``sweep_id`` is None. Returns the ids of trials that are
+        They are linked to a sweep unless ``sweep_id`` is None. Returns the keys of trials that are
         stored with other values, with the differing columns.
         """
         # Before the lock is taken, although trials that are already stored need no rows.
@@ -171,14 +171,14 @@ class Store:
     def add_recorded(
         self, records: Sequence[TrialRecord], specs: Mapping[str, str]
     ) -> tuple[int, int, list[str]]:
-        """Store recorded trials without a sweep; trials that are already stored do not change.
+        """Store recorded trials without a sweep, as ``write`` does: only failed ones are replaced.
 
         Returns the number added, the number already stored, and the ids of trials that are stored
         with other values.
         """
         keys = {record.spec.key: record.spec for record in records}
         added = len(keys.keys() - self.ended_trials(keys))
-        differing = list(self.write(None, records, specs))
+        differing = [trial_id for trial_id, _ in self.write(None, records, specs)]
         return added, len(records) - added - len(differing), differing
 
 
@@ -290,10 +290,10 @@ def _ended(connection: duckdb.DuckDBPyConnection, keys: Sequence[TrialKey]) -> d
 def _add_trials(
     connection: duckdb.DuckDBPyConnection,
     played: Sequence[tuple[TrialKey, str, dict[str, list[Row]]]],
-) -> dict[str, list[str]]:
+) -> dict[TrialKey, list[str]]:
     """Store whole trials, replacing failed ones; compare those that are already stored.
 
-    Returns the ids of trials that are stored with other values, with the differing columns.
+    Returns the keys of trials that are stored with other values, with the differing columns.
     """
     stored = _ended(connection, [key for key, *_ in played])
     new: dict[TrialKey, dict[str, list[Row]]] = {}
@@ -303,21 +303,22 @@ def _add_trials(
             new[key] = rows
         elif status != "failed":
             again[key] = rows
-    for table in KEY_COLUMNS:
+    # Factor levels are no results: another study may have others for the same trial.
+    results = [table for table in KEY_COLUMNS if table != FACTOR_TABLE]
+    for table in results:
         for key in new.keys() & stored.keys():
             connection.execute(
                 f"DELETE FROM {table} WHERE trial_id = ? AND spec_hash = ?",  # noqa: S608 # constants
                 key,
             )
         append(connection, table, chain.from_iterable(rows[table] for rows in new.values()))
-    differing: dict[str, list[str]] = {}
-    if not again:
-        return differing
-    _add_factors(connection, [row for rows in again.values() for row in rows[FACTOR_TABLE]])
-    # Factor levels are no results: another study may have others for the same trial.
-    for table in [table for table in KEY_COLUMNS if table != FACTOR_TABLE]:
+    for played_rows in (new, again):
+        levels = [row for rows in played_rows.values() for row in rows[FACTOR_TABLE]]
+        _add_factors(connection, levels)
+    differing: dict[TrialKey, list[str]] = {}
+    for table in results if again else ():
         stored_trials = stored_rows(connection, table, list(again))
         for key, rows in again.items():
             for difference in stored_trials.differences(key, rows[table], ignored=RUN_COLUMNS):
-                differing.setdefault(key[0], []).append(difference.name)
+                differing.setdefault(key, []).append(difference.name)
     return differing

@@ -148,10 +148,10 @@ class LocalRunner:
     def _watch_for_outage(self, record: TrialRecord) -> None:
         """Stop when trials keep failing for one model that answers no call in between."""
         asked = self._trials.arms[record.spec.arm].asked
-        keys = {asked[call.side]: call.request.key for call in record.failed_calls}
-        for name, key in keys.items():  # trials may share a failed call: it counts once
+        for call in record.failed_calls:
+            name = asked[call.side]
             failed = self._failed[name, self.clients[name].meter.calls_live]
-            failed.add(key)
+            failed.add(call.request.key)  # trials may share a failed call: it counts once
             if len(failed) >= FAILURES_IN_A_ROW:
                 raise ProviderDown(
                     f"{len(failed)} different calls to {name} failed and none was answered in "

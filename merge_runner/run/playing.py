@@ -139,7 +139,7 @@ async def _store_rest(session: Session, flusher: Flusher, stopping: Stopping) ->
     session.fail_by(closing.exception())
     if flusher.differing:
         differing = [*flusher.differing.items()][:SHOWN]
-        shown = [f"{trial_id} ({', '.join(columns)})" for trial_id, columns in differing]
+        shown = [f"{trial_id} ({', '.join(columns)})" for (trial_id, _), columns in differing]
         session.fail(
             StoreError.exit_code,
             f"{len(flusher.differing)} trials are stored otherwise in {session.options.db}, "

@@ -12,6 +12,7 @@ from itertools import accumulate
 from pathlib import Path
 
 from merge_runner.errors import StoreError, StoreLocked
+from merge_runner.results.rows import TrialKey
 from merge_runner.results.store import Store
 from merge_runner.text_safety import one_line
 from merge_runner.trial_records import TrialRecord, TrialSpec
@@ -37,9 +38,9 @@ class Flusher:
 
     While storing fails, trials beyond a batch are dropped and others are played; where storing is
     merely slow, new trials wait for it. ``dropped`` trials can be played again from the recorded
-    replies; failed ones cannot, and stay in memory. ``differing`` maps trials that were already
-    stored with other values to the columns that differ. After an error that is no StoreError it is
-    ``broken``: it writes nothing more, and calls ``on_break`` once.
+    replies; failed ones cannot, and stay in memory. ``differing`` maps the keys of trials that were
+    already stored with other values to the columns that differ. After an error that is no
+    StoreError it is ``broken``: it writes nothing more, and calls ``on_break`` once.
     """
 
     def __init__(
@@ -49,7 +50,7 @@ class Flusher:
         say: Callable[[str], None],
         batch_bytes: int = BATCH_BYTES,
     ) -> None:
-        self.differing: dict[str, list[str]] = {}
+        self.differing: dict[TrialKey, list[str]] = {}
         self.dropped: list[TrialSpec] = []
         self.broken = False
         self.on_break: Callable[[], object] = lambda: None

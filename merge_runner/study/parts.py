@@ -84,8 +84,8 @@ def load_study(
 def _require_consent(study: StudySource, models: Iterable[str], *, trust: bool) -> None:
     """Ask for consent to the study's code and to the servers that get keys, once per content.
 
-    Consent is stored in the user's state folder, where no study can write. ``trust`` gives consent.
-    Raises UsageError without consent, and without a terminal.
+    Consent is stored in the user's state folder, where no study can write. ``trust`` gives it, and
+    goes on where it cannot be stored. Raises UsageError without consent, and without a terminal.
     """
     risks, code = [*_endpoints(study.path.parent, models)], study.plugins
     # The unedited plug-in of ``init`` is our own code.
@@ -101,13 +101,15 @@ def _require_consent(study: StudySource, models: Iterable[str], *, trust: bool) 
     try:
         for line in record.read_text("utf-8", "replace").splitlines() if record.exists() else ():
             by_digest.pop(line.partition(" ")[0], None)
-        if by_digest and not trust:
+        if not by_digest:
+            return
+        if not trust:
             _ask(study, by_digest.values())
         record.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with record.open("a", encoding="utf-8") as file:
             file.writelines(f"{n} {one_line(str(path))}\n" for n, (path, _) in by_digest.items())
     except OSError as exc:
-        if not trust:  # --trust needs no record
+        if not trust:
             raise UsageError(
                 f"the agreement cannot be stored in {record}: {exc.strerror}; name another folder "
                 "with XDG_STATE_HOME, or add --trust"
@@ -240,8 +242,8 @@ class _Source(InspectLoader):
 def _run_plugins(sources: Mapping[str, str]) -> None:
     """Run plug-ins, given by file name and source, as the modules of one package.
 
-    They import from each other by ``from .other import thing``. The package's name has a hash of
-    the sources, so that studies do not share modules.
+    They run in this order: each imports from those before it by ``from .other import thing``. The
+    package's name has a hash of the sources, so that studies do not share modules.
     """
     digest = hashlib.sha256(canonical_json([*sources.items()]).encode()).hexdigest()
     package = f"{STUDY_PLUGINS}_{digest[:16]}"

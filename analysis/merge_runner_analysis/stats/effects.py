@@ -301,7 +301,7 @@ def _compare(level: Columns, reference: Columns, metric: Metric) -> Comparison:
         return medians, Estimate(medians[0] - medians[1])
     if metric.rate and (cells := contrasts.shared_cells(level, reference, "value")):
         first, second = cells.rates
-        return (100 * first, 100 * second), contrasts.contrast_rates(cells).times(100)
+        return (100 * first, 100 * second), contrasts.contrast_rates(cells).in_percent()
     means = contrasts.means_within(level, reference, "value")
     return means, contrasts.contrast_means(level, reference, "value")
 
@@ -314,7 +314,7 @@ def _interaction(frames: Sequence[Columns], metric: Metric) -> Estimate | None:
         others = contrasts.shared_cells(twin, base, "value")
         if cells is None or others is None:
             return None
-        return contrasts.difference_of_contrasts(cells, others).times(100)
+        return contrasts.difference_of_contrasts(cells, others).in_percent()
     mean = contrasts.contrast_means(level, reference, "value")
     other = contrasts.contrast_means(twin, base, "value")
     return difference(mean, other) if mean and other else None

@@ -44,8 +44,16 @@ class Estimate:
             return None
         return self.low, self.high
 
-    def times(self, factor: float) -> Estimate:
-        """Return the same in another unit, as a share in percent; not its weight or its trials."""
+    def in_percent(self) -> Estimate:
+        """Return the same share in percent; its weight and its trials stay as they are."""
         ends = (self.value, self.low, self.high, self.se, self.detectable)
-        value, low, high, se, least = (None if end is None else factor * end for end in ends)
-        return replace(self, value=value, low=low, high=high, se=se, detectable=least)
+        value, low, high, se, least = (None if end is None else 100 * end for end in ends)
+        scaled = replace(self, value=value, low=low, high=high, se=se, detectable=least)
+        if (ends_at := self.ends_at) is None:
+            return scaled
+
+        def percent_at(level: float) -> tuple[float, float] | None:
+            bounds = ends_at(level)
+            return bounds and (100 * bounds[0], 100 * bounds[1])
+
+        return replace(scaled, ends_at=percent_at)

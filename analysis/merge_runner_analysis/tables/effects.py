@@ -245,7 +245,7 @@ def _notes(study: StudyResults, by: str) -> Iterator[str]:
     yield (
         "levels are compared within the cells that both have, a condition with one level of each "
         "other factor: shares by the test of Mantel and Haenszel with the score interval that "
-        "agrees with it, means by Welch's test in a model with a level for each cell. an "
+        "agrees with it, means by Welch's test in a model with a level for each cell. An "
         "interaction (×) is the difference of a level minus that at the reference of the other "
         "factor, in the cells that all four have"
     )
@@ -297,8 +297,9 @@ def _words(study: StudyResults) -> Iterator[str]:
 
 def _planted(study: StudyResults) -> list[str]:
     """Return the effects of words that a study plants in the mock models that drove."""
+    texts = texts_of(study) if any(group.scripted for group in study.models) else {}
     planted = []
-    for factor, levels in texts_of(study).items() if any(g.scripted for g in study.models) else ():
+    for factor, levels in texts.items():
         for level, text in levels.items():
             if more := text.emulator.own_first:
                 even, sure = (100 / (1 + exp(-more) / odds) for odds in (1, 19))
@@ -308,7 +309,7 @@ def _planted(study: StudyResults) -> list[str]:
                 )
             if gap_m := text.emulator.gap_m:
                 planted.append(f"{factor}={level} adds {gap_m:g} m to the gap that drivers aim at")
-    if any("chance" in text for text in planted):
+    if any(text.emulator.own_first for levels in texts.values() for text in levels.values()):
         planted.append("little can change where a situation almost decides the order")
     return planted
 
@@ -431,7 +432,10 @@ def _same_as_reference(study: StudyResults) -> Iterator[str]:
 
 
 def balance(study: StudyResults, levels: list[Level]) -> str:
-    """Return whether all levels of a factor have the same cells."""
+    """Return a sentence on whether all levels of a factor have the same cells.
+
+    Some may have a mirrored cell only where who goes first is read from both sides.
+    """
     cells_of = {level.name: cells_seen(study, level) for level in levels}
     every = set().union(*cells_of.values())
     lacking = [
@@ -441,4 +445,11 @@ def balance(study: StudyResults, levels: list[Level]) -> str:
     ]
     if lacking:
         return f"not balanced, so that values over all trials are confounded: {'; '.join(lacking)}"
-    return f"every level has the same {len(every)} cells"
+    same = f"every level has the same {len(every)} cells"
+    played = set.intersection(*({*level.pooled.ended["cell"]} for level in levels))
+    if played == every:
+        return same
+    return (
+        f"{same} for who goes first, which is read from both sides of equal drivers, and "
+        f"{len(played)} for other measures"
+    )

@@ -1,6 +1,7 @@
 """The table of effects: two drivers, families, measures of plug-ins, and its views."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,13 +11,14 @@ from statsmodels.stats.multitest import multipletests
 from merge_runner.errors import UsageError
 from merge_runner.registry import Catalogue, using
 from merge_runner.run.plan import make_plan
-from merge_runner.study.file import MEASURES
+from merge_runner.study.file import MEASURES, StudyText
 from merge_runner_analysis.frames import load
 from merge_runner_analysis.metrics import COLLISIONS, LEFT_FIRST, METRICS
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.stats.effects import driver_effects, effects, primary
 from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables.effects import comparison
+from merge_runner_analysis.tables import effects as tables
 from tests.support.harness import FAST
 from tests.support.studies import changed, write_study, yielding
 from tests.support.tables import made, values_of
@@ -207,6 +209,26 @@ def test_the_one_in_a_hurry_is_compared_with_the_one_on_the_same_side(prepare, t
     assert (found.at_level.n, found.at_reference.n) == tuple(
         counts.groupby(counts.index.get_level_values(0) == "")["n"].sum()
     )
+
+
+def test_a_note_says_which_cells_only_who_goes_first_has(prepare, tmp_path):
+    conditions = HURRY.replace('"N_0_0", "L_4_0", "R_-4_0"', '"L_4_0"').replace("12", "2")
+    (tmp_path / "hurry.toml").write_text(conditions)
+    prepare(tmp_path, "sweep", "hurry.toml", "--db", "t.duckdb", *FAST, code=0)
+    study = StudyResults(tmp_path / "t.duckdb")
+    note = "every level has the same 2 cells for who goes first, which is read from both sides"
+    assert (
+        f"hurry: {note} of equal drivers, and 1 for other measures" in made(study, "effects").notes
+    )
+    found = {one.metric.name: one.at_level.n for one in effects(study)}
+    assert (found["left_first_percent"], found["collided_percent"]) == (4, 2)
+
+
+def test_a_planted_gap_is_no_chance_whatever_its_factor_is_named(monkeypatch):
+    study = SimpleNamespace(models=[SimpleNamespace(scripted=True)])
+    text = StudyText(remove=["C4"], emulator={"gap_m": 2})
+    monkeypatch.setattr(tables, "texts_of", lambda _: {"chance": {"high": text}})
+    assert tables._planted(study) == ["chance=high adds 2 m to the gap that drivers aim at"]
 
 
 def test_a_study_without_factors_says_so(tmp_path):

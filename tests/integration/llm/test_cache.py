@@ -186,6 +186,8 @@ async def test_a_kept_reply_is_never_replaced(cache, other):
     assert await keep(other, first) == first
     assert await keep(cache, second) == first
     assert cache.put_now([second, entry(2)]) == [first, entry(2)]
+    twice = [entry(3, reply=said(text)) for text in ("first", "second")]
+    assert cache.put_now(twice) == twice[:1] * 2
     assert cache.get(second.request.key) == first
 
 

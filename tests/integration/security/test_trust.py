@@ -1,9 +1,11 @@
 """A study's folder runs no code, and sends no key where its user did not send it, unasked."""
 
+import errno
 import os
 import re
 import shutil
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -167,6 +169,19 @@ def test_a_script_may_agree_where_nothing_can_be_kept_but_a_person_is_told(
     terminal("y")
     with pytest.raises(UsageError, match=r"the agreement cannot be stored in .*XDG_STATE_HOME"):
         load_study(study)
+
+
+def test_a_stored_agreement_is_read_where_nothing_can_be_written(state, study, monkeypatch):
+    load_study(study, trust=True)
+    opened = Path.open
+
+    def read_only(path, mode="r", *rest, **more):
+        if "a" in mode:
+            raise OSError(errno.EROFS, "Read-only file system")
+        return opened(path, mode, *rest, **more)
+
+    monkeypatch.setattr(Path, "open", read_only)
+    load_study(study)
 
 
 def test_the_study_of_init_is_its_users_own_until_its_code_is_edited(state, tmp_path):

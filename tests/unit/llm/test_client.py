@@ -93,6 +93,17 @@ async def test_who_finds_a_reply_that_was_just_stored_shares_it(make, monkeypatc
     assert (client.meter.calls_cached, client.meter.calls_shared) == (1, 1)
 
 
+async def test_a_reply_that_an_import_has_stored_first_is_no_attempt_of_this_run(make, cache):
+    client = make(answer("late"))
+    asked = await held(client)
+    request = client.recorded.request("prompt", slot())
+    imported = Attempt(1, "ok", 200, reply=answer("imported").body)
+    cache.put_now([CachedCall(request, (imported,))])
+    client.direct.transport.open.set()
+    reply = await asked
+    assert (reply.text, reply.cached_attempts, reply.cached) == ("imported", 1, True)
+
+
 async def test_a_call_whose_wait_for_money_times_out_is_no_call_that_was_given_up(
     make, monkeypatch
 ):

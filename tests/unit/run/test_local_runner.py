@@ -63,22 +63,24 @@ async def test_a_failed_call_leaves_the_other_one_its_answer(play, failing):
     assert [row.side for row in trial.decisions] == [side for side in SIDES if side != failing]
 
 
-@pytest.mark.parametrize("are_shared", [True, False])
-async def test_a_failed_call_that_trials_share_is_no_outage(are_shared):
+@pytest.mark.parametrize(
+    ("key", "trials"), [("shared", None), ("of {order}", 10), ("of {order}, {side}", 5)]
+)
+async def test_different_failed_calls_are_an_outage_and_none_that_trials_share(key, trials):
     class Failing(Client):
         async def ask(self, prompt, slot, *, order):
-            key = "shared" if are_shared else str(order)
-            raise CallFailed("HTTP 400", replace(REQUEST, key=key))
+            named = key.format(order=order, side=slot.side)
+            raise CallFailed("HTTP 400", replace(REQUEST, key=named))
 
     plan, failed = make_plan("baseline", "emulator", conditions=["N_0_0"], repetitions=12), []
     runner = LocalRunner(plan, {"emulator": Failing()}, 1)
     playing = runner.play(plan.trial_specs(), lambda _, trial: failed.append(trial.status))
-    if are_shared:
+    if trials is None:
         await playing
     else:
         with pytest.raises(ProviderDown, match="10 different calls to emulator failed"):
             await playing
-    assert failed == ["failed"] * (12 if are_shared else 10)
+    assert failed == ["failed"] * (trials or 12)
 
 
 async def test_a_trial_that_is_cancelled_takes_both_calls_with_it(play):

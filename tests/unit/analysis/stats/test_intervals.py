@@ -10,6 +10,7 @@ from statsmodels.stats.proportion import proportion_confint
 
 from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.intervals import (
+    at,
     detectable,
     difference,
     estimate,
@@ -64,8 +65,14 @@ def test_a_difference_of_means_is_welchs_t_test(seed):
     found, welch = difference(mean(one), mean(other)), stats.ttest_ind(one, other, equal_var=False)
     assert (found.p, found.freedom) == (pytest.approx(welch.pvalue), pytest.approx(welch.df))
     interval = welch.confidence_interval(0.95)
-    assert found.times(100).bounds() == pytest.approx((100 * interval.low, 100 * interval.high))
+    assert found.in_percent().bounds() == pytest.approx((100 * interval.low, 100 * interval.high))
     assert difference(mean([1.0, 1.0]), mean([2.0, 2.0])) is None
+
+
+def test_a_share_in_percent_has_its_ends_in_percent_at_every_level():
+    share = Estimate(0.5, ends_at=lambda level: None if level == 1 else (0.5 - level, 0.75))
+    assert at(share.in_percent(), 0.25).bounds() == (25, 75)
+    assert at(share.in_percent(), 1).bounds() is None
 
 
 def test_a_difference_of_likelihood_estimates_is_a_normal_test():
