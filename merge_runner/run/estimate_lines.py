@@ -87,8 +87,8 @@ def estimate_lines(expected: Estimate) -> Iterator[str]:
     if expected.rounds:
         cost += f" in batches; {usd_text(expected.singly_usd)} and {time} by normal requests"
         time = (
-            f"{expected.rounds} rounds; each takes as long as its slowest batch: minutes, an hour, "
-            "a day at most"
+            f"{expected.rounds} rounds; each takes as long as its slowest batch: minutes, hours, "
+            "two days at most"
         )
     yield f"cost    {cost}"
     yield from _by_model(expected)

@@ -17,8 +17,8 @@ from merge_runner_analysis.metrics import COLLISIONS, LEFT_FIRST, METRICS
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.stats.effects import driver_effects, effects, primary
 from merge_runner_analysis.study import StudyResults
-from merge_runner_analysis.tables.effects import comparison
 from merge_runner_analysis.tables import effects as tables
+from merge_runner_analysis.tables.effects import comparison
 from tests.support.harness import FAST
 from tests.support.studies import changed, write_study, yielding
 from tests.support.tables import made, values_of
