@@ -32,9 +32,10 @@ class Trial:
     ) -> None:
         # A driver may set the start of its side, and of the other side if that driver sets none.
         by_driver = {side: d.starts for side, d in drivers.items() if hasattr(d, "starts")}
-        starts = {
-            side: by_driver.get(side, other)[side] for other in by_driver.values() for side in SIDES
-        }
+        starts = {}
+        for set_by_other in by_driver.values():
+            for side in SIDES:
+                starts[side] = by_driver.get(side, set_by_other)[side]
         self._spec = spec
         self._world = World(scenario, spec.kinematics, TRACK, starts)
         self._states = {

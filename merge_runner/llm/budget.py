@@ -1,16 +1,17 @@
 """Admission control under a cap: trials are admitted and attempts reserved in their order.
 
 A trial is admitted only if its expected cost, and what the running trials are still expected to
-cost, fit under the cap. So money finishes trials instead of beginning more. The oldest running
-trial may use all that is left. A younger one leaves what older ones are still expected to cost. So,
-if expectations were too low, the youngest are suspended first. A call that several trials share is
-paid by the oldest running one, so that a running trial never waits for the admission of another. A
-probe comes before all others and may use all that is left: older trials may wait for its reply.
+cost, fit under the cap; the first is also admitted if nothing was spent or reserved before it. So
+money finishes trials instead of beginning more. The oldest running trial may use all that is left.
+A younger one leaves what older ones are still expected to cost. So, if expectations were too low,
+the youngest are suspended first. A call that several trials share is paid by the oldest running
+one, so that a running trial never waits for the admission of another. A probe comes before all
+others and may use all that is left: older trials may wait for its reply.
 
 The worst case of an attempt is reserved in this process while it waits for its turn, and in the
 ledger right before it is sent. A server may ignore the output cap. So several attempts are in
 flight only while twice their worst cases fit. Then only the last reply can exceed the cap, unless
-one costs more than twice the most expensive reply known when it was sent.
+one costs more than twice the largest worst case that was reserved before or for it.
 """
 
 from __future__ import annotations
@@ -83,7 +84,7 @@ class Reservation:
         return ledger.store.write(partial(both, keep, book))
 
     def close(self) -> None:
-        """Return what the attempt, which has ended, did not spend."""
+        """End the attempt: return what it did not spend; nothing where its cost is unknown."""
         self.budget.in_flight -= 1
         if self.queued:
             self.budget.queued_usd -= self.usd
@@ -162,6 +163,7 @@ class MoneyQueue:
 class Budget:
     """Spending under a ledger's cap; without a cap it is only recorded.
 
+    The models of a run with a price share one, and its free models another one without a cap.
     A trial is named by its order in the sweep; ``trial_usd`` returns its expected cost.
     ``in_flight`` counts reservations, ``queued_usd`` is reserved in this process alone.
     ``expected_usd`` has, by running trial, the rest of its expected cost, below 0 where it has cost

@@ -161,7 +161,7 @@ class CacheFile:
         self.closing.close()
         self._writer.close()
         self.locks.close()
-        self.reading.close()  # first: the last to close ends the journal, and must be able to write
+        self.reading.close()  # before the writer: the last to close ends the journal
         if self.texts is not None:
             close_texts(self.texts)
 
@@ -208,9 +208,9 @@ class CallStore(CacheFile):
         return self.closing.enter_context(opened()) if opened else ({}, {})
 
     def get(self, key: str, request: ChatRequest | None = None) -> CachedCall | None:
-        """Return the entry of a call, checked against its ``request`` where that is given.
+        """Return the entry of a call, of the recording or else of the folder.
 
-        Raises RecordingError where it is damaged or forged.
+        Raises RecordingError where the folder's is damaged, or does not match the ``request``.
         """
         return self.recording[0].get(key) or self._entry(key, request)
 
@@ -223,7 +223,7 @@ class CallStore(CacheFile):
     ) -> tuple[CachedCall | None, Attempts]:
         """Return the entry of a call, or the attempts of earlier runs, unseen ones included.
 
-        Raises RecordingError where they are damaged, or do not match the ``request``.
+        Raises RecordingError where the folder's are damaged, or do not match the ``request``.
         """
         if recorded := self.recording[0].get(key):
             return recorded, ()

@@ -30,7 +30,8 @@ A_FEW = 16
 class LocalRunner:
     """Player of at most ``in_flight`` trials at once in this process; ``running`` counts them.
 
-    With ``rounds`` their calls are submitted in batches when no trial can go on.
+    With ``rounds`` their calls are submitted in batches when no trial can go on. ``workers`` is
+    None, which says that all is in this process.
     """
 
     plan: Plan
@@ -74,7 +75,7 @@ class LocalRunner:
     async def play(
         self, specs: Sequence[TrialSpec], ended: Ended, capacity: Capacity | None = None
     ) -> None:
-        """Play trials in order; an error raised by ``ended`` or outside a trial ends the run."""
+        """Play trials in order; any error but TrialSuspended, also of ``ended``, ends the run."""
         waiting = iter(specs)
 
         async def work() -> None:

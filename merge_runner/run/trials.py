@@ -55,7 +55,7 @@ class Player(Protocol):
         """Text of what an interrupted run saves before it ends."""
 
     async def play(self, specs: Sequence[TrialSpec], ended: Ended, capacity: Capacity) -> None:
-        """Play trials in order; an error raised by ``ended`` or outside a trial ends the run."""
+        """Play trials in order; any error but TrialSuspended, also of ``ended``, ends the run."""
 
     async def drain(self) -> None:
         """Let calls in flight end and be saved."""

@@ -14,11 +14,12 @@ class Estimate:
     """A number with its interval, counts and test; None stands for unknown values.
 
     ``ends_at`` finds the interval's ends at another ``level``, if it is not Student's t. A rate
-    counts ``k`` of ``n`` trials and is as good as one of ``weight``; with ``undecided`` ones it has
-    no value, and its interval holds both worst cases (Manski 1989). ``freedom`` is infinite where
-    the test is not Student's t. ``p`` is two-sided, against 0, ``p_holm`` corrected over a family,
+    counts ``k`` of ``n`` trials, or replies of ``n`` trials, ``weight`` in all; one of humans is as
+    precise as one of ``weight`` independent trials. With ``undecided`` trials a rate has no value,
+    and its interval holds both worst cases (Manski 1989). ``freedom`` is infinite where the test is
+    not Student's t. ``p`` is two-sided, against 0, ``p_holm`` corrected over a family,
     ``detectable`` the minimum detectable effect at 80 % power. ``problem`` says why something is
-    missing, ``source`` that it is published.
+    missing, ``source`` where a published one is from.
     """
 
     value: float | None = None

@@ -44,8 +44,8 @@ from merge_runner_analysis.wording import (
 
 TEST = "of the test of Mantel and Haenszel, or of Welch's"
 UNTESTED = (
-    "no test without cells that all have, spread within cells, or with undecided trials, trials of "
-    "several studies or the same ones at two levels"
+    "no test: it needs cells that all levels have, spread within cells, and trials of one study, "
+    "none of them undecided or at two levels"
 )
 
 DIFFERENCE = (
@@ -130,6 +130,7 @@ def _primary_name(study: StudyResults) -> str:
 
 
 def _compared_row(study: StudyResults, effect: Effect) -> Row:
+    """Return the row of a comparison: both sides within shared cells, or over all their trials."""
     values: dict[str, Value] = {}
     sides = (effect.level, effect.at_level), (effect.reference, effect.at_reference)
     for of, (level, estimate) in zip(SIDES, sides, strict=True):

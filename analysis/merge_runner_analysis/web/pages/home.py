@@ -48,7 +48,10 @@ def _question(site: Site, bar: Bar) -> tuple[Jobs, Jobs, Answer | None]:
 def _rivals(
     site: Site, drivers: Sequence[Driver], scope: Scope
 ) -> tuple[Jobs, Jobs, Comparison | None]:
-    """Return the same of two language models or, in a rehearsal, of two mock models."""
+    """Return jobs as ``_question`` does, and the comparison of two models of one kind.
+
+    They are language models or, in a rehearsal, mock models.
+    """
     kinds = {driver.kind for driver in drivers}
     if len(drivers) != 2 or kinds not in ({LANGUAGE_MODEL}, {MOCK}):
         return [], [], None
