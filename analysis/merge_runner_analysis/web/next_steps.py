@@ -37,31 +37,28 @@ UNCLEAR = "Likeness to people cannot be told in every measure. More trials narro
 
 def next_steps(
     program: str,
-    typed: Sequence[str],
+    sweep: Sequence[str],
     drivers: Sequence[Driver],
     short: Mapping[str, str],
     conditions: Mapping[str, Any],
     answers: Answer | Comparison | None,
 ) -> list[tuple[str, str]]:
-    """Return sentences with commands; ``typed`` are the arguments of the newest run, if known."""
-    sweep = list(typed) or ["sweep", "STUDY"]
+    """Return sentences with commands; ``sweep`` are the words that play the study."""
 
     def again(*options: str) -> str:
         return shlex.join([program, *sweep, *options])
 
     steps = []
     if is_rehearsal(drivers):
-        while "--model" in sweep:  # an option and its value
-            place = sweep.index("--model")
-            del sweep[place : place + 2]
-        steps.append((REHEARSED, again("--model", "MODEL", "--dry-run")))
+        of_any = without("--model", sweep)
+        steps.append((REHEARSED, shlex.join([program, *of_any, "--model", "MODEL", "--dry-run"])))
     judged = [driver for driver in drivers if driver.cells]
     few = [of for of in judged if not has_verdict(of.cells["collisions"].values)]
     same = [short[of.name] for of in few if repeated(of, conditions)[0]]
     others = [short[of.name] for of in few if short[of.name] not in same]
     if same:
         steps.append((REPEATED.format(joined(same)), ""))
-    if others:
+    if others and not is_rehearsal(drivers):
         steps.append((FEW.format(joined(others)), again("--reps", "N")))
     if isinstance(answers, Answer) and not _shown([row.mark for row in answers.changes]):
         steps.append((UNSHOWN, shlex.join([program, "power", sweep[1]])))
@@ -75,6 +72,15 @@ def next_steps(
     if OPEN in states and not few and not is_rehearsal(drivers):
         steps.append((UNCLEAR, again("--reps", "N")))
     return steps
+
+
+def without(option: str, words: Sequence[str]) -> list[str]:
+    """Return the words of a command without an option and its values."""
+    left = list(words)
+    while option in left:
+        place = left.index(option)
+        del left[place : place + 2]
+    return left
 
 
 def is_rehearsal(drivers: Sequence[Driver]) -> bool:

@@ -12,8 +12,10 @@ from merge_runner_analysis.web.effect_rows import unbroken
 from merge_runner_analysis.web.judged import Driver
 from merge_runner_analysis.web.marks import Cell
 from merge_runner_analysis.wording import (
+    DIFFERS,
     HEADINGS,
     MARGINS,
+    MEASURES,
     OPEN,
     PLAYED_RULES,
     RULES_MEAN,
@@ -25,6 +27,7 @@ from merge_runner_analysis.wording import (
     WEAKER,
     brackets,
     has_verdict,
+    joined,
     number,
     share,
     shown_state,
@@ -60,6 +63,16 @@ class Likeness:
     by_people: str = ""
 
 
+def other_differences(driver: Driver) -> str:
+    """Return in which measures without a column a driver is shown to differ from people."""
+    labels = [
+        MEASURES[name].label
+        for name, cell in driver.cells.items()
+        if name not in HEADINGS and shown_state(cell.values) in DIFFERS
+    ]
+    return f"differs in {joined(labels)}, too" if labels else ""
+
+
 def likeness_of(driver: Driver) -> dict[str, Likeness]:
     """Return the likeness of a driver by measure; empty where it is not judged."""
     return {name: _likeness(driver.cells[name]) for name in HEADINGS if name in driver.cells}
@@ -78,7 +91,7 @@ def counted(driver: Driver, conditions: Mapping[str, Any]) -> str:
         "did not end": driver.facts["trials"] - ended,
     }
     why = ", ".join(f"{k} {reason}" for reason, k in reasons.items() if k)
-    return f"{shared - repeats} counted: {why}" if why else ""
+    return f"{shared - repeats} counted; not counted: {why}" if why else ""
 
 
 def repeated(driver: Driver, conditions: Mapping[str, Any]) -> tuple[int, int]:

@@ -184,11 +184,15 @@ class Site:
         """Return whether the trials are being read for the first time."""
         return self._first_reading is not None and self._first_reading.is_alive()
 
+    @property
+    def named_db(self) -> list[str]:
+        """Words of a command that name the shown database, unless it is the default."""
+        return [] if self.db == DEFAULT_DB else ["--db", str(self.db)]
+
     def share(self, *options: str, of_study: bool = True) -> str:
         """Return the command that exports the shown pages; ``of_study``: it takes --study."""
-        db = [] if self.db == DEFAULT_DB else ["--db", str(self.db)]
         study = ["--study", self.study] if self.study and of_study else []
-        return shlex.join([self.program, "view", *db, *study, *options])
+        return shlex.join([self.program, "view", *self.named_db, *study, *options])
 
     def render(self, template: str, **values: object) -> str:
         """Return a page, or a part of one."""

@@ -12,9 +12,10 @@ from merge_runner_analysis.web.people import (
     counted,
     gap_weights,
     likeness_of,
+    other_differences,
     verdict_rules,
 )
-from merge_runner_analysis.wording import MEASURES, MOCK, OPEN, PROGRAM, SHOWN, WEAKER
+from merge_runner_analysis.wording import MEASURES, MOCK, OPEN, PROGRAM, SHOWN, STRONGER, WEAKER
 
 
 def driver(name, **verdicts):
@@ -108,11 +109,12 @@ def played(*, trials, n, ended, human=(True, False)):
         (played(trials=20, n=20, ended=(10, 10), human=(True, True)), ""),
         (
             played(trials=20, n=3, ended=(10, 8)),
-            "3 counted: 7 repeat another one, 8 in situations that nobody drove, 2 did not end",
+            "3 counted; not counted: 7 repeat another one, 8 in situations that nobody drove, "
+            "2 did not end",
         ),
         (
             played(trials=20, n=11, ended=(10, 10), human=(True, True)),
-            "11 counted: 9 repeat another one",
+            "11 counted; not counted: 9 repeat another one",
         ),
     ],
 )
@@ -156,7 +158,7 @@ TYPED = ["sweep", "s.toml", "--model", "emulator", "--yes"]
 
 
 @pytest.mark.parametrize(
-    ("of", "kind", "typed", "steps"),
+    ("of", "kind", "sweep", "steps"),
     [
         (
             played(trials=10, n=10, ended=(10, 0)),
@@ -164,8 +166,13 @@ TYPED = ["sweep", "s.toml", "--model", "emulator", "--yes"]
             TYPED,
             [
                 ("This was a rehearsal", "m sweep s.toml --yes --model MODEL --dry-run"),
-                ("a: fewer than 20 counted", "m sweep s.toml --yes --reps N"),
             ],
+        ),
+        (
+            played(trials=10, n=10, ended=(10, 0)),
+            PROGRAM,
+            TYPED,
+            [("a: fewer than 20 counted", "m sweep s.toml --model emulator --yes --reps N")],
         ),
         (
             played(trials=110, n=11, ended=(110, 0)),
@@ -176,22 +183,34 @@ TYPED = ["sweep", "s.toml", "--model", "emulator", "--yes"]
         (
             played(trials=110, n=110, ended=(110, 0)),
             PROGRAM,
-            [],
+            ["sweep", "STUDY"],
             [("Likeness to people cannot be told", "m sweep STUDY --reps N")],
         ),
-        (played(trials=110, n=110, ended=(110, 0)), MOCK, [], [("This was", "m sweep STUDY --mo")]),
+        (
+            played(trials=110, n=110, ended=(110, 0)),
+            MOCK,
+            TYPED,
+            [("This was", "m sweep s.toml --yes --mo")],
+        ),
     ],
 )
-def test_the_next_steps_follow_from_the_result(of, kind, typed, steps):
+def test_the_next_steps_follow_from_the_result(of, kind, sweep, steps):
     a, conditions = of
     a = replace(a, kind=kind)
     conditions = conditions | {"rows": [(a, conditions["rows"][0][1])]}
-    given = next_steps("m", typed, [a], NAMES, conditions, None)
+    given = next_steps("m", sweep, [a], NAMES, conditions, None)
     assert len(given) == len(steps)
     for (text, command), (begins, run) in zip(given, steps, strict=True):
         assert text.startswith(begins)
         assert command.startswith(run)
         assert bool(command) == bool(run)
+
+
+def test_a_difference_in_a_measure_without_a_column_is_named_in_the_row():
+    apart = {"state": STRONGER, "n": 110, "ended": 110}
+    shown = driver("a", **{"gap": apart, "gap-headway": apart})
+    assert other_differences(shown) == "differs in gap, by headway, too"
+    assert other_differences(driver("a", gap=apart)) == ""
 
 
 @pytest.mark.parametrize(

@@ -10,13 +10,14 @@ from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.effect_rows import MIDDLE
 from merge_runner_analysis.web.judged import Driver, by_condition, by_kind, humans_of, judged, noted
 from merge_runner_analysis.web.names import PLAYED, names_mean, opponents_text, short_names
-from merge_runner_analysis.web.next_steps import is_found, is_rehearsal, next_steps
+from merge_runner_analysis.web.next_steps import is_found, is_rehearsal, next_steps, without
 from merge_runner_analysis.web.people import (
     UNPOSED,
     could_see,
     counted,
     gap_weights,
     likeness_of,
+    other_differences,
     people_of,
     verdict_rules,
 )
@@ -80,7 +81,11 @@ def _beside_people(
     return {
         "headline": headline(verdicts),
         "likeness": [
-            (driver, likeness_of(driver), counted(driver, conditions))
+            (
+                driver,
+                likeness_of(driver),
+                filter(None, (counted(driver, conditions), other_differences(driver))),
+            )
             for kind in by_kind(drivers).values()
             for driver in kind
         ],
@@ -121,7 +126,9 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
     short = short_names(names)
     # People's gap covers the situations in which the first driver finished.
     human = humans_of(values["table"], next(iter(shown), None))
-    typed = standing[0]["config"].get("typed") or () if standing else ()
+    typed = standing[0]["config"].get("typed") if standing else None
+    # The database may have been moved since.
+    sweep = [*without("--db", typed or ("sweep", "STUDY")), *site.named_db]
     return site.render(
         "home.html",
         view="index",
@@ -137,7 +144,7 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         is_rehearsal=is_rehearsal(shown),
         question=question,
         apart=apart,
-        steps=next_steps(site.program, typed, shown, short, conditions, question or apart),
+        steps=next_steps(site.program, sweep, shown, short, conditions, question or apart),
         found=is_found(shown, question or apart),
         prompted=any(driver.kind != PROGRAM for driver in shown),
         asking=asking,
