@@ -109,8 +109,8 @@ class Calls:
     def wait(self, call: Call, wait: Wait) -> None:
         """Let a call wait, so that it can be cancelled; raise CallFailed if it is given up.
 
-        It is in flight again when its ``wait`` is None. A sender, whose attempt is reserved, sets
-        the waits of the attempt itself.
+        It is in flight again when its ``wait`` is None. The waits of an attempt are set by who
+        makes it, since what is reserved or sent is not given up.
         """
         if self.stopping or not call.trials:
             raise self.given_up(call)

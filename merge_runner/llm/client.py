@@ -213,12 +213,12 @@ class LlmClient:
         label, key = call.label, call.request.key
         if sender.price_factor != 1.0:
             label = replace(label, worst_usd=label.worst_usd * sender.price_factor)
-        if call.pending_batch:  # it was sent: its reply is waited for without a trial, too
-            if self.calls.stopping:
-                raise self.calls.given_up(call)
+        if self.calls.stopping or not (call.trials or call.pending_batch):
+            raise self.calls.given_up(call)
+        if call.pending_batch:
             reservation = Reservation.resume(self.budget, call.order, key, label)
         else:
-            self.calls.wait(call, Wait(NO_MONEY, blocked=True))
+            call.wait = Wait(NO_MONEY, blocked=True)
             reservation = await self.budget.reserve(call.trials, key, label, is_probe=call.is_probe)
         with closing(reservation):
             sent = await sender.send(call, reservation)

@@ -322,14 +322,12 @@ def render_prompt(
     """
     now = Situation(observation, scenario, remaining_plan, first)
     parts = prompt.templates[observation.road]
-    text = "".join([literal + field(now) if field else literal for literal, field in parts])
+    text = "".join([text + FIELDS[name](now) if name else text for text, name in parts])
     return text if observation.other_seen else _UNIT_OF_NOTHING.sub(r"\1", text)
 
 
-def _template(
-    blocks: Iterable[Block], road: Road
-) -> list[tuple[str, Callable[[Situation], str] | None]]:
+def _template(blocks: Iterable[Block], road: Road) -> list[tuple[str, str | None]]:
     """Return the joined template of the blocks for a road: its texts, each before a variable."""
     templates = (block.merge if road == "merge" else block.straight for block in blocks)
     whole = "\n\n".join(template for template in templates if template is not None) + "\n"
-    return [(text, FIELDS[name] if name else None) for text, name, *_ in Formatter().parse(whole)]
+    return [(text, name) for text, name, *_ in Formatter().parse(whole)]

@@ -100,6 +100,6 @@ async def test_a_dry_run_says_what_batches_cost_beside_single_calls(merge_runner
     assert lines[5].startswith("cost    about 0.27 USD in batches; about 0.55 USD and ")
     assert lines[5].endswith(" minutes by normal requests")
     assert lines[6] == (
-        "time    about 11 rounds; each takes as long as its slowest batch: minutes, an hour, a day "
-        "at most"
+        "time    about 11 rounds; each takes as long as its slowest batch: minutes, hours, "
+        "two days at most"
     )
