@@ -16,7 +16,7 @@ import duckdb
 
 from merge_runner.errors import StoreError
 from merge_runner.results.database import append, by_name, read_database
-from merge_runner.results.instance import limit_memory
+from merge_runner.results.instance import SIZES, limit_memory
 from merge_runner.results.rows import TrialKey
 from merge_runner.served_model import other_models
 from merge_runner.text_safety import first_line
@@ -59,6 +59,8 @@ OF_MOCKS = "attempts answered by a mock model"
 """The column of ``counts`` with the replies of mock models."""
 FINDINGS_SHOWN = 20
 REPLIES_AT_ONCE = 4_000
+LONG_REPLY, PARSED_BYTES = 2**15, 2**25
+"""Length above which replies are parsed few at once, and the bytes at once; else 2,048 replies."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +138,13 @@ def prepare(connection: duckdb.DuckDBPyConnection, sweep_id: str | None = None) 
     make_views(connection, "checks.sql")
     append(connection, "other_models", other_models(connection))
     connection.execute("SET VARIABLE sweep_id = ?", [sweep_id])
-    connection.execute("INSERT INTO ids FROM read_ids; INSERT INTO reply_ids FROM identified")
+    [(longest, _)] = connection.execute(SIZES).fetchall()
+    [(rows,)] = connection.execute("SELECT coalesce(max(rowid), -1) + 1 FROM calls").fetchall()
+    step = max(1, PARSED_BYTES // longest if longest > LONG_REPLY else rows)
+    for first in range(0, rows, step):
+        span = f"SET VARIABLE first_row = {first}; SET VARIABLE last_row = {first + step - 1}"
+        connection.execute(f"{span}; INSERT INTO ids FROM read_ids")
+    connection.execute("INSERT INTO reply_ids FROM identified")
     rowids = [rowid for (rowid,) in connection.execute("FROM repeated_replies").fetchall()]
     for first in range(0, len(rowids), REPLIES_AT_ONCE):  # a chunk is in memory at once
         replies = connection.execute(REPLIES, [rowids[first : first + REPLIES_AT_ONCE]]).fetchall()

@@ -55,37 +55,40 @@ SELECT 'attempt' AS kind, trial_id, side, decision, text FROM (
     GROUP BY trial_id, spec_hash, side, decision, call_key
 ) WHERE text IS NOT NULL;
 
+-- The ids of the replies of the sweep in the variable sweep_id, or of all, and the requests that they
+-- name, are read once and without any other column, from first_row to last_row: replies may be long.
+CREATE OR REPLACE TEMP MACRO text_of(json) AS if(json_type(json) = 'VARCHAR', json->>'$', NULL);
+CREATE OR REPLACE TEMP VIEW read_ids AS
+SELECT call_rowid, coalesce(nullif(text_of(members[1]), ''), text_of(members[2])) AS reply_id,
+    members[3] AS answered
+FROM (
+    SELECT rowid AS call_rowid,
+        json_extract(reply, ['$.id', '$.responseId', '$.merge_runner_request']) AS members
+    FROM calls WHERE rowid BETWEEN getvariable('first_row') AND getvariable('last_row')
+    AND (getvariable('sweep_id') IS NULL OR (trial_id, spec_hash) IN (
+        SELECT (trial_id, spec_hash) FROM sweep_trials WHERE sweep_id = getvariable('sweep_id')))
+) WHERE reply_id IS NOT NULL OR answered IS NOT NULL;
+CREATE OR REPLACE TEMP TABLE ids AS FROM read_ids LIMIT 0;
+
 -- Each reply of the emulator names the request that it answers.
 CREATE OR REPLACE TEMP VIEW exchanged_findings AS
-SELECT 'exchanged' AS kind, trial_id, side, decision,
+SELECT 'exchanged' AS kind, trial_id, calls.side, calls.decision,
     'its reply names another request' AS text
-FROM (
-    SELECT trial_id, spec_hash, side, decision, request, reply->'$.merge_runner_request' AS answered
-    FROM calls WHERE contains(reply::VARCHAR, 'merge_runner_request')
-) SEMI JOIN audited USING (trial_id, spec_hash) JOIN trials USING (trial_id, spec_hash)
+FROM calls JOIN (FROM ids WHERE answered IS NOT NULL) ON calls.rowid = call_rowid
+SEMI JOIN audited USING (trial_id, spec_hash) JOIN trials USING (trial_id, spec_hash)
 WHERE answered->>'$.body_sha256' <> sha256(request::VARCHAR)
     OR [answered->>'$.slot.condition', answered->>'$.slot.repetition', answered->>'$.slot.side',
         answered->>'$.slot.decision', answered->>'$.slot.sample_set']
-        <> [condition, rep::VARCHAR, side, decision::VARCHAR, sample_set::VARCHAR]
+        <> [condition, rep::VARCHAR, calls.side, calls.decision::VARCHAR, sample_set::VARCHAR]
     AND json_type(answered, '$.slot') = 'OBJECT';
-
--- The ids of the replies of the sweep in the variable sweep_id, or of all, are read once and without
--- any other column, since replies may be long.
-CREATE OR REPLACE TEMP MACRO text_of(json) AS if(json_type(json) = 'VARCHAR', json->>'$', NULL);
-CREATE OR REPLACE TEMP VIEW read_ids AS
-SELECT call_rowid, coalesce(nullif(text_of(ids[1]), ''), text_of(ids[2])) AS reply_id FROM (
-    SELECT rowid AS call_rowid, json_extract(reply, ['$.id', '$.responseId']) AS ids FROM calls
-    WHERE http_status = 200 AND (getvariable('sweep_id') IS NULL OR (trial_id, spec_hash) IN (
-        SELECT (trial_id, spec_hash) FROM sweep_trials WHERE sweep_id = getvariable('sweep_id')))
-) WHERE reply_id IS NOT NULL;
-CREATE OR REPLACE TEMP TABLE ids AS FROM read_ids LIMIT 0;
 
 -- They are compared within an endpoint: two emulators give equal requests equal ids.
 CREATE OR REPLACE TEMP VIEW identified AS
 SELECT call_rowid, calls.trial_id, calls.spec_hash, calls.side, decision, call_key, provider,
     model_requested,
     coalesce(json_extract_string(spec, '$.' || side || '.endpoint'), '') AS endpoint, reply_id
-FROM calls JOIN ids ON calls.rowid = call_rowid LEFT JOIN specs USING (spec_hash);
+FROM calls JOIN ids ON calls.rowid = call_rowid LEFT JOIN specs USING (spec_hash)
+WHERE http_status = 200 AND reply_id IS NOT NULL;
 CREATE OR REPLACE TEMP TABLE reply_ids AS FROM identified LIMIT 0;
 
 -- The replies whose id another call has too, and a hash of the answer of each.
