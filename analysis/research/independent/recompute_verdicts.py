@@ -20,6 +20,7 @@ GAP_N, GAP_M, GAP_SD_M = 962, 3.85, 1.82
 INTERCEPTS_M = (-0.49, 1.21, 1.94, -0.01, -0.35, 1.07, -1.61, -1.86, 0.09)
 PAIRS, PAIR_SD_M = 9, float(np.std(INTERCEPTS_M, ddof=1))
 MARGIN_M = 1.0
+ENOUGH = 20  # counted trials, and half of those that ended: fewer have no verdict
 KEPT = ("estimate", "ci_low", "ci_high", "n")
 
 
@@ -53,8 +54,11 @@ def rows(trials: pd.DataFrame, humans: dict, indicators, held: float | None) -> 
     if moved.differences is not None:
         found["gap-velocity"]["p"] = moved.beyond_p()
     _correct([*found.values(), {"p": held}])
+    ended = int((trials["status"] != "failed").sum())
     for name, row in found.items():
         row["state"] = _state(name, row, indicators, within=moved.within())
+        if row["state"] is None or row["n"] < max(ENOUGH, ended / 2):
+            row["detectable"] = None
         if row["p_holm"] is None:
             continue
         level = 0.9 if name == "gap-velocity" and row["state"] == "shown" else row["level"] / 100
