@@ -126,9 +126,9 @@ def forget(
     """
     from merge_runner.results.sweeps import forget as forget_sweeps
     from merge_runner.results.sweeps import to_forget
-    from merge_runner.run.progress_file import running
+    from merge_runner.run.progress_file import running_sweeps
 
-    for busy in running(db):
+    for busy in running_sweeps(db):
         raise UsageError(
             f"the sweep {busy.sweep_id} is running into {db}: stop it, or wait for its end"
         )

@@ -54,7 +54,7 @@ class Reservation:
     cost_usd: float | None = None
 
     def __post_init__(self) -> None:
-        self.budget.in_flight += 1
+        self.budget.open_reservations += 1
         self.budget.queued_usd += self.usd if self.queued else 0.0
         self._take(self.usd)
 
@@ -85,7 +85,7 @@ class Reservation:
 
     def close(self) -> None:
         """End the attempt: return what it did not spend; nothing where its cost is unknown."""
-        self.budget.in_flight -= 1
+        self.budget.open_reservations -= 1
         if self.queued:
             self.budget.queued_usd -= self.usd
             self.cost_usd = 0.0
@@ -117,10 +117,10 @@ class MoneyQueue:
     A call takes the place of the oldest running trial that needs it.
     """
 
-    def __init__(self, ledger: Ledger, running: Mapping[int, float]) -> None:
+    def __init__(self, ledger: Ledger, expected_usd: Mapping[int, float]) -> None:
         self.waiters: list[Waiter] = []
         self._ledger = ledger
-        self._running = running
+        self._expected_usd = expected_usd
 
     @property
     def trials(self) -> set[int]:
@@ -130,7 +130,7 @@ class MoneyQueue:
     def _place(self, waiter: Waiter) -> tuple[bool, float]:
         if waiter.is_probe:
             return False, -math.inf
-        running = self._running.keys() & waiter.trials
+        running = self._expected_usd.keys() & waiter.trials
         return waiter.is_admission and not running, min(running or waiter.trials, default=math.inf)
 
     def wake(self) -> None:
@@ -165,7 +165,7 @@ class Budget:
 
     The models of a run with a price share one, and its free models another one without a cap.
     A trial is named by its order in the sweep; ``trial_usd`` returns its expected cost.
-    ``in_flight`` counts reservations, ``queued_usd`` is reserved in this process alone.
+    ``open_reservations`` counts reservations, ``queued_usd`` is reserved in this process alone.
     ``expected_usd`` has, by running trial, the rest of its expected cost, below 0 where it has cost
     more.
     """
@@ -173,7 +173,7 @@ class Budget:
     def __init__(self, ledger: Ledger, trial_usd: Callable[[int], float] = lambda _: 0.0) -> None:
         self.ledger = ledger
         self.trial_usd = trial_usd
-        self.in_flight = 0
+        self.open_reservations = 0
         self.queued_usd = 0.0
         self.expected_usd: dict[int, float] = {}
         self._largest_usd = 0.0
@@ -230,7 +230,7 @@ class Budget:
             raise TrialSuspended("its trial is suspended")
         needed_usd = self.trial_usd(trial)
         left_usd = self._left_usd(needed_usd)
-        if left_usd < needed_usd and not self.expected_usd and not self.in_flight:
+        if left_usd < needed_usd and not self.expected_usd and not self.open_reservations:
             # The first trial begins all the same: it may cost less, and each attempt must still
             # fit.
             if self._spent_before or self._largest_usd:
@@ -244,13 +244,13 @@ class Budget:
         """Return whether an attempt's worst case fits; raise TrialSuspended where it never will."""
         worst_usd = self._worst_usd(label)
         left_usd = self._left_usd(worst_usd)
-        if left_usd < worst_usd and not self.in_flight:
+        if left_usd < worst_usd and not self.open_reservations:
             raise self._suspended(f"the next call may cost {worst_usd:.4f} USD")
         older_usd = 0.0 if is_probe else self._still_expected_usd(before=self._payer(trials))
         # Only the first expensive reply shows that a server ignores the output cap, when the others
         # are sent already: all in flight may cost twice as much.
-        twice_usd = (self.in_flight + 1) * max(worst_usd, self._largest_usd)
-        return left_usd - worst_usd >= max(older_usd, twice_usd if self.in_flight else 0.0)
+        twice_usd = (self.open_reservations + 1) * max(worst_usd, self._largest_usd)
+        return left_usd - worst_usd >= max(older_usd, twice_usd if self.open_reservations else 0.0)
 
     def _payer(self, trials: Sequence[int]) -> int:
         """Return the oldest running trial of those that share a call, else the oldest."""
@@ -267,7 +267,7 @@ class Budget:
         """
         cap, ledger = self.ledger.cap, self.ledger
         assert cap is not None
-        if not self.in_flight and cap.usd - ledger.committed_usd < needed_usd:
+        if not self.open_reservations and cap.usd - ledger.committed_usd < needed_usd:
             ledger.read()
         return cap.usd - ledger.committed_usd - self.queued_usd + TOLERANCE_USD
 

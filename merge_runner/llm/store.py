@@ -225,8 +225,8 @@ class CallStore(CacheFile):
 
         Raises RecordingError where the folder's are damaged, or do not match the ``request``.
         """
-        if recorded := self.recording[0].get(key):
-            return recorded, ()
+        if call := self.recording[0].get(key):
+            return call, ()
         rows = self.rows(_LOOK_UP, key, UNANSWERED + key)
         if not rows:
             return None, ()
