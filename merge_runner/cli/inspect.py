@@ -39,7 +39,7 @@ def sql(
     writers = {"text": export.write_table, "csv": export.write_csv, "json": export.write_json}
     # A slow reader of a pipe would otherwise keep every sweep from writing meanwhile.
     with tempfile.TemporaryFile("w+", encoding="utf-8", newline="") as spooled:
-        with store.answer(db, query) as result:
+        with store.open_result(db, query) as result:
             writers["json" if as_json else output](
                 database.names_of(result), database.fetched(result), spooled
             )
@@ -113,7 +113,7 @@ def audit(
 
 def forget(
     sweeps: Annotated[
-        list[str], typer.Argument(metavar="SWEEP", help="A sweep_id; * stands for anything.")
+        list[str], typer.Argument(metavar="SWEEP", help="A sweep_id; * matches any text.")
     ],
     db: cli.DbOption = DEFAULT_DB,
     yes: cli.YesOption = False,

@@ -109,7 +109,7 @@ def sweep(
     quiet: Annotated[bool, cli.flag("--quiet", "Show no progress.", **cli.ASKED)] = False,
     as_json: cli.JsonOption = False,
 ) -> None:
-    """Run a study. What is already stored is not run again.
+    """Run a study. Stored trials are not run again.
 
     Example: merge-runner sweep baseline --model o3 --dry-run
     """

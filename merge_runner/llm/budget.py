@@ -1,12 +1,14 @@
-"""Admission control under a cap: trials are admitted and attempts reserved in their order.
+"""Admission control under a cap: trials are admitted and attempts reserved, oldest trial first.
 
-A trial is admitted only if its expected cost, and what the running trials are still expected to
-cost, fit under the cap; the first is also admitted if nothing was spent or reserved before it. So
-money finishes trials instead of beginning more. The oldest running trial may use all that is left.
-A younger one leaves what older ones are still expected to cost. So, if expectations were too low,
-the youngest are suspended first. A call that several trials share is paid by the oldest running
-one, so that a running trial never waits for the admission of another. A probe comes before all
-others and may use all that is left: older trials may wait for its reply.
+A trial is admitted if its expected cost, and what the running trials are still expected to cost,
+fit under the cap. So money finishes trials instead of beginning more. The first trial is also
+admitted if nothing was spent or reserved before it.
+
+The oldest running trial may use all that is left. A younger one leaves what older ones are still
+expected to cost. So, if expectations were too low, the youngest are suspended first. A call that
+several trials share is paid by the oldest running one, so that a running trial never waits for the
+admission of another. A probe comes first and may use all that is left, since older trials may wait
+for its reply.
 
 The worst case of an attempt is reserved in this process while it waits for its turn, and in the
 ledger right before it is sent. A server may ignore the output cap. So several attempts are in
@@ -37,12 +39,12 @@ USED_UP = "others under the same cap have used it up"
 
 @dataclass(slots=True)
 class Reservation:
-    """Worst case of one attempt, from its reservation to ``close``, the end of the attempt.
+    """Worst case of one attempt, ``usd``, from its reservation to its end, ``close``.
 
-    While ``queued``, ``usd`` is reserved in this process, and after ``begin`` in the ledger. An
-    attempt that ends before ``begin`` returns all of it to its trial. After ``book`` the
-    difference to the cost is returned. Where the cost is unknown the attempt may have been charged:
-    all of it stays in the ledger until a user releases it.
+    While ``queued`` it is reserved in this process, and after ``begin`` in the ledger. ``close``
+    returns to the trial what the attempt did not spend: all if it ends before ``begin``, the
+    difference to the cost after ``book``. If the cost is unknown, the attempt may have been
+    charged: all stays in the ledger until a user releases it.
     """
 
     budget: Budget
@@ -66,7 +68,10 @@ class Reservation:
         )
 
     async def begin(self, number: int) -> None:
-        """Reserve durably, right before the attempt is sent; raise TrialSuspended."""
+        """Reserve in the ledger, right before the attempt is sent.
+
+        Raises TrialSuspended if other processes have used up the cap.
+        """
         if not self.queued:  # it is reserved: by an earlier run, or for a batch that was refused
             return
         ledger = self.budget.ledger
@@ -96,7 +101,7 @@ class Reservation:
         self.budget.queue.wake()
 
     def _take(self, usd: float) -> None:
-        """Take from the expected cost of the trial, if it still runs."""
+        """Subtract from the expected cost of the trial, if it still runs."""
         if self.trial in self.budget.expected_usd:
             self.budget.expected_usd[self.trial] -= usd
 
@@ -139,7 +144,7 @@ class MoneyQueue:
             self.waiters[0].changed.set()
 
     def reorder(self, trial: int | None = None) -> None:
-        """Sort the queue, since a trial begins or ends; None: since one joins or leaves a call."""
+        """Sort the queue after a trial has begun or ended; None: one has joined or left a call."""
         if trial is None or any(trial in waiter.trials for waiter in self.waiters):
             self.waiters.sort(key=self._place)
         self.wake()
@@ -184,7 +189,7 @@ class Budget:
     async def admit(self, trials: Sequence[int]) -> None:
         """Wait until one of the trials that share a call runs, or the oldest of them may begin.
 
-        ``trials`` may change meanwhile. Raise TrialSuspended if no other trial can free money.
+        ``trials`` may change meanwhile. Raises TrialSuspended if no other trial can free money.
         """
         if self.ledger.cap is not None and self.expected_usd.keys().isdisjoint(trials):
             may_begin = partial(self._may_begin, trials)
@@ -219,9 +224,9 @@ class Budget:
         return Reservation(self, self._payer(trials), key, label, usd)
 
     def _may_begin(self, trials: Sequence[int]) -> bool:
-        """Admit the oldest trial, unless one runs, if its expected cost fits beside those running.
+        """Return whether one of the trials runs; if none does, admit the oldest if its cost fits.
 
-        Raise TrialSuspended.
+        Raises TrialSuspended if no other trial can free money.
         """
         if not self.expected_usd.keys().isdisjoint(trials):
             return True

@@ -38,11 +38,11 @@ NO_MONEY = "for calls in flight to be paid, under the cap"
 
 @dataclass(slots=True)
 class LlmClient:
-    """Client of one model, which answers its prompts.
+    """Client of one model: returns its replies to prompts.
 
-    ``direct`` sends normal requests, ``batch`` what goes into batches. ``calls`` are the run's
-    calls. A call whose trials are all cancelled goes on while it may be billed, to store its reply;
-    one that waits is cancelled. ``strict``: a reply of another model stops the sweep.
+    ``direct`` sends normal requests, ``batch`` sends them in batches. ``calls`` are the run's
+    calls. If all trials of a call are cancelled, it goes on while it may be billed, to store its
+    reply, and is cancelled while it waits. ``strict``: a reply of another model stops the sweep.
     """
 
     endpoint: EndpointState
@@ -75,7 +75,7 @@ class LlmClient:
         """
         request = self.replies.request(prompt, slot)
         reply, attempts = None, None
-        with suppress(RecordingError):  # it is damaged
+        with suppress(RecordingError):  # damaged: no reply, and attempts stays None
             stored, attempts = self.cache.look_up(request.key, request)
             if stored:
                 reply = self.replies.read(stored, len(stored.attempts))
@@ -94,7 +94,7 @@ class LlmClient:
     async def _shared(
         self, request: ChatRequest, order: int, attempts: Attempts | None
     ) -> ChatReply:
-        """Return the reply of the call under way for a request, or of a new one."""
+        """Return the reply to a request, from the call under way for it or from a new call."""
         call = self.calls.under_way.get(request.key)
         is_shared = call is not None and not call.given_up
         if call is None or not is_shared:
@@ -116,7 +116,7 @@ class LlmClient:
             if call.trials:
                 self.budget.queue.reorder()
             elif call.wait is not None and not call.wait.charged:
-                call.give_up()  # or it would take money for a trial that has ended
+                call.give_up()  # it would take money for a trial that has ended
         # The attempts are counted once, for the first trial that asked.
         return replace(reply, cached_attempts=len(reply.attempts)) if is_shared else reply
 

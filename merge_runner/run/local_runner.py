@@ -20,7 +20,7 @@ from merge_runner.run.trials import Capacity, Ended, TrialMaker
 from merge_runner.trial import Trial
 from merge_runner.trial_records import TrialRecord, TrialSpec
 
-# More than bad luck explains, since nothing is answered between them; few enough to stop early.
+# Too many for chance, as no call is answered in between; few enough to stop early.
 FAILURES_IN_A_ROW = 10
 # Trials that begin or go on in one round of the event loop, so that each round stays short.
 A_FEW = 16
@@ -42,8 +42,8 @@ class LocalRunner:
     calls: Calls = field(default_factory=Calls)
     running_trials: int = 0
     workers: None = None
-    # The open questions of each trial that is running and has asked.
-    _asking: Counter[int] = field(default_factory=Counter)
+    # Numbers of open questions, by trial.
+    _open_questions: Counter[int] = field(default_factory=Counter)
     _gate: asyncio.Semaphore = field(default_factory=partial(asyncio.Semaphore, A_FEW))
     # Keys of failed calls by model and its number of answered calls: an answer starts a new set.
     _failed: dict[tuple[str, int], set[str]] = field(default_factory=partial(defaultdict, set))
@@ -54,7 +54,7 @@ class LocalRunner:
 
     @property
     def waits(self) -> Sequence[Wait]:
-        """The reasons why calls wait that are not in flight."""
+        """The waits of calls that are not in flight."""
         return self.calls.waits
 
     @property
@@ -63,8 +63,8 @@ class LocalRunner:
         return len(set().union(*(client.budget.queue.trials for client in self.clients.values())))
 
     def _is_idle(self) -> bool:
-        """Return whether every running trial waits for a reply, so that no trial can go on."""
-        asking = +self._asking  # without the trials that ask nothing now
+        """Return whether all open questions wait for blocked calls, so that no trial can go on."""
+        asking = +self._open_questions  # without trials that have no open question
         return self.running_trials == len(asking) and asking.total() == self.calls.blocked_askers
 
     @property
@@ -113,7 +113,7 @@ class LocalRunner:
                 return await self._play(spec)
             finally:
                 self.running_trials -= 1
-                self._asking.pop(spec.order, None)
+                self._open_questions.pop(spec.order, None)
                 for client in self.clients.values():
                     client.budget.leave(spec.order)
 
@@ -165,7 +165,7 @@ class LocalRunner:
     ) -> tuple[Side, Decision] | None:
         """Return a decision; None where its call failed, which ends the trial."""
         client, side = self.clients[question.model], question.slot.side
-        self._asking[order] += 1
+        self._open_questions[order] += 1
         try:
             prompt = client.replies.prompt(question)
             reply = await client.ask(prompt, question.slot, order=order)
@@ -173,7 +173,7 @@ class LocalRunner:
             trial.fail(side, failure)
             return None
         finally:
-            self._asking[order] -= 1
+            self._open_questions[order] -= 1
         decision = question.decision(prompt, reply)
         if question.model not in self.first.valid:
             self.first.count_decision(question.model, decision)
