@@ -179,11 +179,7 @@ def test_a_driver_stands_beside_another(client, db):
     shares = sorted(share for (share,) in query(db, sql)[1])
     marks = re.findall(r'class="d" href="#plain" x="([\d.]+)%"', left_first)
     assert (sorted(map(float, marks)), len(marks)) == (shares, 10)  # in one it collides
-    assert (
-        left_first.count_decision('class="band"')
-        == left_first.count_decision('href="#other"')
-        == 11
-    )
+    assert left_first.count('class="band"') == left_first.count('href="#other"') == 11
     numbers = [words for _, words in Page(client.get("/drivers").text).to("/trials?")]
     assert sum(words.isdigit() for words in numbers) == 3
 
