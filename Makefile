@@ -19,7 +19,7 @@ unexport MODEL SWEEP ARGS RECORDING PYTHON MAKEFLAGS MFLAGS MAKEOVERRIDES
 help:
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
 
-sweep: .venv/runtime $(if $(findstring --dask,$(ARGS)),.venv/dask) ## the main job: MODEL=, SWEEP=, ARGS=
+sweep: .venv/runtime $(if $(findstring --dask,$(ARGS)),.venv/dask) ## run a study: MODEL=, SWEEP=, ARGS=
 	@$(RUN) sweep $(SWEEP) $(addprefix --model ,$(MODEL)) $(ARGS)
 
 replay: .venv/runtime ## the same from recorded replies alone: MODEL=, SWEEP=, RECORDING=, ARGS=
@@ -49,7 +49,7 @@ lint: .venv/dev ## formatting, lint, types, import contract
 check: lint ## what a change must pass: formatting, lint, types, import contract, unit and integration tests
 	@$(PYTEST) tests/unit tests/integration $(ARGS)
 
-check-all: check ## what an hour may find: the weekly tests too, and the wheel on every Python that is here
+check-all: check ## make check, the weekly tests, and the wheel on every installed Python: an hour
 	@MERGE_RUNNER_BROWSER=required $(PYTEST) tests/weekly $(ARGS)
 	@.ci/installed everywhere
 

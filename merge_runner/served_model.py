@@ -38,5 +38,5 @@ def other_models(connection: duckdb.DuckDBPyConnection) -> list[Pair]:
 
 def sql_of(others: Iterable[Pair]) -> str:
     """Return the condition on a row of ``calls`` or ``attempts`` that another model answered."""
-    listed = ", ".join(f"({quoted(asked)}, {quoted(served)})" for asked, served in others)
+    listed = ", ".join(f"({quoted(requested)}, {quoted(served)})" for requested, served in others)
     return f"(model_requested, model_served) IN ({listed})" if listed else "false"

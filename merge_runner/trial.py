@@ -22,7 +22,7 @@ from merge_runner.trial_records import DecisionRow, FailedCall, TrialRecord, Tri
 
 
 class Trial:
-    """Trial under way; it ends with its world, or at the first decision step with a failed call."""
+    """Trial under way: it ends with its world, or at the first decision step with a failed call."""
 
     def __init__(
         self,
@@ -53,7 +53,7 @@ class Trial:
         """
         while not (self._questions or self._failures or self._world.status):
             for side, state in self._states.items():
-                if state.is_due():
+                if state.decides_now():
                     outcome = state.decide()
                     if isinstance(outcome, Question):
                         self._questions.append(outcome)
@@ -99,7 +99,7 @@ class Trial:
         )
 
     def _advance(self) -> None:
-        """Execute the decisions until the next decision step of either driver."""
+        """Drive the decisions until the next decision step of a driver, unless a call failed."""
         world, (left, right) = self._world, self._states.values()
         time_s = world.time_s
         for state in (left, right):
@@ -128,7 +128,7 @@ def play_trial(trial: Trial, answer: Callable[[Question], Decision]) -> TrialRec
 
 
 class _DriverState:
-    """State of a driver in its trial: its last decision and the step of that decision.
+    """Driver in its trial, with its last decision and the step of that decision.
 
     ``observed`` is its last noisy observation, None under perfect perception.
     """
@@ -156,8 +156,8 @@ class _DriverState:
         """Number of the world's steps until its next decision step."""
         return self._interval - self._world.step % self._interval
 
-    def is_due(self) -> bool:
-        """Return whether it decides now. Once in control, it stays in control."""
+    def decides_now(self) -> bool:
+        """Return whether it decides at this step. Once in control, it stays in control."""
         self._in_control = self._in_control or self._world.in_control(self.side)
         return self._in_control and self._world.step % self._interval == 0
 
@@ -168,7 +168,7 @@ class _DriverState:
         observation = self.observed or self._world.observe(self.side)
         if isinstance(self.driver, LlmDriver):
             return self.driver.ask(observation, self.number)
-        return _decided(self.driver.decide(observation, self.number), self.side)
+        return _result_of(self.driver.decide(observation, self.number), self.side)
 
     def take(self, decision: Decision) -> None:
         """Execute a decision from now on; raises UsageError for one that cannot be executed."""
@@ -192,7 +192,7 @@ class _DriverState:
         return self._driven[since : since + steps]
 
 
-def _decided(deciding: Coroutine[Any, Any, Decision], side: Side) -> Decision:
+def _result_of(deciding: Coroutine[Any, Any, Decision], side: Side) -> Decision:
     """Return the result of an ``async def decide`` that awaits nothing; raises UsageError."""
     try:
         deciding.send(None)
@@ -200,7 +200,7 @@ def _decided(deciding: Coroutine[Any, Any, Decision], side: Side) -> Decision:
         decision: Decision = end.value
         return decision
     except RuntimeError as error:
-        # Without an event loop, as in a replay, there is nothing to wait with.
+        # A replay has no event loop to wait in.
         if "no running event loop" not in str(error):
             raise
     deciding.close()

@@ -63,10 +63,10 @@ ALSO, EXPORT = (
 )
 SINGLE, STUDY_FILE = "Write one page with the --trials.", "experiments/STUDY.toml, or a path."
 FORM = "text (the default), csv, json, md or latex."
-AGAINST = "Published values and differences, for drivers of that name."
-WITHOUT = "Without the trials in which a reply held no valid plan."
-WIDE = "All columns, also where the terminal is narrower."
-TRIALS = "Which trials to write: names separated by commas, * for anything."
+AGAINST = "Add published values and differences, for drivers with the paper's names."
+WITHOUT = "Only trials in which each reply has a valid plan."
+WIDE = "All columns, even if the terminal is narrower."
+TRIALS = "Trials to write: names, separated by commas; * matches any text."
 READER = "Your name in notes; default: your user name."
 ModelsOption = Annotated[str | None, option("A,B", MODELS, "--models")]
 WhereOption = Annotated[list[str] | None, option("FACTOR=LEVEL", WHERE, "--where")]
@@ -173,7 +173,9 @@ def power(
     reps: cli.RepsOption = None,
     conditions: cli.ConditionsOption = None,
     variants: cli.VariantsOption = None,
-    sims: Annotated[int, option("N", "Simulated studies a size.", min=20)] = 100,
+    sims: Annotated[
+        int, option("N", "Simulated studies for each number of repetitions.", min=20)
+    ] = 100,
     db: DbOption = DEFAULT_DB,
     cache: cli.CacheOption = DEFAULT_CACHE,
     trust: TrustOption = False,

@@ -39,7 +39,7 @@ def sql(
     writers = {"text": export.write_table, "csv": export.write_csv, "json": export.write_json}
     # A slow reader of a pipe would otherwise keep every sweep from writing meanwhile.
     with tempfile.TemporaryFile("w+", encoding="utf-8", newline="") as spooled:
-        with store.answer(db, query) as result:
+        with store.open_result(db, query) as result:
             writers["json" if as_json else output](
                 database.names_of(result), database.fetched(result), spooled
             )
@@ -113,7 +113,7 @@ def audit(
 
 def forget(
     sweeps: Annotated[
-        list[str], typer.Argument(metavar="SWEEP", help="A sweep_id; * stands for anything.")
+        list[str], typer.Argument(metavar="SWEEP", help="A sweep_id; * matches any text.")
     ],
     db: cli.DbOption = DEFAULT_DB,
     yes: cli.YesOption = False,
@@ -126,9 +126,9 @@ def forget(
     """
     from merge_runner.results.sweeps import forget as forget_sweeps
     from merge_runner.results.sweeps import to_forget
-    from merge_runner.run.progress_file import running
+    from merge_runner.run.progress_file import running_sweeps
 
-    for busy in running(db):
+    for busy in running_sweeps(db):
         raise UsageError(
             f"the sweep {busy.sweep_id} is running into {db}: stop it, or wait for its end"
         )

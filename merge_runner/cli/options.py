@@ -58,7 +58,7 @@ MODEL = (
     "A model or program of `merge-runner models`, or a pair LEFT+RIGHT; may be repeated. Default: "
     "the models of the study's file, or the emulator."
 )
-ONLY = "Only this level of a factor, of model or of prompt; may be repeated."
+ONLY = "Only trials at this level of a factor, model or prompt; may be repeated."
 CONDITIONS, PROMPTS = "Conditions, separated by commas.", "Prompts, separated by commas."
 REPS = "Repetitions per condition and prompt."
 ModelOption = Annotated[list[str] | None, option("NAME", MODEL, "--model", **PLAYED)]
@@ -68,7 +68,7 @@ ConditionsOption = Annotated[str | None, option("A,B", CONDITIONS, "--conditions
 VariantsOption = Annotated[str | None, option("A,B", PROMPTS, "--variants", **PLAYED)]
 YES = "Do not ask before something is spent or removed."
 TRUST = "Without asking, run the study's code, and send keys where its models.toml says."
-STUDY = "Only trials of this study. A command that needs the study's parts runs its plug-ins."
+STUDY = "Only trials of this study. A command that needs the study's plug-ins runs them."
 JsonOption = Annotated[bool, flag("--json", "Print the result as JSON.", **ASKED)]
 YesOption = Annotated[bool, flag("--yes", YES, **ASKED)]
 TrustOption = Annotated[bool, flag("--trust", TRUST, **ASKED)]

@@ -16,7 +16,7 @@ from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
 from merge_runner.text_safety import say
 
-SWEEP = "The sweep_id of a run; may be repeated. Default: the newest with its replies in the cache."
+SWEEP = "A run's sweep_id; may be repeated. Default: the newest run whose replies are in the cache."
 RecordingFile = Annotated[Path, typer.Argument(metavar="FILE", help="A recording (.parquet).")]
 
 recording_app = Program(

@@ -109,7 +109,7 @@ def sweep(
     quiet: Annotated[bool, cli.flag("--quiet", "Show no progress.", **cli.ASKED)] = False,
     as_json: cli.JsonOption = False,
 ) -> None:
-    """Run a study. What is already stored is not run again.
+    """Run a study. Stored trials are not run again.
 
     Example: merge-runner sweep baseline --model o3 --dry-run
     """
@@ -239,8 +239,8 @@ def _say_shutdowns(plan: Plan, options: Options) -> None:
     from merge_runner.llm.models import shutdown_notes
 
     if not options.replay:
-        asked = {plan.registered[name]: entry for name, entry in plan.entries.items()}
-        for note in shutdown_notes(asked, datetime.now(UTC).date()):
+        entries = {plan.registered[name]: entry for name, entry in plan.entries.items()}
+        for note in shutdown_notes(entries, datetime.now(UTC).date()):
             say(note)
 
 
@@ -267,10 +267,10 @@ def _play(plan: Plan, options: Options, *, whole: bool, yes: bool, as_json: bool
     """Play a plan; return the exit code."""
     import asyncio
 
-    from merge_runner.run import sweep as running
     from merge_runner.run.estimate_lines import estimate_lines
     from merge_runner.run.interrupt import INTERRUPTED
     from merge_runner.run.summary import as_lines
+    from merge_runner.run.sweep import play
 
     _say_shutdowns(plan, options)
 
@@ -279,7 +279,7 @@ def _play(plan: Plan, options: Options, *, whole: bool, yes: bool, as_json: bool
         agree(lines, "Go ahead?", otherwise="nothing was sent", yes=yes)
 
     try:
-        playing = running.play(plan, options, whole=whole, say=say, agree=ask, stopping=on_signal)
+        playing = play(plan, options, whole=whole, say=say, agree=ask, stopping=on_signal)
         facts = asyncio.run(playing)
     except KeyboardInterrupt:  # before the trials began or after they ended
         say("interrupted: run the same command again to go on")

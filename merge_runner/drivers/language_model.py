@@ -97,8 +97,7 @@ class LlmDriver:
         self._executed += count
         failure = parsed.failure
         if failure is None and parsed.tactical is None:
-            asked = self.prompt.asks_tactical(road)
-            failure = NO_DECISION if asked else None
+            failure = NO_DECISION if self.prompt.asks_tactical(road) else None
         return Decision(
             plan=parsed.plan,
             applied=actions + (0.0,) * (count - len(actions)),

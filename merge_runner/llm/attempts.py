@@ -47,7 +47,7 @@ class Meter:
 
     def add(self, other: Meter) -> None:
         """Add the counts of another meter."""
-        for name in (count.name for count in fields(self)):
+        for name in (counted.name for counted in fields(self)):
             setattr(self, name, getattr(self, name) + getattr(other, name))
 
 

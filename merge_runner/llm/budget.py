@@ -1,12 +1,14 @@
-"""Admission control under a cap: trials are admitted and attempts reserved in their order.
+"""Admission control under a cap: trials are admitted and attempts reserved, oldest trial first.
 
-A trial is admitted only if its expected cost, and what the running trials are still expected to
-cost, fit under the cap; the first is also admitted if nothing was spent or reserved before it. So
-money finishes trials instead of beginning more. The oldest running trial may use all that is left.
-A younger one leaves what older ones are still expected to cost. So, if expectations were too low,
-the youngest are suspended first. A call that several trials share is paid by the oldest running
-one, so that a running trial never waits for the admission of another. A probe comes before all
-others and may use all that is left: older trials may wait for its reply.
+A trial is admitted if its expected cost, and what the running trials are still expected to cost,
+fit under the cap. So money finishes trials instead of beginning more. The first trial is also
+admitted if nothing was spent or reserved before it.
+
+The oldest running trial may use all that is left. A younger one leaves what older ones are still
+expected to cost. So, if expectations were too low, the youngest are suspended first. A call that
+several trials share is paid by the oldest running one, so that a running trial never waits for the
+admission of another. A probe comes first and may use all that is left, since older trials may wait
+for its reply.
 
 The worst case of an attempt is reserved in this process while it waits for its turn, and in the
 ledger right before it is sent. A server may ignore the output cap. So several attempts are in
@@ -37,12 +39,12 @@ USED_UP = "others under the same cap have used it up"
 
 @dataclass(slots=True)
 class Reservation:
-    """Worst case of one attempt, from its reservation to ``close``, the end of the attempt.
+    """Worst case of one attempt, ``usd``, from its reservation to its end, ``close``.
 
-    While ``queued``, ``usd`` is reserved in this process, and after ``begin`` in the ledger. An
-    attempt that ends before ``begin`` returns all of it to its trial. After ``book`` the
-    difference to the cost is returned. Where the cost is unknown the attempt may have been charged:
-    all of it stays in the ledger until a user releases it.
+    While ``queued`` it is reserved in this process, and after ``begin`` in the ledger. ``close``
+    returns to the trial what the attempt did not spend: all if it ends before ``begin``, the
+    difference to the cost after ``book``. If the cost is unknown, the attempt may have been
+    charged: all stays in the ledger until a user releases it.
     """
 
     budget: Budget
@@ -54,7 +56,7 @@ class Reservation:
     cost_usd: float | None = None
 
     def __post_init__(self) -> None:
-        self.budget.in_flight += 1
+        self.budget.open_reservations += 1
         self.budget.queued_usd += self.usd if self.queued else 0.0
         self._take(self.usd)
 
@@ -66,7 +68,10 @@ class Reservation:
         )
 
     async def begin(self, number: int) -> None:
-        """Reserve durably, right before the attempt is sent; raise TrialSuspended."""
+        """Reserve in the ledger, right before the attempt is sent.
+
+        Raises TrialSuspended if other processes have used up the cap.
+        """
         if not self.queued:  # it is reserved: by an earlier run, or for a batch that was refused
             return
         ledger = self.budget.ledger
@@ -85,7 +90,7 @@ class Reservation:
 
     def close(self) -> None:
         """End the attempt: return what it did not spend; nothing where its cost is unknown."""
-        self.budget.in_flight -= 1
+        self.budget.open_reservations -= 1
         if self.queued:
             self.budget.queued_usd -= self.usd
             self.cost_usd = 0.0
@@ -96,7 +101,7 @@ class Reservation:
         self.budget.queue.wake()
 
     def _take(self, usd: float) -> None:
-        """Take from the expected cost of the trial, if it still runs."""
+        """Subtract from the expected cost of the trial, if it still runs."""
         if self.trial in self.budget.expected_usd:
             self.budget.expected_usd[self.trial] -= usd
 
@@ -117,10 +122,10 @@ class MoneyQueue:
     A call takes the place of the oldest running trial that needs it.
     """
 
-    def __init__(self, ledger: Ledger, running: Mapping[int, float]) -> None:
+    def __init__(self, ledger: Ledger, expected_usd: Mapping[int, float]) -> None:
         self.waiters: list[Waiter] = []
         self._ledger = ledger
-        self._running = running
+        self._expected_usd = expected_usd
 
     @property
     def trials(self) -> set[int]:
@@ -130,7 +135,7 @@ class MoneyQueue:
     def _place(self, waiter: Waiter) -> tuple[bool, float]:
         if waiter.is_probe:
             return False, -math.inf
-        running = self._running.keys() & waiter.trials
+        running = self._expected_usd.keys() & waiter.trials
         return waiter.is_admission and not running, min(running or waiter.trials, default=math.inf)
 
     def wake(self) -> None:
@@ -139,7 +144,7 @@ class MoneyQueue:
             self.waiters[0].changed.set()
 
     def reorder(self, trial: int | None = None) -> None:
-        """Sort the queue, since a trial begins or ends; None: since one joins or leaves a call."""
+        """Sort the queue after a trial has begun or ended; None: one has joined or left a call."""
         if trial is None or any(trial in waiter.trials for waiter in self.waiters):
             self.waiters.sort(key=self._place)
         self.wake()
@@ -165,7 +170,7 @@ class Budget:
 
     The models of a run with a price share one, and its free models another one without a cap.
     A trial is named by its order in the sweep; ``trial_usd`` returns its expected cost.
-    ``in_flight`` counts reservations, ``queued_usd`` is reserved in this process alone.
+    ``open_reservations`` counts reservations, ``queued_usd`` is reserved in this process alone.
     ``expected_usd`` has, by running trial, the rest of its expected cost, below 0 where it has cost
     more.
     """
@@ -173,7 +178,7 @@ class Budget:
     def __init__(self, ledger: Ledger, trial_usd: Callable[[int], float] = lambda _: 0.0) -> None:
         self.ledger = ledger
         self.trial_usd = trial_usd
-        self.in_flight = 0
+        self.open_reservations = 0
         self.queued_usd = 0.0
         self.expected_usd: dict[int, float] = {}
         self._largest_usd = 0.0
@@ -184,7 +189,7 @@ class Budget:
     async def admit(self, trials: Sequence[int]) -> None:
         """Wait until one of the trials that share a call runs, or the oldest of them may begin.
 
-        ``trials`` may change meanwhile. Raise TrialSuspended if no other trial can free money.
+        ``trials`` may change meanwhile. Raises TrialSuspended if no other trial can free money.
         """
         if self.ledger.cap is not None and self.expected_usd.keys().isdisjoint(trials):
             may_begin = partial(self._may_begin, trials)
@@ -219,9 +224,9 @@ class Budget:
         return Reservation(self, self._payer(trials), key, label, usd)
 
     def _may_begin(self, trials: Sequence[int]) -> bool:
-        """Admit the oldest trial, unless one runs, if its expected cost fits beside those running.
+        """Return whether one of the trials runs; if none does, admit the oldest if its cost fits.
 
-        Raise TrialSuspended.
+        Raises TrialSuspended if no other trial can free money.
         """
         if not self.expected_usd.keys().isdisjoint(trials):
             return True
@@ -230,7 +235,7 @@ class Budget:
             raise TrialSuspended("its trial is suspended")
         needed_usd = self.trial_usd(trial)
         left_usd = self._left_usd(needed_usd)
-        if left_usd < needed_usd and not self.expected_usd and not self.in_flight:
+        if left_usd < needed_usd and not self.expected_usd and not self.open_reservations:
             # The first trial begins all the same: it may cost less, and each attempt must still
             # fit.
             if self._spent_before or self._largest_usd:
@@ -244,13 +249,13 @@ class Budget:
         """Return whether an attempt's worst case fits; raise TrialSuspended where it never will."""
         worst_usd = self._worst_usd(label)
         left_usd = self._left_usd(worst_usd)
-        if left_usd < worst_usd and not self.in_flight:
+        if left_usd < worst_usd and not self.open_reservations:
             raise self._suspended(f"the next call may cost {worst_usd:.4f} USD")
         older_usd = 0.0 if is_probe else self._still_expected_usd(before=self._payer(trials))
         # Only the first expensive reply shows that a server ignores the output cap, when the others
         # are sent already: all in flight may cost twice as much.
-        twice_usd = (self.in_flight + 1) * max(worst_usd, self._largest_usd)
-        return left_usd - worst_usd >= max(older_usd, twice_usd if self.in_flight else 0.0)
+        twice_usd = (self.open_reservations + 1) * max(worst_usd, self._largest_usd)
+        return left_usd - worst_usd >= max(older_usd, twice_usd if self.open_reservations else 0.0)
 
     def _payer(self, trials: Sequence[int]) -> int:
         """Return the oldest running trial of those that share a call, else the oldest."""
@@ -267,7 +272,7 @@ class Budget:
         """
         cap, ledger = self.ledger.cap, self.ledger
         assert cap is not None
-        if not self.in_flight and cap.usd - ledger.committed_usd < needed_usd:
+        if not self.open_reservations and cap.usd - ledger.committed_usd < needed_usd:
             ledger.read()
         return cap.usd - ledger.committed_usd - self.queued_usd + TOLERANCE_USD
 

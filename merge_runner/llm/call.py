@@ -96,7 +96,7 @@ class Calls:
         return [call.wait for call in self.under_way.values() if call.wait is not None]
 
     @property
-    def in_flight(self) -> int:
+    def calls_in_flight(self) -> int:
         """Number of calls in flight or being saved."""
         return sum(call.wait is None for call in self.under_way.values())
 

@@ -38,11 +38,11 @@ NO_MONEY = "for calls in flight to be paid, under the cap"
 
 @dataclass(slots=True)
 class LlmClient:
-    """Client of one model, which answers its prompts.
+    """Client of one model: returns its replies to prompts.
 
-    ``direct`` sends normal requests, ``batch`` what goes into batches. ``calls`` are the run's
-    calls. A call whose trials are all cancelled goes on while it may be billed, to store its reply;
-    one that waits is cancelled. ``strict``: a reply of another model stops the sweep.
+    ``direct`` sends normal requests, ``batch`` sends them in batches. ``calls`` are the run's
+    calls. If all trials of a call are cancelled, it goes on while it may be billed, to store its
+    reply, and is cancelled while it waits. ``strict``: a reply of another model stops the sweep.
     """
 
     endpoint: EndpointState
@@ -52,13 +52,13 @@ class LlmClient:
     batch: BatchSender | None = None
     strict: bool = False
     calls: Calls = field(default_factory=Calls)
-    recorded: RecordedReplies = field(init=False)
+    replies: RecordedReplies = field(init=False)
     probe: Probe = field(init=False)
 
     def __post_init__(self) -> None:
         """Make the parts that all calls share."""
         endpoint, entry = self.endpoint, self.endpoint.entry
-        self.recorded = RecordedReplies(
+        self.replies = RecordedReplies(
             endpoint.name, entry, endpoint.identity, endpoint.wire, self.cache
         )
         self.probe = Probe(endpoint, self.calls, self.meter)
@@ -66,24 +66,24 @@ class LlmClient:
     @property
     def meter(self) -> Meter:
         """Counts of this model's calls."""
-        return self.recorded.meter
+        return self.replies.meter
 
     async def ask(self, prompt: str, slot: Slot, *, order: int = 0) -> ChatReply:
         """Return the model's reply for a slot; lower ``order`` is served first.
 
         Raises CallFailed, TrialSuspended or SweepStopped.
         """
-        request = self.recorded.request(prompt, slot)
+        request = self.replies.request(prompt, slot)
         reply, attempts = None, None
-        with suppress(RecordingError):  # it is damaged
-            recorded, attempts = self.cache.look_up(request.key, request)
-            if recorded:
-                reply = self.recorded.read(recorded, len(recorded.attempts))
+        with suppress(RecordingError):  # damaged: no reply, and attempts stays None
+            stored, attempts = self.cache.look_up(request.key, request)
+            if stored:
+                reply = self.replies.read(stored, len(stored.attempts))
         if reply is None:
             reply = await self._shared(request, order, attempts)
-        self.recorded.count(reply, shared=request.key in self.calls.answered)
+        self.replies.count_reply(reply, shared=request.key in self.calls.answered)
         served = reply.attempts[-1].model_served
-        if self.strict and served not in self.recorded.own_names:
+        if self.strict and served not in self.replies.own_names:
             entry = self.endpoint.entry
             raise SweepStopped(
                 f"{self.endpoint.driver}: {served} answered where {entry.id} was asked for, at "
@@ -94,7 +94,7 @@ class LlmClient:
     async def _shared(
         self, request: ChatRequest, order: int, attempts: Attempts | None
     ) -> ChatReply:
-        """Return the reply of the call under way for a request, or of a new one."""
+        """Return the reply to a request, from the call under way for it or from a new call."""
         call = self.calls.under_way.get(request.key)
         is_shared = call is not None and not call.given_up
         if call is None or not is_shared:
@@ -116,16 +116,16 @@ class LlmClient:
             if call.trials:
                 self.budget.queue.reorder()
             elif call.wait is not None and not call.wait.charged:
-                call.give_up()  # or it would take money for a trial that has ended
+                call.give_up()  # it would take money for a trial that has ended
         # The attempts are counted once, for the first trial that asked.
         return replace(reply, cached_attempts=len(reply.attempts)) if is_shared else reply
 
-    def _start(self, request: ChatRequest, order: int, recorded: Attempts | None) -> Call:
+    def _start(self, request: ChatRequest, order: int, earlier: Attempts | None) -> Call:
         entry = self.endpoint.entry
         worst, usd = worst_case(entry, request.body)
         label = CallLabel(self.endpoint.driver, str(request.slot), usd)
-        call = Call(request, order, label, worst, entry.deadline_s, damaged=recorded is None)
-        call.attempts, call.earlier_attempts = [*(recorded or ())], len(recorded or ())
+        call = Call(request, order, label, worst, entry.deadline_s, damaged=earlier is None)
+        call.attempts, call.earlier_attempts = [*(earlier or ())], len(earlier or ())
         call.task = asyncio.create_task(self._call(call))
         self.calls.under_way[request.key] = call
 
@@ -165,8 +165,8 @@ class LlmClient:
                 f"{self.endpoint.driver}: {call.label.slot}: what is recorded is damaged; it is "
                 f"quarantined as 'damaged {name}' in the cache, and asked again"
             )
-        _, recorded = self.cache.look_up(key)
-        call.attempts, call.earlier_attempts = [*recorded], len(recorded)
+        _, earlier = self.cache.look_up(key)
+        call.attempts, call.earlier_attempts = [*earlier], len(earlier)
 
     async def _attempts(self, call: Call) -> ChatReply:
         """Make attempts, with backoff, until one brings an answer."""
@@ -223,7 +223,7 @@ class LlmClient:
         with closing(reservation):
             sent = await sender.send(call, reservation)
             usd = attempt_usd(sent, call.worst, self.endpoint, sender.price_factor)
-            attempt = record(call, sent, usd, reservation, self.endpoint, self.recorded.meter)
+            attempt = record(call, sent, usd, reservation, self.endpoint, self.replies.meter)
             error = sent.error or self.endpoint.error_of(call, sent.outcome)
             return await self._finish(call, reservation, attempt, sent.outcome, error)
 
@@ -245,6 +245,6 @@ class LlmClient:
         self.calls.answered.add(key)  # before others can find the reply in the cache
         kept = await reservation.book(attempt, partial(self.cache.keep, answered))
         if kept is not answered:  # an import has stored another reply first, which is used
-            return self.recorded.read(kept, len(kept.attempts))
+            return self.replies.read(kept, len(kept.attempts))
         text = outcome.reading.text
         return ChatReply(text, attempt.outcome, call.request, attempts, call.earlier_attempts)

@@ -91,10 +91,10 @@ class GroupWriter:
             operations, futures = zip(*self._waiting, strict=True)
             self._waiting = []
             # In a thread, since the event loop must not wait for a disk.
-            running = loop.run_in_executor(self._thread, self._run, operations)
-            await asyncio.wait([running])
-            failed = running.exception()
-            results = repeat(failed) if failed else running.result()
+            written = loop.run_in_executor(self._thread, self._run, operations)
+            await asyncio.wait([written])
+            failed = written.exception()
+            results = repeat(failed) if failed else written.result()
             for number, (future, result) in enumerate(zip(futures, results, strict=False), 1):
                 if number % A_FEW == 0:  # or all callers would go on in one round of the loop
                     await asyncio.sleep(0)

@@ -64,13 +64,13 @@ class RecordedReplies:
         prompt = self.prompt(question)
         request = self.request(prompt, question.slot)
         try:
-            recorded = self.calls.get(request.key, request)
+            stored = self.calls.get(request.key, request)
         except RecordingError as exc:
             raise CallFailed(f"{self.name}: call {request.key}: {exc}", request) from exc
-        if recorded is None:
+        if stored is None:
             raise ReplayMiss("no recorded reply", request)
-        reply = self.read(recorded, len(recorded.attempts))
-        self.count(reply)
+        reply = self.read(stored, len(stored.attempts))
+        self.count_reply(reply)
         return question.decision(prompt, reply)
 
     def prompt(self, question: Question) -> str:
@@ -101,18 +101,18 @@ class RecordedReplies:
             slot=slot,
         )
 
-    def read(self, recorded: CachedCall, cached_attempts: int) -> ChatReply:
+    def read(self, stored: CachedCall, cached_attempts: int) -> ChatReply:
         """Read a recorded reply by the present rules, not by its run's, as an audit does."""
-        attempts, last = recorded.attempts, recorded.attempts[-1]
+        attempts, last = stored.attempts, stored.attempts[-1]
         payload = reply_object(last.reply or "{}") if last.http_status == 200 else {}
         reading = read_reply(self.wire, payload)
         differs = (reading.outcome, reading.usage) != (last.outcome, last.usage)
         if payload and reading.outcome in ANSWERS and differs:
             last = replace(last, outcome=reading.outcome, usage=reading.usage)
             attempts = (*attempts[:-1], last)
-        return ChatReply(reading.text, last.outcome, recorded.request, attempts, cached_attempts)
+        return ChatReply(reading.text, last.outcome, stored.request, attempts, cached_attempts)
 
-    def count(self, reply: ChatReply, *, shared: bool = False) -> None:
+    def count_reply(self, reply: ChatReply, *, shared: bool = False) -> None:
         """Count a reply that a trial uses, and its model where another one was asked for.
 
         ``shared``: this run has sent its call for another trial.

@@ -1,10 +1,10 @@
 """Store of recorded replies and their costs: one SQLite file, from which nothing is evicted.
 
-An entry is the JSON of a request and all its attempts, the answering one last, after a checksum. It
+An entry is a checksum, then the JSON of a request and all its attempts, the answering one last. It
 is durable before anyone sees it: each group of writes is one synchronous SQLite transaction. The
 file also holds the attempts of calls without an answer, the notes of batches, and damaged entries
-in quarantine. Two tables in it are the ledgers of all sweeps, so that a reply and its cost are kept
-together or not at all; a third counts calls by request template.
+in quarantine. Two of its tables are the ledgers of all sweeps: a reply and its cost are stored
+together or not at all. A third table counts calls by request template.
 """
 
 from __future__ import annotations
@@ -89,8 +89,7 @@ class CacheFile:
     """Open file of a cache folder, read directly and written by a thread in groups.
 
     ``locks`` keep other live runs from asking the same model. ``write`` runs an operation in the
-    next durable transaction, and returns its future result. ``closing`` closes what is opened with
-    the folder.
+    next durable transaction, and returns its future result. ``closing`` has what ``close`` closes.
     """
 
     def __init__(self, folder: Path, *, read_only: bool, allow_previous: bool) -> None:
@@ -104,7 +103,7 @@ class CacheFile:
         self.closing = ExitStack()
         self._writer = GroupWriter(self._run_each)
         self.write = self._writer.write
-        self.summed: object = None  # the ledger that knows its sums in the transaction under way
+        self.summed: object = None  # ledger whose sums hold in the transaction under way
         try:
             prepare(folder, read_only=read_only, allow_previous=allow_previous)
             self._opened = self._file
@@ -117,7 +116,7 @@ class CacheFile:
             raise UsageError(f"the cache {folder} cannot be used: {exc}. {NEW_CACHE}") from exc
 
     def rows(self, sql: str, *values: object, execute: Execute | None = None) -> Rows:
-        """Return the rows of a query, or by ``execute`` those that its transaction sees.
+        """Return the rows of a query; with ``execute``, as its transaction sees them.
 
         Raises CacheFailed, or RecordingError for invalid text.
         """
@@ -166,7 +165,7 @@ class CacheFile:
             close_texts(self.texts)
 
     def failure(self, done: str, why: BaseException) -> CacheFailed | RecordingError:
-        """Return the error of a folder that cannot be used, or of invalid text."""
+        """Return the error for a folder that cannot be read or written, or for invalid text."""
         if "utf-8" in str(why).lower():  # the only trace in SQLite's message
             return RecordingError("the recorded reply is damaged: it is no text")
         reason = f"cannot be {done}: {str(why) or 'another program writes'}"
@@ -179,7 +178,7 @@ class CacheFile:
 
     @property
     def _file(self) -> tuple[int, int] | None:
-        """Identity of the file in the folder, since SQLite goes on with a deleted one."""
+        """Identity of the file in the folder: SQLite would go on with a deleted one."""
         with contextlib.suppress(OSError):
             status = os.stat(self.folder / FILE)
             return status.st_dev, status.st_ino
@@ -225,8 +224,8 @@ class CallStore(CacheFile):
 
         Raises RecordingError where the folder's are damaged, or do not match the ``request``.
         """
-        if recorded := self.recording[0].get(key):
-            return recorded, ()
+        if call := self.recording[0].get(key):
+            return call, ()
         rows = self.rows(_LOOK_UP, key, UNANSWERED + key)
         if not rows:
             return None, ()
@@ -319,7 +318,7 @@ def _checksum(text: str) -> str:
 
 
 def text_of(mode: object, filename: object, value: object) -> str:
-    """Return the text of a row after its checksum.
+    """Return the text of a row, without its checksum.
 
     Raises RecordingError where it is damaged, or not written by merge-runner.
     """

@@ -12,7 +12,7 @@ import pandas as pd
 from merge_runner.results.database import only
 from merge_runner.results.export import FACTOR_TYPES, wide_trials
 from merge_runner.results.rows import KEY_COLUMNS
-from merge_runner.results.store import answer
+from merge_runner.results.store import open_result
 
 TEXT = pd.StringDtype(na_value=np.nan)  # pandas' str since version 3
 # By SQL type: dtype without and with missing values; None: inferred by pandas.
@@ -29,7 +29,7 @@ DTYPES: dict[str, tuple[Any, Any]] = {
 
 def load(db: Path, sql: str) -> pd.DataFrame:
     """Return the rows of a read-only query; raises UsageError."""
-    with answer(db, sql) as result:
+    with open_result(db, sql) as result:
         return frame(result)
 
 

@@ -95,13 +95,13 @@ def recorded_part(
     for file in files:
         with opened(file) as (connection, provenance):
             counts = "SELECT condition, max(repetition) FROM recording GROUP BY ALL"
-            recorded = dict(connection.execute(counts).fetchall())
+            repetitions_of = dict(connection.execute(counts).fetchall())
         for sweep in described_sweeps(provenance):
             if sweep.name not in names or (sweep.model, sweep.sample_set) != (model, sample_set):
                 continue
-            most = max((recorded.get(name, 0) for name in sweep.conditions), default=0)
+            most = max((repetitions_of.get(name, 0) for name in sweep.conditions), default=0)
             repetitions = Counter({name: min(n, most) for name, n in sweep.repetitions.items()})
-            conditions = tuple(name for name in sweep.conditions if name in recorded)
+            conditions = tuple(name for name in sweep.conditions if name in repetitions_of)
             if part is not None:
                 repetitions |= part.repetitions  # the larger number of each
                 conditions = tuple(dict.fromkeys([*part.conditions, *conditions]))

@@ -63,5 +63,5 @@ def summary_lines(file: Path, summary: dict[str, Any]) -> Iterator[str]:
     yield f"calls    {calls} ({outcomes}), {summary['attempts']} attempts, {usd}"
     if summary["plugins"]:
         yield f"code     {', '.join(summary['plugins'])}: runs where the study is played again"
-    yield f"digest   {summary['provenance']['content_sha256']} (of its replies)"
+    yield f"hash     {summary['provenance']['content_sha256']} (of its replies, not of results)"
     yield f"again    merge-runner replay {shlex.quote(str(file))}"

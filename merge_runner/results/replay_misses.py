@@ -36,7 +36,7 @@ class Miss:
     request: ChatRequest
 
 
-def explain(misses: list[Miss], recorded: Iterable[CachedCall]) -> list[str]:
+def explain(misses: list[Miss], calls: Iterable[CachedCall]) -> list[str]:
     """Return how misses differ from the nearest recorded request, one text per kind of difference.
 
     The text names the first trial, side and decision, and the number of further ones. The nearest
@@ -46,7 +46,7 @@ def explain(misses: list[Miss], recorded: Iterable[CachedCall]) -> list[str]:
     place = attrgetter("condition", "side", "decision")
     slots = {miss.request.slot for miss in misses}
     known: dict[object, list[ChatRequest]] = {}  # by slot, the first by place, the first of all
-    for request in (entry.request for entry in recorded):
+    for request in (call.request for call in calls):
         if request.slot in slots:
             known.setdefault(request.slot, []).append(request)
         for key in (place(request.slot), None):
@@ -69,9 +69,9 @@ def explain(misses: list[Miss], recorded: Iterable[CachedCall]) -> list[str]:
     return lines
 
 
-def _differences(recorded: ChatRequest, expected: ChatRequest) -> list[str]:
+def _differences(nearest: ChatRequest, expected: ChatRequest) -> list[str]:
     """Return the differing fields with both values; for texts the first differing lines."""
-    old, new, texts = _fields(recorded), _fields(expected), []
+    old, new, texts = _fields(nearest), _fields(expected), []
     for name in sorted(old.keys() | new.keys()):
         before, after = old.get(name), new.get(name)
         if isinstance(before, str) and isinstance(after, str):

@@ -43,15 +43,15 @@ from merge_runner.results.rows import (
 from merge_runner.scenarios.merge.measures import measures_sql
 from merge_runner.trial_records import TrialRecord, TrialSpec
 
-# Whether a file may have tables. To list those of a new file is slow: DuckDB loads its own views.
+# Whether a file may have tables: to list those of a new file is slow, as DuckDB loads its views.
 IS_WRITTEN = """
 SELECT total_blocks > 0 OR wal_size <> '0 bytes' FROM pragma_database_size()
 WHERE database_name = current_database()
 """
 # Columns that depend on the run: whether it made an attempt itself, and when.
 RUN_COLUMNS = frozenset({"cached", "started_at", "latency_s"})
-# The first and the third column order the rows of a trial. A digest has the value that the source
-# of a first decision had in schema 9.
+# The first and the third column order the rows of a trial. The source of a first decision was
+# 'seat' in schema 9: with another value its digests would change.
 DIGEST_COLUMNS = {
     "trials": "pair, if(source = 'first_decision', 'seat', source), model_left, model_right, "
     "variant, condition, rep, sample_set, status, merged_first, end_time_s, error",
@@ -88,7 +88,7 @@ class Store:
     ) -> None:
         """Add a sweep with its specs, and link its trials that are already stored.
 
-        Their factor levels are added as well: another study may have stored them without.
+        Their factor levels are added: the study that stored them may have had others.
         """
         with write_database(self.path) as connection:
             connection.execute("INSERT INTO sweeps BY NAME SELECT unnest(?)", [sweep])
@@ -153,7 +153,7 @@ class Store:
         They are linked to a sweep unless ``sweep_id`` is None. Returns the keys of trials that are
         stored with other values, with the differing columns.
         """
-        # Before the lock is taken, although trials that are already stored need no rows.
+        # Made before the database is locked, although trials that are stored need no rows.
         played = [(record.spec.key, record.status, rows_of(record)) for record in records]
         calls = [call for record in records for call in record.calls]
         texts = [call.request.body for call in calls]
@@ -187,19 +187,19 @@ def query(path: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
 
     The query has no access to files, the network or settings.
     """
-    with answer(path, sql) as result:
+    with open_result(path, sql) as result:
         return names_of(result), result.fetchall()
 
 
 @contextmanager
-def answer(path: Path, sql: str) -> Iterator[duckdb.DuckDBPyConnection]:
+def open_result(path: Path, sql: str) -> Iterator[duckdb.DuckDBPyConnection]:
     """Yield the result of a query to fetch; the database is locked until the block ends."""
-    # The restrictions hold for a whole instance and cannot be lifted.
+    # An instance of its own: the restrictions hold for a whole instance and cannot be lifted.
     with read_database(path, Instance()) as connection:
         # DuckDB ignores signals while several of its threads work on a query.
         connection.execute("SET threads = 1")
         try:
-            with answering(connection, sql) as result:
+            with run_restricted(connection, sql) as result:
                 yield result
         except RuntimeError as exc:
             if "interrupted" not in str(exc):
@@ -208,7 +208,7 @@ def answer(path: Path, sql: str) -> Iterator[duckdb.DuckDBPyConnection]:
 
 
 @contextmanager
-def answering(
+def run_restricted(
     connection: duckdb.DuckDBPyConnection, sql: str
 ) -> Iterator[duckdb.DuckDBPyConnection]:
     """Run one query that can access only the open database, and yield its result to fetch.
@@ -254,8 +254,8 @@ def results_digest(path: Path, sweep_ids: Sequence[str] | None = None) -> tuple[
         keys = f"SELECT trial_id, spec_hash FROM trials {only(sweep_ids)}"  # noqa: S608
         chosen = None if sweep_ids is None else {*connection.execute(keys).fetchall()}
         for table, columns in DIGEST_COLUMNS.items():
-            # The rows of a trial are adjacent in the table, which is too large to be sorted; a join
-            # would mix them.
+            # The table is too large to be sorted, but a trial's rows are adjacent; a join would mix
+            # them.
             sql = f"SELECT trial_id, spec_hash, {columns} FROM {table}"  # noqa: S608
             for key, rows in groupby(fetched(connection.execute(sql)), key=itemgetter(0, 1)):
                 if chosen is not None and key not in chosen:

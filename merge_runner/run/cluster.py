@@ -32,8 +32,8 @@ from merge_runner.run.cluster_worker import (
     Chunk,
     MoneyEvent,
     Played,
-    Recorded,
     RunSetup,
+    StoredCalls,
     begin_chunk,
     fingerprint,
     forget,
@@ -149,7 +149,7 @@ class ClusterRunner:
         return self._setup.first
 
     @property
-    def running(self) -> int:
+    def running_trials(self) -> int:
         """The number of trials that workers have been given."""
         return sum(len(assignment.chunk.specs) for assignment in self._assigned.values())
 
@@ -204,7 +204,7 @@ class ClusterRunner:
         specs = self._groups.popleft()
         while self._groups and len(specs) + len(self._groups[0]) <= size:
             specs = specs + self._groups.popleft()
-        recorded = await recorded_calls(setup.plan, self._cache, specs)
+        calls = await recorded_calls(setup.plan, self._cache, specs)
         cap, spending = self._ledger.cap, self._ledger.read()
         if cap is not None:
             kept_usd = sum(assignment.unused_usd for assignment in self._assigned.values())
@@ -217,7 +217,7 @@ class ClusterRunner:
             cap=cap,
             specs=specs,
             share=1 / slots,
-            recorded=recorded,
+            calls=calls,
             overruns=[*spending.overruns.items()],
         )
         assignment = Assignment(address, chunk)
@@ -249,7 +249,7 @@ class ClusterRunner:
         booked = [(driver, -usd, -over_usd, 0.0) for driver, usd, over_usd in assignment.booked]
         spent = [*booked, *played.spent]
         share = partial(self._ledger.share, chunk.name, spent, played.opened)
-        self._cache.put_now(*played.recorded, [] if plan.is_free else [share])
+        self._cache.put_now(*played.calls, [] if plan.is_free else [share])
         for model, meter in played.meters.items():
             self.meters[model].add(meter)
         arms = plan.by_label()
@@ -260,10 +260,10 @@ class ClusterRunner:
                 self._groups.appendleft([spec])
                 continue
             self._ended(spec, record)
-            asked = arms[spec.arm].asked
+            names = arms[spec.arm].full_names
             for row in record.decisions if isinstance(record, TrialRecord) else ():
-                if asked[row.side] in plan.entries:
-                    self.first.count(asked[row.side], row.decision)
+                if names[row.side] in plan.entries:
+                    self.first.count_decision(names[row.side], row.decision)
         if played.exit_code:
             stopped = SweepStopped(
                 f"{played.error} (reported by the Dask worker {assignment.address})"
@@ -286,7 +286,9 @@ class ClusterRunner:
         next(iter(self.meters.values())).notes.append(lost)
 
 
-async def recorded_calls(plan: Plan, cache: ResponseCache, specs: Sequence[TrialSpec]) -> Recorded:
+async def recorded_calls(
+    plan: Plan, cache: ResponseCache, specs: Sequence[TrialSpec]
+) -> StoredCalls:
     """Return the recorded calls of trials, of each one up to its first missing call."""
     replay = Replay(plan, cache)
     answered: dict[str, CachedCall] = {}

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 # The coordinator may be slow, or its machine suspended; one that is gone never answers.
 SILENT_S = 300
 # The calls with an answer, and by key the attempts at those without one.
-Recorded = tuple[Sequence[CachedCall], Sequence[tuple[str, tuple[Attempt, ...]]]]
+StoredCalls = tuple[Sequence[CachedCall], Sequence[tuple[str, tuple[Attempt, ...]]]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,7 @@ class Chunk:
     cap: Cap | None
     specs: Sequence[TrialSpec]
     share: float
-    recorded: Recorded
+    calls: StoredCalls
     overruns: Sequence[tuple[str, float]]
 
 
@@ -81,7 +81,7 @@ class Played:
     """
 
     ended: list[tuple[TrialSpec, TrialRecord | TrialSuspended]] = field(default_factory=list)
-    recorded: Recorded = ((), ())
+    calls: StoredCalls = ((), ())
     spent: Rows = field(default_factory=list)
     opened: Rows = field(default_factory=list)
     meters: Mapping[str, Meter] = field(default_factory=dict)
@@ -253,7 +253,7 @@ async def _play(chunk: Chunk, state: WorkerRun, coordinator: RemoteCoordinator) 
         replies = stack.enter_context(closing(ResponseCache(folder)))
         ledger = Ledger(replies, setup.plan.ledger, chunk.cap, coordinator)
         overruns = [(driver, 0, 0, ratio) for driver, ratio in chunk.overruns]
-        replies.put_now(*chunk.recorded, [partial(ledger.share, "", overruns, [])])
+        replies.put_now(*chunk.calls, [partial(ledger.share, "", overruns, [])])
         try:
             calls = Calls()
             clients = live_clients(
@@ -277,9 +277,9 @@ async def _play(chunk: Chunk, state: WorkerRun, coordinator: RemoteCoordinator) 
             error = exc
         if error is not None:
             played.fail(error)
-        known = {call.request.key for call in chunk.recorded[0]}
+        known = {call.request.key for call in chunk.calls[0]}
         new = [call for call in replies.entries() if call.request.key not in known]
-        played.recorded = new, [*replies.all_unanswered().items()]
+        played.calls = new, [*replies.all_unanswered().items()]
         played.spent, played.opened = ledger.rows()
     return played
 

@@ -41,9 +41,9 @@ def earlier_answers(plan: Plan, cache: ResponseCache) -> dict[str, Usage | None]
     requests = _request_templates(plan)
     sums: dict[str, AnswerCounts] = {}
     for template, answers in chain.from_iterable(c.items() for c in answer_counts(cache)):
-        asked = template.model, template.endpoint, template.path, template.body
-        for name in (name for name, request in requests.items() if request[:2] == asked[:2]):
-            counts = template.genuine and requests[name] == asked
+        request = template.model, template.endpoint, template.path, template.body
+        for name in (name for name, known in requests.items() if known[:2] == request[:2]):
+            counts = template.genuine and requests[name] == request
             sums[name] = sums.get(name, AnswerCounts()).plus(answers if counts else AnswerCounts())
     return {name: _mean(answers) for name, answers in sums.items()}
 
@@ -57,9 +57,9 @@ def usual_latencies_s(
     for call in cache.newest(MOST_READ) if latencies else ():
         last = call.attempts[-1]
         (template,) = count_by_template([(call.request, last)])
-        asked = template.model, template.endpoint, template.path, template.body
+        request = template.model, template.endpoint, template.path, template.body
         if template.genuine and last.latency_s is not None:
-            for name in (name for name in latencies if requests[name] == asked):
+            for name in (name for name in latencies if requests[name] == request):
                 latencies[name].append(last.latency_s)
         if all(len(latencies_s) >= ENOUGH for latencies_s in latencies.values()):
             break
@@ -68,11 +68,11 @@ def usual_latencies_s(
 
 def _request_templates(plan: Plan) -> dict[str, tuple[str, str, str, str]]:
     """Return by model the id, endpoint, path and body of its requests, all but the prompt."""
-    asked = {}
+    requests = {}
     for name, entry in plan.entries.items():
         sent = plan.parts.formats[entry.format].request(entry, "")
-        asked[name] = entry.id, plan.endpoints[name], sent.path, canonical_json(sent.body)
-    return asked
+        requests[name] = entry.id, plan.endpoints[name], sent.path, canonical_json(sent.body)
+    return requests
 
 
 def _mean(answers: AnswerCounts) -> Usage | None:
@@ -129,7 +129,7 @@ def estimate(
     ``facts`` are the mean tokens of each model's earlier answers to similar requests at its
     endpoint, and ``latencies_s`` their median latencies, in place of the registry's.
     """
-    number = read = written = 0
+    all_calls = read = written = 0
     usd = singly_usd = 0.0
     by_model: defaultdict[str, float] = defaultdict(float)
     busy_s: defaultdict[str, float] = defaultdict(float)
@@ -137,27 +137,27 @@ def estimate(
     at_once = min(options.connections, 2 * max(trials, 1))
     for label, arm in plan.by_label().items():
         for name, entry in arm.entries.items():
-            asked, usage = round(calls[label][name]), _usage(plan, arm, name, facts)
+            number, usage = round(calls[label][name]), _usage(plan, arm, name, facts)
             price = cost_usd(entry, usage)
             call_usd = math.nan if price is None else price
-            number += asked
+            all_calls += number
             model = plan.registered[name]
             caps[model] = max(caps[model], entry.max_output_tokens)
-            read += asked * (usage.input_tokens or 0)
-            written += asked * (usage.output_tokens or 0)
-            singly_usd += asked * call_usd
-            asked_usd = asked * call_usd * _price_factor(entry, options.batch)
-            usd += asked_usd
-            by_model[model] += asked_usd
+            read += number * (usage.input_tokens or 0)
+            written += number * (usage.output_tokens or 0)
+            singly_usd += number * call_usd
+            arm_usd = number * call_usd * _price_factor(entry, options.batch)
+            usd += arm_usd
+            by_model[model] += arm_usd
             # An account's limits hold for a model, with whatever parameters it is asked.
             latency_s = latencies_s.get(name, entry.typical_latency_s)
             call_s = max(latency_s / at_once, _limited_s(options, entry, usage, latency_s))
-            busy_s[model] += asked * call_s
+            busy_s[model] += number * call_s
     rounds = max((math.ceil(usual_prompts(arm)) for arm in plan.arms), default=0)
     return Estimate(
         plan.driver,
         trials,
-        calls=number,
+        calls=all_calls,
         input_tokens=read,
         output_tokens=written,
         cost_usd=_cents(usd),
@@ -189,7 +189,7 @@ def trial_costs(
     by_arm: defaultdict[str, float] = defaultdict(float)
     for arm in plan.arms:
         read = _request_bytes(plan, arm)  # no tokeniser makes more tokens than bytes
-        for name in filter(arm.entries.get, arm.asked.values()):
+        for name in filter(arm.entries.get, arm.full_names.values()):
             entry = arm.entries[name]
             usual_usd = cost_usd(entry, _usage(plan, arm, name, facts)) or 0.0
             worst = Usage(input_tokens=read, output_tokens=entry.max_output_tokens)
@@ -253,7 +253,7 @@ def prompts_of(plan: Plan, arm: Arm) -> dict[str, str]:
     world = World(scenario, plan.parts.conditions[plan.conditions[0]], TRACK)
     rest = (0.25,) * (scenario.plan_actions - scenario.executed_actions)
     seen = world.observe("left")
-    names = {arm.prompt(side) for side in SIDES if arm.asked[side] in arm.entries}
+    names = {arm.prompt(side) for side in SIDES if arm.full_names[side] in arm.entries}
     return {
         name: render_prompt(seen, rest, prompt=plan.parts.prompts[name], scenario=scenario)
         for name in sorted(names)

@@ -51,7 +51,7 @@ def shown_prompts(plan: Plan) -> list[dict[str, Any]]:
     readers: dict[tuple[str, str], list[str]] = {}
     for arm in plan.arms:
         for name, text in prompts_of(plan, arm).items():
-            sides = [s for s in SIDES if arm.asked[s] in arm.entries and arm.prompt(s) == name]
+            sides = [s for s in SIDES if arm.full_names[s] in arm.entries and arm.prompt(s) == name]
             drivers = "both drivers" if len(sides) == len(SIDES) else f"the {sides[0]} driver"
             readers.setdefault((name, text), []).append(f"{drivers} of {arm.label}")
     return [
@@ -72,9 +72,9 @@ def estimate_lines(expected: Estimate) -> Iterator[str]:
     measured = ", as measured before" if expected.measured else ""
     tokens = f"about {expected.input_tokens} in, {expected.output_tokens} out{measured}"
     if not expected.trials:
-        if recorded := expected.planned - expected.stored:
+        if replayed := expected.planned - expected.stored:
             stored = f"{expected.stored} trials are stored"
-            yield f"Nothing left to ask: {stored}, and {recorded} are played from recorded replies."
+            yield f"Nothing left to ask: {stored}, and {replayed} are played from recorded replies."
         else:
             yield f"Nothing left to play: all {expected.planned} trials are stored."
         return

@@ -35,7 +35,7 @@ class FirstDecisions:
         self.valid: set[str] = set()
         self._invalid: Counter[str] = Counter()
         self._described: dict[str, str] = {}
-        self._asked: set[str] = set()  # models that a trial asks alone
+        self._alone: set[str] = set()  # models that a trial asks alone
         self._changed = asyncio.Event()
 
     @asynccontextmanager
@@ -43,18 +43,18 @@ class FirstDecisions:
         """With ``one_by_one``, wait until no other trial asks a model without a valid decision."""
         self._check()
         alone = {*models} if self._one_by_one else set()
-        while alone & self._asked - self.valid:
+        while alone & self._alone - self.valid:
             self._changed.clear()
             await self._changed.wait()
         alone -= self.valid
-        self._asked |= alone
+        self._alone |= alone
         try:
             yield
         finally:
-            self._asked -= alone
+            self._alone -= alone
             self._changed.set()
 
-    def count(self, model: str, decision: Decision) -> None:
+    def count_decision(self, model: str, decision: Decision) -> None:
         """Count a decision; raises NoValidDecision where too many are invalid."""
         text = decision.reply.text if decision.reply else ""
         self.add(model, decision.valid, not decision.valid, decision.failure, text)

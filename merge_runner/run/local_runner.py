@@ -20,7 +20,7 @@ from merge_runner.run.trials import Capacity, Ended, TrialMaker
 from merge_runner.trial import Trial
 from merge_runner.trial_records import TrialRecord, TrialSpec
 
-# More than bad luck explains, since nothing is answered between them; few enough to stop early.
+# Too many for chance, as no call is answered in between; few enough to stop early.
 FAILURES_IN_A_ROW = 10
 # Trials that begin or go on in one round of the event loop, so that each round stays short.
 A_FEW = 16
@@ -28,10 +28,10 @@ A_FEW = 16
 
 @dataclass
 class LocalRunner:
-    """Player of at most ``in_flight`` trials at once in this process; ``running`` counts them.
+    """Player of at most ``in_flight`` trials at once in this process.
 
-    With ``rounds`` their calls are submitted in batches when no trial can go on. ``workers`` is
-    None, which says that all is in this process.
+    ``running_trials`` is their number. With ``rounds`` their calls are submitted in batches when no
+    trial can go on. ``workers`` is None: there is no other process.
     """
 
     plan: Plan
@@ -40,10 +40,10 @@ class LocalRunner:
     first: FirstDecisions = field(default_factory=FirstDecisions)
     rounds: Rounds | None = None
     calls: Calls = field(default_factory=Calls)
-    running: int = 0
+    running_trials: int = 0
     workers: None = None
-    # The open questions of each trial that is running and has asked.
-    _asking: Counter[int] = field(default_factory=Counter)
+    # Numbers of open questions, by trial.
+    _open_questions: Counter[int] = field(default_factory=Counter)
     _gate: asyncio.Semaphore = field(default_factory=partial(asyncio.Semaphore, A_FEW))
     # Keys of failed calls by model and its number of answered calls: an answer starts a new set.
     _failed: dict[tuple[str, int], set[str]] = field(default_factory=partial(defaultdict, set))
@@ -54,7 +54,7 @@ class LocalRunner:
 
     @property
     def waits(self) -> Sequence[Wait]:
-        """The reasons why calls wait that are not in flight."""
+        """The waits of calls that are not in flight."""
         return self.calls.waits
 
     @property
@@ -63,14 +63,14 @@ class LocalRunner:
         return len(set().union(*(client.budget.queue.trials for client in self.clients.values())))
 
     def _is_idle(self) -> bool:
-        """Return whether every running trial waits for a reply, so that no trial can go on."""
-        asking = +self._asking  # without the trials that ask nothing now
-        return self.running == len(asking) and asking.total() == self.calls.blocked_askers
+        """Return whether all open questions wait for blocked calls, so that no trial can go on."""
+        asking = +self._open_questions  # without trials that have no open question
+        return self.running_trials == len(asking) and asking.total() == self.calls.blocked_askers
 
     @property
     def unsaved(self) -> str:
         """Text of what an interrupted run saves before it ends."""
-        return f"{self.calls.in_flight} calls in flight"
+        return f"{self.calls.calls_in_flight} calls in flight"
 
     async def play(
         self, specs: Sequence[TrialSpec], ended: Ended, capacity: Capacity | None = None
@@ -106,14 +106,14 @@ class LocalRunner:
 
     async def play_one(self, spec: TrialSpec) -> TrialRecord:
         """Play a trial; raises TrialSuspended where there is no money for it."""
-        asked = {*self._trials.arms[spec.arm].asked.values()}
-        async with self.first.turn(self.clients.keys() & asked):
-            self.running += 1
+        models = {*self._trials.arms[spec.arm].full_names.values()}
+        async with self.first.turn(self.clients.keys() & models):
+            self.running_trials += 1
             try:
                 return await self._play(spec)
             finally:
-                self.running -= 1
-                self._asking.pop(spec.order, None)
+                self.running_trials -= 1
+                self._open_questions.pop(spec.order, None)
                 for client in self.clients.values():
                     client.budget.leave(spec.order)
 
@@ -148,9 +148,9 @@ class LocalRunner:
 
     def _watch_for_outage(self, record: TrialRecord) -> None:
         """Stop when trials keep failing for one model that answers no call in between."""
-        asked = self._trials.arms[record.spec.arm].asked
+        names = self._trials.arms[record.spec.arm].full_names
         for call in record.failed_calls:
-            name = asked[call.side]
+            name = names[call.side]
             failed = self._failed[name, self.clients[name].meter.calls_live]
             failed.add(call.request.key)  # trials may share a failed call: it counts once
             if len(failed) >= FAILURES_IN_A_ROW:
@@ -165,16 +165,16 @@ class LocalRunner:
     ) -> tuple[Side, Decision] | None:
         """Return a decision; None where its call failed, which ends the trial."""
         client, side = self.clients[question.model], question.slot.side
-        self._asking[order] += 1
+        self._open_questions[order] += 1
         try:
-            prompt = client.recorded.prompt(question)
+            prompt = client.replies.prompt(question)
             reply = await client.ask(prompt, question.slot, order=order)
         except CallFailed as failure:
             trial.fail(side, failure)
             return None
         finally:
-            self._asking[order] -= 1
+            self._open_questions[order] -= 1
         decision = question.decision(prompt, reply)
         if question.model not in self.first.valid:
-            self.first.count(question.model, decision)
+            self.first.count_decision(question.model, decision)
         return side, decision

@@ -46,12 +46,14 @@ class Parts:
 
     def with_code(self, arms: Iterable[Arm], catalogue: Catalogue, hint: str = "") -> Parts:
         """Return the same with the programs and wire formats of arms; raises UsageError."""
-        asked = {name: arm.entries.get(name) for arm in arms for name in arm.asked.values()}
+        entries = {name: arm.entries.get(name) for arm in arms for name in arm.full_names.values()}
         with using(catalogue):
             return replace(
                 self,
-                programs={n: PROGRAMS.require(n, hint) for n, entry in asked.items() if not entry},
-                formats={e.format: FORMATS[e.format] for e in asked.values() if e},
+                programs={
+                    n: PROGRAMS.require(n, hint) for n, entry in entries.items() if not entry
+                },
+                formats={e.format: FORMATS[e.format] for e in entries.values() if e},
                 catalogue=catalogue,
             )
 
@@ -92,4 +94,4 @@ def find_parts(
 
 def _read(arm: Arm) -> list[str]:
     """Return the variants of the prompts that language models read in an arm."""
-    return [arm.prompt(side) for side in SIDES if arm.asked[side] in arm.entries]
+    return [arm.prompt(side) for side in SIDES if arm.full_names[side] in arm.entries]

@@ -41,7 +41,7 @@ class Plan(BaseModel):
     The column ``sweeps.config`` holds it as JSON, from which it is read again. ``model`` names
     the drivers except opponents, separated by commas, as ids of sweeps do. ``levels`` has the
     levels of each factor of its file, the reference first. ``entries`` are the language models of
-    all arms by their names in an arm's ``asked``, and ``endpoints`` the identities of their
+    all arms by their names in an arm's ``full_names``, and ``endpoints`` the identities of their
     endpoints (``providers.Endpoint``). ``probe`` is ``first`` where only first decisions are asked,
     and empty in a sweep. ``parts`` are no part of the JSON: a plan that is read has none.
     """
@@ -77,7 +77,7 @@ class Plan(BaseModel):
     @property
     def registered(self) -> dict[str, str]:
         """The names in the registry of the models of ``entries``, whatever their parameters."""
-        return {arm.asked[side]: arm.sides[side] for arm in self.arms for side in SIDES}
+        return {arm.full_names[side]: arm.sides[side] for arm in self.arms for side in SIDES}
 
     @computed_field  # type: ignore[prop-decorator] # https://github.com/python/mypy/issues/14461
     @property
@@ -198,10 +198,10 @@ def make_plan(
         conditions = grid_conditions(grid)
     if sample_set < 0:
         raise UsageError("--sample-set is a whole number from 0")
-    asked = (models,) if isinstance(models, str) else tuple(models)
-    study, catalogue = load_study(sweep, asked, trust=trust, registered=registered)
+    chosen = (models,) if isinstance(models, str) else tuple(models)
+    study, catalogue = load_study(sweep, chosen, trust=trust, registered=registered)
     file = study.file
-    drivers = chosen_models(file, asked)
+    drivers = chosen_models(file, chosen)
     pairs = (dict.fromkeys(both_sides(name).values()) for name in drivers)
     with using(catalogue):
         _check_primary(file.primary)
@@ -267,7 +267,7 @@ def _check_arms(arms: Sequence[Arm], parts: Parts, *, first: bool) -> None:
                 f"{name}: a vehicle is in its tunnel yet when the first driver decides. First "
                 'situations need control_start = "both_exits"'
             )
-        for asked in {*arm.asked.values()} - {*arm.entries}:
-            program = parts.programs[asked]
+        for driver in {*arm.full_names.values()} - {*arm.entries}:
+            program = parts.programs[driver]
             if program.data is not None:
                 program.data.check(program, arm.scenario, name, arm.repetitions)

@@ -52,5 +52,5 @@ def _count_stored(first: FirstDecisions, session: Session, store: Store) -> None
     labels = session.plan.by_label()
     arms = {spec.spec_hash: labels[spec.arm] for spec in session.stored}
     for spec_hash, side, *decisions in store.decisions_by_spec(arms) if arms else ():
-        if (model := arms[spec_hash].asked[side]) in session.plan.entries:
+        if (model := arms[spec_hash].full_names[side]) in session.plan.entries:
             first.add(model, *decisions)

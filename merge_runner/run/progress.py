@@ -95,10 +95,10 @@ class Progress:
         before = f" (+{self.trials.stored} stored before)" if self.trials.stored else ""
         workers = "" if self.runner.workers is None else f" on {self.runner.workers} workers"
         waiting = self.runner.waiting_for_money
-        running = f"{max(0, self.runner.running - waiting)} running{workers}"
-        running += f", {waiting} wait for money" if waiting else ""
+        state = f"{max(0, self.runner.running_trials - waiting)} running{workers}"
+        state += f", {waiting} wait for money" if waiting else ""
         total = self.trials.todo.total()
-        trials = f"{ended + failed}/{total} ended{before}, {running}"
+        trials = f"{ended + failed}/{total} ended{before}, {state}"
         cost = f"{meter.cost_usd:.2f} USD"
         if (cap := self.ledger.cap) is not None:
             cost += f", {self.ledger.committed_usd:.2f} of {cap.usd:g} over all runs"
@@ -157,7 +157,7 @@ class Progress:
         """
         expected, made = defaultdict[str, float](float), Counter[str]()
         for arm in self.plan.arms:
-            for name in filter(arm.entries.get, arm.asked.values()):
+            for name in filter(arm.entries.get, arm.full_names.values()):
                 model = self.plan.registered[name]
                 expected[model] += self.trials.todo[arm.label] * usual_prompts(arm)
         for name, meter in self.runner.meters.items():

@@ -81,7 +81,7 @@ def read_snapshot(db: Path, sweep_id: str) -> ProgressSnapshot | None:
     return _read(_path(db, sweep_id))
 
 
-def running(db: Path) -> list[ProgressSnapshot]:
+def running_sweeps(db: Path) -> list[ProgressSnapshot]:
     """Return the snapshots of the sweeps into this database that are running now."""
     return [snapshot for _, snapshot in _snapshots(db) if snapshot.alive]
 

@@ -23,7 +23,7 @@ class Replay:
 
     plan: Plan
     calls: RecordedCalls
-    running: int = 0
+    running_trials: int = 0
     waiting_for_money: int = 0
     waits: Sequence[Wait] = ()
     workers: None = None
@@ -71,9 +71,9 @@ class Replay:
             if capacity is not None:
                 await capacity()
             await asyncio.sleep(0)
-            self.running = 1
+            self.running_trials = 1
             ended(spec, self.play_one(spec))
-            self.running = 0
+            self.running_trials = 0
 
     async def drain(self) -> None:
         """Do nothing: no call is in flight."""

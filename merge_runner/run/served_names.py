@@ -36,15 +36,15 @@ async def with_names(
         entries[name] = entry.model_copy(
             update={"id": served_id or await _served_name(name, entry, say=say)}
         )
-        recorded: set[str] = set()
+        known: set[str] = set()
         if options.replay:
-            recorded = recorded_values(cache, "endpoint", model=entries[name].id)
-        if recorded and endpoints[name] not in recorded:
-            endpoints[name], *others = sorted(recorded)
+            known = recorded_values(cache, "endpoint", model=entries[name].id)
+        if known and endpoints[name] not in known:
+            endpoints[name], *others = sorted(known)
             if others:
                 raise UsageError(
                     f"replies of {name} are recorded from several endpoints: "
-                    f"{', '.join(sorted(recorded))}. Set the base URL variable of its provider to "
+                    f"{', '.join(sorted(known))}. Set the base URL variable of its provider to "
                     "the one to replay."
                 )
     arms = tuple(replace(arm, entries={n: entries[n] for n in arm.entries}) for arm in plan.arms)

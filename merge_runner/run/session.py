@@ -81,12 +81,12 @@ async def open_session(
         from merge_runner.run.clients import check_batches
 
         check_batches(plan, options)
-    recorded = None
+    overlay = None
     if options.recordings:
         from merge_runner.results.recording import spilled
 
-        recorded = partial(spilled, options.recordings)
-    with closing(ResponseCache(options.cache, overlay=recorded)) as cache:
+        overlay = partial(spilled, options.recordings)
+    with closing(ResponseCache(options.cache, overlay=overlay)) as cache:
         plan = await with_names(plan, options, cache, say)
         specs = {spec.key: spec for spec in plan.trial_specs()}
         # A replay derives everything from the recorded replies alone, so it plays every trial.
@@ -101,8 +101,8 @@ async def open_session(
                 resolve_endpoint(name, entry)  # raises where its key is missing
         cap = _cap(plan, options, cache, say, is_open=bool(todo) and not options.replay)
         if live:
-            asked = plan.entries.items()
-            cache.locks.take({f"{e.id} at {plan.endpoints[name]}" for name, e in asked})
+            models = plan.entries.items()
+            cache.locks.take({f"{e.id} at {plan.endpoints[name]}" for name, e in models})
         ledger = Ledger(cache, plan.ledger, cap)
         yield Session(plan, options, cache, ledger, stored, todo, say)
 

@@ -53,7 +53,7 @@ def spec_text(
 def _prompt_blocks(arm: Arm, parts: Parts) -> dict[str, str]:
     """Return the digests of the prompt's blocks; one of a single driver names its side."""
     left, right = (
-        parts.prompts[arm.prompt(side)].digests if arm.asked[side] in arm.entries else None
+        parts.prompts[arm.prompt(side)].digests if arm.full_names[side] in arm.entries else None
         for side in SIDES
     )
     if left is None or right is None:
@@ -67,7 +67,7 @@ def _prompt_blocks(arm: Arm, parts: Parts) -> dict[str, str]:
 
 
 def _driver(arm: Arm, side: Side, parts: Parts, endpoints: Mapping[str, str]) -> dict[str, object]:
-    name = arm.asked[side]
+    name = arm.full_names[side]
     entry = arm.entries.get(name)
     if entry is None:
         return parts.programs[name].in_spec(name)

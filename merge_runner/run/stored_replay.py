@@ -84,7 +84,7 @@ def audit_database(
     the folder ``cache``, if it is named, and are compared with the stored ones. Raises UsageError.
     """
     opened = nullcontext() if cache is None else closing(ResponseCache(cache, read_only=True))
-    with audited_database(path) as connection, opened as recorded:
+    with audited_database(path) as connection, opened as named_cache:
         sweeps = {row[0]: row for row in connection.execute(SWEEPS).fetchall()}
         if sweep_ids is not None:
             oldest_first = dict(reversed(sweeps.items()))
@@ -92,7 +92,7 @@ def audit_database(
                 require(oldest_first, "sweep", sweep_id, f"in {path}")
             sweeps = {name: row for name, row in sweeps.items() if name in sweep_ids}
         audits = [
-            _audit(connection, name, config, recorded, finished=finished)
+            _audit(connection, name, config, named_cache, finished=finished)
             for name, config, finished in sweeps.values()
         ]
         orphans = [check_rest(connection, path)] if sweep_ids is None else []
@@ -105,7 +105,9 @@ def check_programs(path: Path, plan: Plan, stored: Sequence[TrialSpec]) -> None:
     One trial of each spec with a program is played, by the stored replies.
     """
     arms = plan.by_label()
-    programs = {name: sorted({*arm.asked.values()} - {*arm.entries}) for name, arm in arms.items()}
+    programs = {
+        name: sorted({*arm.full_names.values()} - {*arm.entries}) for name, arm in arms.items()
+    }
     firsts = {spec.spec_hash: spec for spec in reversed(stored) if programs[spec.arm]}
     by_key = {spec.key: spec for spec in firsts.values()}
     if not by_key:
@@ -267,7 +269,7 @@ class StoredReplies:
         spec, arm = self.spec, self.arms[self.spec.arm]
         rows = sorted((r for r in self.rows if r["call_key"] == key), key=itemgetter("attempt"))
         side: Any = rows[0]["side"] if rows else None
-        name = arm.asked.get(side, "")
+        name = arm.full_names.get(side, "")
         if name not in arm.entries:
             return None
         entry = arm.entries[name]

@@ -105,7 +105,9 @@ def _stored(plan: Plan, facts: dict[str, Any]) -> dict[str, Any]:
         "invalid_decisions": facts["invalid"],
         "fallbacks": facts["fallbacks"],
         "no_decision": facts["no_decision"],
-        "model_mismatches": {f"{asked} -> {served}": n for asked, served, n in facts["others"]},
+        "model_mismatches": {
+            f"{requested} -> {served}": n for requested, served, n in facts["others"]
+        },
         "stand_ins": [row[:3] for row in facts["stand_ins"]],
         "same_prompts": [variants for (variants,) in facts["same_prompts"]],
         "failed": dict(facts["failed"]),
@@ -159,15 +161,15 @@ def _outcomes(summary: dict[str, Any]) -> str:
     return f"trials: {trials}{of}{outcomes}{before}"
 
 
-def calls_text(live: int, cached: int, shared: int, recorded: int) -> str:
+def calls_text(live: int, cached: int, shared: int, from_recordings: int) -> str:
     """Return the numbers of ``live`` calls, and of ``cached`` ones, which sent no request.
 
-    ``shared`` of the cached ones have a reply of this run, ``recorded`` a reply of a recording that
-    the user named.
+    ``shared`` of the cached ones have a reply of this run, ``from_recordings`` have one of a
+    recording that the user named.
     """
     parts = {
-        "from recordings": recorded,
-        "from the cache": cached - shared - recorded,
+        "from recordings": from_recordings,
+        "from the cache": cached - shared - from_recordings,
         "shared with another trial": shared,
     }
     had = [f"{number} {how}" for how, number in parts.items() if number]

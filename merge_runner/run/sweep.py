@@ -151,7 +151,7 @@ async def estimate_rest(session: Session, *, whole: bool = False) -> Estimate:
         if record is not None and record.status != "failed":
             continue
         trials += 1
-        for side, name in arm.asked.items():
+        for side, name in arm.full_names.items():
             if name in arm.entries:
                 answered = sum(row.side == side for row in record.decisions) if record else 0
                 calls[spec.arm][name] += max(1.0, usual_prompts(arm) - answered)
@@ -180,8 +180,8 @@ async def unsent(
     """
     with tempfile.TemporaryDirectory() as folder:
         db = options.db if options.db.is_file() else Path(folder) / "none.duckdb"
-        recorded = (options.cache / "cache.db").is_file()
-        cache = options.cache if recorded else Path(folder) / "responses"
+        has_cache = (options.cache / "cache.db").is_file()
+        cache = options.cache if has_cache else Path(folder) / "responses"
         options = replace(options, db=db, cache=cache, dry_run=True)
         with using(plan.parts.catalogue):
             async with open_session(plan, options, say=say) as session:
@@ -204,14 +204,14 @@ def _recorded_part(plan: Plan, recordings: Sequence[Path]) -> Plan:
     from merge_runner.results.recorded_sweeps import recorded_part
 
     names = {plan.study.name, plan.name}
-    recorded = recorded_part(recordings, names, plan.model, plan.sample_set)
-    if recorded is None:
+    available = recorded_part(recordings, names, plan.model, plan.sample_set)
+    if available is None:
         return plan
     arms = []
     for arm in plan.arms:
-        most = recorded.repetitions.get(arm.variant)
-        if most and (not recorded.arms or arm.label in recorded.arms):
+        most = available.repetitions.get(arm.variant)
+        if most and (not available.arms or arm.label in available.arms):
             arms.append(replace(arm, repetitions=min(arm.repetitions, most)))
-    conditions = tuple(name for name in plan.conditions if name in recorded.conditions)
+    conditions = tuple(name for name in plan.conditions if name in available.conditions)
     part = plan.model_copy(update={"arms": tuple(arms), "conditions": conditions})
     return part if part.trials else plan

@@ -39,7 +39,7 @@ class Player(Protocol):
         """The reasons why calls wait that are not in flight."""
 
     @property
-    def running(self) -> int:
+    def running_trials(self) -> int:
         """The number of trials under way."""
 
     @property
@@ -73,6 +73,7 @@ class TrialMaker:
         """Return a trial before its first decision."""
         arm = self.arms[spec.arm]
         drivers = {
-            side: self._drivers[arm.asked[side]].make(arm.scenario, spec, side) for side in SIDES
+            side: self._drivers[arm.full_names[side]].make(arm.scenario, spec, side)
+            for side in SIDES
         }
         return Trial(spec, arm.scenario, drivers)

@@ -34,7 +34,7 @@ class Arm:
     """Arm of a study: one combination of levels, played in all conditions.
 
     ``model`` is a part of trial ids. ``sides`` are the drivers by their names in the registry;
-    ``asked`` are their names with parameters, the keys of ``entries``. ``names`` are ``asked``,
+    ``full_names`` are their names with parameters, the keys of ``entries``. ``names`` has the same,
     the ego's first, without the effects that text factors plant in the emulator.
     ``factors`` are the levels as texts; ``label`` has the levels in which the arms differ. ``ego``
     is the side of the focal driver (``ego_side``). ``focal`` is the same if the two drivers have
@@ -44,7 +44,7 @@ class Arm:
 
     model: str
     sides: dict[Side, str]
-    asked: dict[Side, str]
+    full_names: dict[Side, str]
     names: tuple[str, str]
     entries: dict[str, ModelEntry]
     scenario: ScenarioConfig
@@ -92,7 +92,7 @@ class ArmDrivers:
 
     sides: dict[Side, str]
     ego: Side
-    asked: dict[Side, str]
+    full_names: dict[Side, str]
     entries: dict[Side, ModelEntry]
     one_sided: bool = False
 
@@ -174,7 +174,7 @@ class ArmDrivers:
         self.entries[side] = with_parameter(self.sides[side], before, parameter, value)
         if self.entries[side] == before:
             return False
-        self.asked[side] += f" {parameter}={text}"
+        self.full_names[side] += f" {parameter}={text}"
         return True
 
 
@@ -195,7 +195,7 @@ def make_arm(
     drivers = ArmDrivers.of(texts, registry, mirrored=mirrored)
     drivers.set_parameters(file, levels, texts)
     words, ego = drivers.words(file, texts), drivers.ego
-    names = drivers.asked[ego], drivers.asked[other_side(ego)]
+    names = drivers.full_names[ego], drivers.full_names[other_side(ego)]
     drivers.plant(words.values())
 
     def prompt(names: Iterable[str]) -> str:
@@ -214,9 +214,9 @@ def make_arm(
     return Arm(
         model="+".join(dict.fromkeys(drivers.sides.values())),
         sides=drivers.sides,
-        asked=drivers.asked,
+        full_names=drivers.full_names,
         names=names,
-        entries={drivers.asked[side]: entry for side, entry in drivers.entries.items()},
+        entries={drivers.full_names[side]: entry for side, entry in drivers.entries.items()},
         scenario=scenario,
         variant=variant,
         repetitions=repetitions,

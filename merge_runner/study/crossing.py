@@ -80,7 +80,7 @@ def cross(
             trials += conditions * arm.repetitions if twin is arm else 0
             if trials > MOST_TRIALS:
                 raise _too_many(f"more than {MOST_TRIALS:,} trials")
-            if twin.asked != arm.asked:
+            if twin.full_names != arm.full_names:
                 raise UsageError(
                     f"the crossings {twin.label!r} and {arm.label!r} have the same names, and are "
                     "asked otherwise: leave one out, by skip"

@@ -82,7 +82,7 @@ def load_study(
 
 
 def _require_consent(study: StudySource, models: Iterable[str], *, trust: bool) -> None:
-    """Ask for consent to the study's code and to the servers that get keys, once per content.
+    """Ask for consent to the study's code and to the servers that get keys, once for each content.
 
     Consent is stored in the user's state folder, where no study can write. ``trust`` gives it, and
     goes on where it cannot be stored. Raises UsageError without consent, and without a terminal.
@@ -137,13 +137,13 @@ def _ask(study: StudySource, risks: Collection[tuple[Path, str]]) -> None:
 def _endpoints(folder: Path, models: Iterable[str]) -> Iterator[tuple[Path, str, object]]:
     """Yield the models whose endpoints need consent: (file, description, content to consent to).
 
-    They are entries of a user's models.toml, if they replace a shipped model, send a key
-    that is not the provider's, or send anything to a URL that is not the provider's. Loopback
-    counts as the provider's if it needs no key.
+    They are entries of a user's models.toml that replace a shipped model, take a key from a
+    variable that is not the provider's, or send to another URL than the provider's. This machine
+    is exempt for a provider without a key.
     """
-    own_file = SHIPPED_EXPERIMENTS / REGISTRY
-    files = [path for path in registry_files(folder) if not path.samefile(own_file)]
-    shipped = read_entries(own_file) if files else {}
+    shipped_file = SHIPPED_EXPERIMENTS / REGISTRY
+    files = [path for path in registry_files(folder) if not path.samefile(shipped_file)]
+    shipped = read_entries(shipped_file) if files else {}
     defined = {name: (path, entry) for path in files for name, entry in read_entries(path).items()}
     for name in sorted({*models} & {*defined}):
         path, entry = defined[name]
@@ -154,18 +154,18 @@ def _endpoints(folder: Path, models: Iterable[str]) -> Iterator[tuple[Path, str,
         replaces = name in shipped and identity != shipped[name].model_dump(include=IDENTITY)
         try:
             origin = url_origin(endpoint_url(entry))
-            elsewhere = entry.base_url is not None and origin != url_origin(provider.base_url)
+            is_foreign = entry.base_url is not None and origin != url_origin(provider.base_url)
         except UsageError as exc:
             raise UsageError(one_line(f"{path}: [{name}]: {exc}")) from exc
-        at_home = not provider.key_needed and urlsplit(origin).hostname in LOOPBACK
+        is_local = not provider.key_needed and urlsplit(origin).hostname in LOOPBACK
         if (
             replaces
             or entry.key_env not in (None, *provider.key_envs)
-            or (elsewhere and not at_home)
+            or (is_foreign and not is_local)
         ):
             sent = entry.key_env or " or ".join(provider.key_envs) or "prompts"
-            instead = ", in place of merge-runner's own" if replaces else ""
-            words = f"sends {sent} to {origin} for the model {name}{instead}"
+            replacing = ", in place of merge-runner's own" if replaces else ""
+            words = f"sends {sent} to {origin} for the model {name}{replacing}"
             yield path, words, identity if replaces else None
 
 
@@ -217,9 +217,9 @@ def declared_catalogue(file: StudyFile) -> Catalogue:
 
 
 def _import(*args: Any, **kwargs: Any) -> Any:  # noqa: ANN401 # as the built-in function
-    """Import a module as the import statements of plug-ins do.
+    """Import a module for an import statement of a plug-in.
 
-    Its parts are installed, and not those of the study: the next study does not run it again.
+    What it registers counts as installed, not as the study's: a later study does not run it again.
     """
     with installing():
         return __import__(*args, **kwargs)

@@ -11,13 +11,13 @@ SPENDING = Spending(spent_usd=4.0, reserved_usd=0.25)
 LEDGER = SimpleNamespace(spending=SPENDING, committed_usd=SPENDING.committed_usd, cap=Cap(20))
 
 
-def runner(*meters, running=0, waits=(), waiting_for_money=0):
+def runner(*meters, running_trials=0, waits=(), waiting_for_money=0):
     """Plays nothing, and has counted this."""
     named = dict(zip(("emulator", "another"), meters, strict=False))
     return SimpleNamespace(
         meters=named,
         waits=waits,
-        running=running,
+        running_trials=running_trials,
         waiting_for_money=waiting_for_money,
         workers=None,
     )

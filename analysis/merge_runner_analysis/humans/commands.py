@@ -36,7 +36,7 @@ PathArgument = Annotated[
 def human_import(path: PathArgument, db: DbOption = DEFAULT_DB) -> None:
     """Add the recorded human trials to the database.
 
-    Those that are there stay as they are.
+    Stored ones stay unchanged.
 
     Example: merge-runner human import 19550377.zip
     """

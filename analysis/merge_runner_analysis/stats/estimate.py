@@ -11,7 +11,7 @@ from merge_runner_analysis.wording import Fact
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A number with its interval, counts and test; None stands for unknown values.
+    """A number with its interval, counts and test; None: unknown.
 
     ``ends_at`` finds the interval's ends at another ``level``, if it is not Student's t. A rate
     counts ``k`` of ``n`` trials, or replies of ``n`` trials, ``weight`` in all; one of humans is as

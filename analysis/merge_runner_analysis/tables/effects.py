@@ -61,7 +61,7 @@ GIVEN_TO = {
     "ego": "to the driver under study",
     "other": "to the other driver",
 }
-SIDES = ("", "_reference")  # of a comparison
+SUFFIXES = ("", "_reference")  # of the columns of a comparison, for its two drivers
 
 
 def effects_table(study: StudyResults) -> Table:
@@ -89,9 +89,9 @@ def effects_table(study: StudyResults) -> Table:
 
 
 def comparison(study: StudyResults, driver: str, reference: str) -> Table:
-    """Return a driver with its prompt less another, by their groups' ids: a row per measure.
+    """Return the differences of two groups, given by their ids: a row per measure.
 
-    Values are of the cells of both, or of all trials where nothing is compared.
+    Values are over the cells of both, or over all trials where nothing is compared.
     """
     known = {group.id: group for group in study.models}
     are_judged = {driver, reference} <= {*known}
@@ -100,8 +100,8 @@ def comparison(study: StudyResults, driver: str, reference: str) -> Table:
         "comparison",
         (
             Column("measure", "measure"),
-            *(Optional(f"{name}{of}", name, "count") for of in SIDES for name in ("k", "n")),
-            *(Optional(f"value{of}", f"value{of}", "number") for of in SIDES),
+            *(Optional(f"{name}{end}", name, "count") for end in SUFFIXES for name in ("k", "n")),
+            *(Optional(f"value{end}", f"value{end}", "number") for end in SUFFIXES),
             *DIFFERENCE,
         ),
         [_compared_row(study, effect) for effect in differences if _is_shown(effect)],
@@ -133,26 +133,27 @@ def _compared_row(study: StudyResults, effect: Effect) -> Row:
     """Return the row of a comparison: both sides within shared cells, or over all their trials."""
     values: dict[str, Value] = {}
     sides = (effect.level, effect.at_level), (effect.reference, effect.at_reference)
-    for of, (level, estimate) in zip(SIDES, sides, strict=True):
+    for end, (level, estimate) in zip(SUFFIXES, sides, strict=True):
         shown = level_estimate(study, level, effect.metric) if estimate.value is None else estimate
         k = shown.k if effect.metric.rate else None  # k of valid replies counts replies
-        values |= {f"k{of}": k, f"n{of}": shown.n, f"value{of}": shown.value}
+        values |= {f"k{end}": k, f"n{end}": shown.n, f"value{end}": shown.value}
     return _row(study, effect, values)
 
 
 def _is_shown(effect: Effect) -> bool:
-    """Return whether it has a test; of a level that has none a row says why."""
+    """Return whether an effect has a row; a level without a test has one that says why."""
     is_tested = not effect.across or effect.difference.p is not None
     return effect.metric.estimator != "median" and is_tested
 
 
 def _row(study: StudyResults, effect: Effect, others: dict[str, Value] | None = None) -> Row:
-    """Return the row of an effect, with ``others`` beside or instead of its values."""
+    """Return the row of an effect; ``others`` add to its values or replace them."""
     difference = effect.difference
     level, reference = effect.level.name, effect.reference.name
     if effect.across and not study.selection.by:
         level, reference = (
-            f"{of.name}{TIMES}{of.at.partition('=')[2]}" for of in (effect.level, effect.across[1])
+            f"{crossed.name}{TIMES}{crossed.at.partition('=')[2]}"
+            for crossed in (effect.level, effect.across[1])
         )
     values: dict[str, Value] = {
         "at": _place(effect.level, effect.across),
@@ -233,7 +234,7 @@ def _left_out(level: Level, metric: Metric) -> str:
 
 
 def _notes(study: StudyResults, by: str) -> Iterator[str]:
-    tested = [of for of in effects(study, by) if of.difference.p is not None]
+    tested = [effect for effect in effects(study, by) if effect.difference.p is not None]
     every = levels_by_factor(study)
     if failure := unreadable(study):
         yield failure
@@ -288,10 +289,10 @@ def _words(study: StudyResults) -> Iterator[str]:
     for factor, levels in texts_of(study).items():
         for level, text in levels.items():
             changes = (*text.add, *text.replace.values())
-            words = " ".join(filter(None, (of.merge or of.straight for of in changes)))
+            words = " ".join(filter(None, (block.merge or block.straight for block in changes)))
             shown = shorten(words, WORDS_SHOWN, placeholder=" …")
             parts = [f"“{shown}”"] if words else []
-            parts += [f"with block {of.block}" for of in text.add if of.block]
+            parts += [f"with block {added.block}" for added in text.add if added.block]
             parts += [f"without block {name}" for name in text.remove]
             yield f"{WORDS}{factor}={level}: {', '.join(parts)}, {GIVEN_TO[text.given_to]}"
 

@@ -14,7 +14,7 @@ import duckdb
 from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner.results.database import fetched
 from merge_runner.results.instance import SETTINGS, in_memory
-from merge_runner.results.store import answering
+from merge_runner.results.store import run_restricted
 from merge_runner.text_safety import csv_writer, in_spreadsheet
 from merge_runner_analysis.web.display_text import csv_cell, text_of
 from merge_runner_analysis.web.reading import Copies
@@ -109,7 +109,7 @@ class Queries:
 
             threading.Thread(target=stop, daemon=True).start()
             try:
-                with answering(connection, sql) as cursor:
+                with run_restricted(connection, sql) as cursor:
                     yield cursor
             # Python has no values for some of DuckDB's, such as intervals of millions of years.
             except (MergeRunnerError, duckdb.Error, OverflowError, ValueError) as exc:

@@ -82,14 +82,14 @@ def known_meaning(error: ServerError) -> str | None:
     names, words = error.names, error.message
     violations = [v for detail in error.details for v in as_dicts(detail.get("violations"))]
     per_day = any("PerDay" in str(violation.get("quotaId")) for violation in violations)
-    in_flight = "openrouter_in_flight_budget" in error.body and "retry-after" in error.headers
+    is_transient = "openrouter_in_flight_budget" in error.body and "retry-after" in error.headers
     cases = (
         # Azure's content filter, and OpenRouter's moderation.
         (400, "content_filter" in names, "refusal"),
         (403, "flagged_input" in error.body, "refusal"),
         (400, "invalid_prompt" in names, "bad_prompt"),  # first, since it may quote the prompt
         # OpenRouter's lack of credit while other requests run: transient.
-        (402, in_flight, "rate_limited"),
+        (402, is_transient, "rate_limited"),
         (error.status, bool(names & QUOTA), "quota_exhausted"),
         *((code, SPENT.search(words), "quota_exhausted") for code in (400, 403, 429)),
         # Gemini's daily quota has the message of one per minute, but is not transient.

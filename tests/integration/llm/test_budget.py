@@ -453,6 +453,6 @@ async def test_however_an_attempt_ends_its_money_ends_in_the_right_place(
         await ended()
     spending = budget.ledger.read()
     assert (spending.reserved_usd, spending.spent_usd) == (reserved_usd, spent_usd)
-    assert (budget.in_flight, budget.queued_usd) == (0, 0)
+    assert (budget.open_reservations, budget.queued_usd) == (0, 0)
     with pytest.raises(TrialSuspended, match=f"{kept_usd:.4f} more are reserved for the trials"):
         await set_aside(budget, 1, 5.0)

@@ -60,7 +60,7 @@ async def test_an_error_in_a_servers_words_speaks_to_no_terminal(merge_runner):
 def test_a_servers_words_are_no_markup_in_the_display():
     wait = Wait(f"after HTTP 503: [/nope] {ESCAPE}")
     shown = io.StringIO()
-    waiting = progress(runner(Meter(), running=1, waits=[wait]))
+    waiting = progress(runner(Meter(), running_trials=1, waits=[wait]))
     Console(file=shown, width=200).print(terminal_text(waiting))
     assert "[/nope]" in shown.getvalue()
     assert "\x1b" not in shown.getvalue()

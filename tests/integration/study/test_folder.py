@@ -88,7 +88,7 @@ async def test_a_recording_alone_replays_its_study_in_an_empty_folder_once_its_c
         assert (run.code, said in run.err) == (2, True), run.err
 
 
-async def test_the_summary_of_a_recording_says_study_models_trials_calls_dates_and_digest(
+async def test_the_summary_of_a_recording_says_study_models_trials_calls_dates_and_a_hash(
     merge_runner, tmp_path
 ):
     recording = PROJECT / "cache/recordings/smollm2-baseline.parquet"
@@ -100,7 +100,7 @@ async def test_the_summary_of_a_recording_says_study_models_trials_calls_dates_a
     assert facts["model"] == "SmolLM2-135M-Instruct-Q4_1: 192 calls"
     assert facts["calls"] == "192 (189 ok, 3 truncated), 193 attempts, 0.00 USD"
     whole = json.loads((await merge_runner("recording", "info", recording, "--json")).out)
-    assert facts["digest"].split()[0] == whole["provenance"]["content_sha256"]
+    assert facts["hash"].split()[0] == whole["provenance"]["content_sha256"]
     assert len(told.splitlines()) < 10
     assert facts["again"] == f"merge-runner replay {recording}"
     # It was made before recordings held their study: this is one of the program's own.

@@ -79,7 +79,7 @@ async def test_all_who_ask_the_same_at_once_share_one_call_whose_attempts_count_
 async def test_who_finds_a_reply_that_was_just_stored_shares_it(make, monkeypatch):
     """It is in the cache a moment before the call that brought it goes on."""
     client = make(answer())
-    store, key = client.budget.ledger.store, client.recorded.request("prompt", slot()).key
+    store, key = client.budget.ledger.store, client.replies.request("prompt", slot()).key
     write = store.write
 
     async def then_ask(operation):
@@ -96,7 +96,7 @@ async def test_who_finds_a_reply_that_was_just_stored_shares_it(make, monkeypatc
 async def test_a_reply_that_an_import_has_stored_first_is_no_attempt_of_this_run(make, cache):
     client = make(answer("late"))
     asked = await held(client)
-    request = client.recorded.request("prompt", slot())
+    request = client.replies.request("prompt", slot())
     imported = Attempt(1, "ok", 200, reply=answer("imported").body)
     cache.put_now([CachedCall(request, (imported,))])
     client.direct.transport.open.set()
@@ -185,7 +185,7 @@ async def test_a_damaged_reply_is_told_set_aside_and_asked_again(make, cache):
         damaged = stock[key] = stock[key].replace("old", "odd")
     client = make(answer("new"))
     with pytest.raises(CallFailed, match=key) as caught:  # a replay asks nothing again
-        client.recorded.answer(question())
+        client.replies.answer(question())
     assert caught.value.request.key == key
     assert (await client.ask("prompt", slot())).text == "new"
     assert client.meter.damaged == [key]
@@ -270,13 +270,13 @@ async def test_more_output_than_there_can_be_is_paid_whatever_is_said_of_the_inp
 async def test_who_gives_up_does_not_lose_the_call_in_flight(make, cache):
     client = make(answer("paid for"))
     asked = await held(client)
-    assert client.calls.in_flight == 1
+    assert client.calls.calls_in_flight == 1
     asked.cancel()
     drained = await begun(client.calls.drain())
     assert (asked.cancelled(), drained.done()) == (True, False)
     client.direct.transport.open.set()
     await drained
-    assert client.calls.in_flight == 0
+    assert client.calls.calls_in_flight == 0
     (kept,) = cache.entries()
     assert kept.request == client.direct.transport.sent[0]
     assert outcomes(kept.attempts) == ["ok"]
@@ -393,16 +393,16 @@ async def test_a_call_knows_itself_whether_it_is_in_flight(make):
     retrying = await begun(client.ask("prompt", slot(1)))
     client.direct.transport.open.clear()
     flying = asyncio.create_task(client.ask("prompt", slot(2)))
-    while client.calls.in_flight != 1 or len(client.direct.transport.sent) < 2:
+    while client.calls.calls_in_flight != 1 or len(client.direct.transport.sent) < 2:
         await asyncio.sleep(0)
-    client.recorded.meter = Meter()
+    client.replies.meter = Meter()
     assert [wait.what for wait in client.calls.waits] == ["after HTTP 503: m"]
     drained = await begun(client.calls.drain())
     client.direct.transport.open.set()
     await drained
     results = await asyncio.gather(retrying, flying, return_exceptions=True)
     assert [getattr(result, "text", None) for result in results] == [None, "paid for"]
-    assert (client.calls.waits, client.calls.in_flight) == ([], 0)
+    assert (client.calls.waits, client.calls.calls_in_flight) == ([], 0)
 
 
 async def test_a_model_that_was_not_asked_for_is_counted(make):
@@ -504,10 +504,10 @@ async def test_a_limit_longer_than_the_deadline_ends_the_run_and_an_outage_its_c
 async def test_a_replay_misses_what_is_not_recorded(make):
     client = make(answer("recorded"))
     await client.ask("prompt", slot())
-    prompt, reply = client.recorded.answer(question())
+    prompt, reply = client.replies.answer(question())
     assert (prompt, reply.text, reply.cached) == ("prompt", "recorded", True)
     with pytest.raises(ReplayMiss) as caught:
-        client.recorded.answer(question(repetition=2))
+        client.replies.answer(question(repetition=2))
     assert caught.value.request.slot == slot(2)
     assert (client.meter.calls_live, client.meter.calls_cached) == (1, 1)
 
@@ -519,16 +519,16 @@ async def test_a_prompt_that_an_earlier_version_has_asked_stays_as_it_was(make, 
     client = make(*map(answer, asked))
     for prompt in asked:
         await client.ask(prompt, slot())
-    assert client.recorded.prompt(question("new", older="older")) == expected
-    assert client.recorded.prompt(question("new")) == "new"
+    assert client.replies.prompt(question("new", older="older")) == expected
+    assert client.replies.prompt(question("new")) == "new"
 
 
 @pytest.mark.parametrize("body", [answer("<think>M [1"), answer("M", finish="MAX_TOKENS")])
 def test_an_answer_that_an_earlier_version_kept_is_read_by_the_rules_of_now(make, cache, body):
-    recorded = make(None).recorded
+    replies = make(None).replies
     kept = Attempt(1, "ok", http_status=200, reply=body.body)
-    cache.put_now([CachedCall(recorded.request("prompt", slot()), (kept,))], [])
-    _, reply = recorded.answer(question())
+    cache.put_now([CachedCall(replies.request("prompt", slot()), (kept,))], [])
+    _, reply = replies.answer(question())
     assert (reply.outcome, reply.attempts[-1].outcome) == ("truncated", "truncated")
     assert reply.attempts[-1].usage == Usage(10, output_tokens=5), "it was kept without"
 

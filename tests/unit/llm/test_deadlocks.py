@@ -183,7 +183,7 @@ class Study:
         runner._trials = SimpleNamespace(
             arms={
                 spec.arm: SimpleNamespace(
-                    asked={q.slot.side: q.model for step in spec.steps for q in step}
+                    full_names={q.slot.side: q.model for step in spec.steps for q in step}
                 )
                 for spec in self.specs
             },

@@ -14,13 +14,13 @@ VALID, INVALID = Decision((0.0,), (0.0,)), Decision(None, (0.0,), failure="no_ar
 def test_one_valid_decision_is_enough_and_each_model_is_counted_by_itself():
     first = FirstDecisions(MOST_INVALID)
     for _ in range(MOST_INVALID - 1):
-        first.count("a", INVALID)
-        first.count("b", INVALID)
-    first.count("a", VALID)
+        first.count_decision("a", INVALID)
+        first.count_decision("b", INVALID)
+    first.count_decision("a", VALID)
     for _ in range(MOST_INVALID):
-        first.count("a", INVALID)
+        first.count_decision("a", INVALID)
     with pytest.raises(NoValidDecision, match=r"of b is valid.*is \"\" .no array"):
-        first.count("b", INVALID)
+        first.count_decision("b", INVALID)
 
 
 async def test_trials_wait_for_the_first_valid_decision_of_each_of_their_models():
@@ -42,7 +42,7 @@ async def test_trials_wait_for_the_first_valid_decision_of_each_of_their_models(
             ("b", VALID, [0, 1, 2, 3, 4]),
         ):
             if decision:
-                first.count(model, decision)
+                first.count_decision(model, decision)
             for _ in range(10):
                 await asyncio.sleep(0)
             assert sorted(begun) == expected

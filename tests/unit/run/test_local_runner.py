@@ -22,7 +22,7 @@ class Client:
     def __init__(self, **errors):
         self.errors, self.asked, self.given_up = errors, [], []
         self.meter, self.budget = Meter(), SimpleNamespace(leave=lambda order: None)
-        self.recorded = SimpleNamespace(prompt=lambda question: question.prompt)
+        self.replies = SimpleNamespace(prompt=lambda question: question.prompt)
 
     async def ask(self, prompt, slot, *, order):
         self.asked.append(slot.side)

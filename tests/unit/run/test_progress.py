@@ -34,7 +34,7 @@ def test_every_figure_is_that_of_the_meters():
     meters = [first, Meter(calls_live=4, cost_unknown=1)]
     meters[0].outcomes["ok"] = meters[1].outcomes["timeout"] = 1
     meters[1].mismatches["o3 -> gpt-4o"] = 2
-    shown = progress(runner(*meters, running=5), began_at=ago(60))
+    shown = progress(runner(*meters, running_trials=5), began_at=ago(60))
     shown.trials.stored += 7
     shown.trials.outcome_counts.update(finished=2, failed=1, suspended=1)
     shown.trials.done.update(baseline=3)
@@ -102,13 +102,13 @@ def test_the_time_left_is_that_of_the_slowest_model_that_has_trials_left():
 
 
 def test_trials_that_wait_for_money_are_not_running():
-    waiting = dict(rows(progress(runner(running=105, waiting_for_money=103))))
+    waiting = dict(rows(progress(runner(running_trials=105, waiting_for_money=103))))
     assert waiting["trials"] == "0/10 ended, 2 running, 103 wait for money"
 
 
 def test_a_log_says_in_short_what_is_new_and_its_last_line_once(capsys):
     waits = [Wait("for money " + "for ever " * 20), Wait("for another"), Wait("for another")]
-    shown = progress(runner(running=3, waits=waits), began_at=ago(10))
+    shown = progress(runner(running_trials=3, waits=waits), began_at=ago(10))
     shown.runner.meters = {"emulator": Meter(calls_live=70)}
     log = Log()
     log.show(shown)

@@ -99,7 +99,7 @@ def test_common_names_stand_where_the_format_wants_them(plan_of, tmp_path, model
 
 def test_an_opponent_drives_on_the_right_and_keeps_its_own_parameters(plan_of):
     plan = plan_of('[factors]\ntemperature = [0.2]\nopponent = ["self", "constant", "local"]\n')
-    sides = [(arm.asked["left"], arm.asked["right"]) for arm in plan.arms]
+    sides = [(arm.full_names["left"], arm.full_names["right"]) for arm in plan.arms]
     assert sides == [
         ("emulator temperature=0.2", "emulator temperature=0.2"),
         ("emulator temperature=0.2", "constant"),

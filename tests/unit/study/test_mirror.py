@@ -34,7 +34,7 @@ def test_to_mirror_changes_no_trial_that_was_played_without(plan_of):
     assert trials(one_way).items() < trials(both_ways).items()
     assert [arm.label for arm in one_way.arms] == [arm.label for arm in both_ways.arms[:2]]
     turned = both_ways.arms[2]
-    assert turned.asked == {"left": "constant", "right": "emulator temperature=0.2"}
+    assert turned.full_names == {"left": "constant", "right": "emulator temperature=0.2"}
 
 
 def test_a_pair_of_the_command_line_is_mirrored_too(plan_of):

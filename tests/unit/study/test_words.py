@@ -134,7 +134,7 @@ def test_a_parameter_and_the_perception_may_be_those_of_one_driver(plan_of):
     arms = by_label(plan_of(text))
     assert [arm.focal for arm in arms.values()] == [None, *["left", "right"] * 3]
     warm = arms["temperature=2.0 perception=perfect mirrored"]
-    assert warm.asked == {"left": "emulator", "right": "emulator temperature=2.0"}
+    assert warm.full_names == {"left": "emulator", "right": "emulator temperature=2.0"}
     blind = arms["temperature=default perception=foggy mirrored"]
     assert blind.scenario.perception_left.speed_sd_mps == 0.3
     assert blind.scenario.perception_right.speed_sd_mps == 0.0
@@ -144,7 +144,7 @@ def test_an_effect_is_planted_in_the_emulator_on_both_sides_and_in_no_other_mode
     text = crossed(f"{EGO}\nemulator = {{ own_first = 1.5, gap_m = 2 }}", EGO)
     arms = by_label(plan_of("mirror = true\n" + text))
     arm = arms["persona=taxi hurry=yes mirrored"]
-    planted = [arm.entries[arm.asked[side]].parameters for side in SIDES]
+    planted = [arm.entries[arm.full_names[side]].parameters for side in SIDES]
     assert planted == [{"x_other_first": 1.5, "x_gap_m": 2.0}, {"x_own_first": 1.5, "x_gap_m": 2.0}]
     assert arms["persona=taxi hurry=no"].entries["emulator"].parameters == {}
     assert plan_of("mirror = true\n" + text).driver == "emulator"

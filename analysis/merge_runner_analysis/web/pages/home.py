@@ -34,10 +34,7 @@ Jobs = list[Job]
 
 
 def _question(site: Site, bar: Bar) -> tuple[Jobs, Jobs, Answer | None]:
-    """Return the jobs of the tables on factors, if any, those to wait for, and the answer.
-
-    A job without a table is waited for, even if it ends meanwhile.
-    """
+    """Return the jobs of the factor tables, those that had no table yet, and the answer."""
     if len(bar.prompts) < 2 and not site.catalogue.factors():
         return [], [], None
     part = bar.scope.sweep, bar.scope.condition
@@ -76,7 +73,7 @@ def _beside_people(
     unposed = {name: note for name, note in UNPOSED.items() if name not in people}
     gap = human["cells"].get("gap")
     is_undecided = any(of.cells["collisions"].values.get("undecided") for of in drivers if of.cells)
-    # Of crashes that are undecided the table has the bounds.
+    # The table has the bounds of undecided crashes.
     headings = {n: text for n, text in HEADINGS.items() if n != "collisions" or not is_undecided}
     return {
         "headline": headline(verdicts),
@@ -103,7 +100,7 @@ def _beside_people(
 
 
 def home_page(site: Site, asked: Mapping[str, str]) -> str:
-    """Return the study's page; raises NotThere, and NothingNew where it is as ``seen``."""
+    """Return the study's page; raises NotThere, or NothingNew if it is as it was ``seen``."""
     standing = standing_of(site.catalogue)
     bar = scope_of(site, asked)
     scope = bar.scope
