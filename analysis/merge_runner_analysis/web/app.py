@@ -18,6 +18,7 @@ from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
+from starlette.middleware.base import BaseHTTPMiddleware
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import ClientDisconnect, Request
@@ -33,7 +34,7 @@ from starlette.staticfiles import StaticFiles
 
 from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner_analysis.web.glossary import sections
-from merge_runner_analysis.web.guard import LOOPBACK, Guard
+from merge_runner_analysis.web.guard import LOOPBACK, guard
 from merge_runner_analysis.web.pages import (
     conditions,
     drivers,
@@ -49,32 +50,17 @@ from merge_runner_analysis.web.pages import (
 )
 from merge_runner_analysis.web.reading import reading
 from merge_runner_analysis.web.rendering import STATIC
-from merge_runner_analysis.web.site import (
-    NothingNew,
-    NotThere,
-    Site,
-    TooMuch,
-)
+from merge_runner_analysis.web.site import NothingNew, NotThere, Site, TooMuch
 from merge_runner_analysis.web.urls import whole
 
 # Names that a reader may type, of the pages that are called otherwise.
+_PLURALS = ("drivers", "trials", "conditions", "sweeps", "prompts", "words", "notes", "tables")
 ALIASES = {
-    "home": "",
-    "study": "",
-    "index": "",
-    "driver": "drivers",
-    "trial": "trials",
-    "condition": "conditions",
+    **dict.fromkeys(("home", "study", "index", "conditions"), ""),
+    **{name.removesuffix("s"): name for name in (*_PLURALS, "figures")},
     "run": "sweeps",
     "runs": "sweeps",
-    "sweep": "sweeps",
-    "prompt": "prompts",
-    "word": "words",
-    "note": "notes",
-    "table": "tables",
-    "figure": "figures",
     "figures": "tables",
-    "conditions": "",
 }
 LOG = logging.getLogger(__name__)
 FIRST_TIME = (
@@ -129,16 +115,12 @@ def explorer(site: Site) -> Starlette:
         routes=[
             *(Route(path, partial(_page, site, render)) for path, render in PAGES.items()),
             *(Route(f"/{alias}", _redirect) for alias in ALIASES),
-            *(
-                Route(f"/{alias}/{{name:path}}", _redirect)
-                for alias, page in ALIASES.items()
-                if page
-            ),
+            *(Route(f"/{alias}/{{name:path}}", _redirect) for alias, to in ALIASES.items() if to),
             Route("/notes", partial(_noted, site), methods=["POST"]),
             Mount("/static", StaticFiles(directory=STATIC)),
         ],
         middleware=[
-            Middleware(Guard),
+            Middleware(BaseHTTPMiddleware, dispatch=guard),
             Middleware(TrustedHostMiddleware, allowed_hosts=[LOOPBACK, "localhost"]),
             Middleware(GZipMiddleware, minimum_size=2_000),
         ],
@@ -193,7 +175,7 @@ PAGES: dict[str, Callable[..., str | Response]] = {
 
 
 async def _noted(site: Site, request: Request) -> Response:
-    """Keep what a reader notes; see ``Guard`` for who may write."""
+    """Keep what a reader notes; see ``guard`` for who may write."""
     size = whole(request.headers.get("content-length", ""))
     if size is None or size > MOST_NOTED:
         return PlainTextResponse("nothing was noted: the form is too large", 413)

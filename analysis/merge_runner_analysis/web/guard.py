@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from starlette.datastructures import Headers, MutableHeaders
-from starlette.responses import PlainTextResponse
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.middleware.base import RequestResponseEndpoint
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response
 
 LOOPBACK = "127.0.0.1"
 QUERIES = {"/sql", "/sql.csv"}  # where a link alone would run something
@@ -23,37 +23,24 @@ HEADERS = {
 }
 
 
-class Guard:
-    """Refuses requests of other sites' pages but links, and adds HEADERS to every reply."""
-
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer, or say why not."""
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
-
-        async def guarded(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                headers = MutableHeaders(scope=message)
-                for name, value in HEADERS.items():
-                    headers.setdefault(name, value)
-            await send(message)
-
-        problem = _problem(scope["method"], scope["path"], Headers(scope=scope))
-        app = PlainTextResponse(f"{problem}\n", 403) if problem else self._app
-        await app(scope, receive, guarded)
+async def guard(request: Request, answer: RequestResponseEndpoint) -> Response:
+    """Refuse requests of other sites' pages but links, and add HEADERS to every reply."""
+    problem = _problem(request)
+    reply = PlainTextResponse(f"{problem}\n", 403) if problem else await answer(request)
+    for name, value in HEADERS.items():
+        reply.headers.setdefault(name, value)
+    return reply
 
 
-def _problem(method: str, path: str, headers: Headers) -> str:
+def _problem(request: Request) -> str:
+    headers = request.headers
     origin = headers.get("origin")
     # Every browser that shows our pages says whether another site's page led here.
     from_elsewhere = headers.get("sec-fetch-site") in {"cross-site", "same-site"}
-    if method not in {"GET", "HEAD"} and (origin is None or from_elsewhere):
+    if request.method not in {"GET", "HEAD"} and (origin is None or from_elsewhere):
         return "only a page of the explorer may write here"
-    followed = headers.get("sec-fetch-mode", "navigate") == "navigate" and path not in QUERIES
+    is_link = headers.get("sec-fetch-mode", "navigate") == "navigate"
+    followed = is_link and request.url.path not in QUERIES
     is_ours = origin in {None, f"http://{headers.get('host', '')}"}
     if not is_ours or (from_elsewhere and not followed):
         return "another site's page may not ask here"

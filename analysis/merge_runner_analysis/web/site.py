@@ -27,7 +27,6 @@ from merge_runner_analysis.web.phrases import clock, condition_text
 from merge_runner_analysis.web.queries import Queries
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.rendering import environment
-from merge_runner_analysis.web.search import Words
 from merge_runner_analysis.web.urls import HOME, Links
 from merge_runner_analysis.wording import MEASURES, TABLE
 
@@ -103,7 +102,6 @@ class Site:
         self.catalogue = Catalogue(self.db)
         self.queries = Queries(self.catalogue.copies)
         self.computing = Computing(self.db)
-        self.words = Words(self.catalogue)
         self.notes = Notes(self.db, self.reader)
         self._environment = environment(
             self.at,

@@ -13,15 +13,10 @@ from merge_runner_analysis.web.comparison import compared
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.display_text import with_minus
 from merge_runner_analysis.web.effect_rows import MIDDLE, ends_text
-from merge_runner_analysis.web.judged import (
-    by_condition,
-    by_kind,
-    humans_of,
-    judged,
-    noted,
-)
+from merge_runner_analysis.web.judged import by_condition, by_kind, humans_of, judged, noted
 from merge_runner_analysis.web.marks import rate
 from merge_runner_analysis.web.scope import Scope, scope_of, unmarked
+from merge_runner_analysis.web.search import search
 from merge_runner_analysis.web.site import NotThere, Site
 from merge_runner_analysis.wording import MEASURES
 
@@ -83,7 +78,7 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         **values | {"human": humans_of(values["table"], driver)},
         awaited=awaited,
         first=first,
-        result=site.words.search(trials) if was_asked else None,
+        result=search(site.catalogue, trials) if was_asked else None,
         kept=trials,
         attempts=site.catalogue.ask(ATTEMPTS, unmarked(name), scope.prompt),
         accounts=[
