@@ -25,13 +25,7 @@ from merge_runner_analysis.web.marks import Mark
 from merge_runner_analysis.web.names import short_names
 from merge_runner_analysis.web.scope import Scope
 from merge_runner_analysis.web.site import Site
-from merge_runner_analysis.wording import (
-    LEFT_GOES_FIRST,
-    apart,
-    capital,
-    number,
-    p_value,
-)
+from merge_runner_analysis.wording import LEFT_GOES_FIRST, apart, capital, number, p_value
 
 # The trials behind a count, as a filter of their list; None where no filter keeps just these.
 Filter = dict[str, Any] | None
