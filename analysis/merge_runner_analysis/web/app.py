@@ -109,7 +109,7 @@ def explorer(site: Site) -> Starlette:
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
         yield
-        site.close()  # a server that gets a signal to end is killed after this
+        site.computing.close()  # a server that gets a signal to end is killed after this
 
     return Starlette(
         routes=[

@@ -305,7 +305,7 @@ def _opened(site: Site, patterns: Sequence[str]) -> Iterator[list[Row]]:
     try:
         yield rows
     finally:
-        site.close()
+        site.computing.close()
 
 
 @contextmanager

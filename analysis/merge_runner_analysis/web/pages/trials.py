@@ -79,12 +79,8 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
 
 def _factors(row: Row) -> str:
     """Return a trial's levels, without those that its driver's name has."""
-    levels = [*(row["levels"] or ())]
-    return ", ".join(
-        level
-        for level in levels
-        if level.partition("=")[0] != OPPONENT and level not in row["model"]
-    )
+    levels = (level for level in row["levels"] or () if level not in row["model"])
+    return ", ".join(level for level in levels if not level.startswith(f"{OPPONENT}="))
 
 
 def _unknown(site: Site, chosen: TrialFilter) -> list[tuple[str, str, list[str]]]:
