@@ -16,6 +16,7 @@ from merge_runner_analysis.web.effect_rows import MIDDLE, ends_text
 from merge_runner_analysis.web.judged import by_condition, by_kind, humans_of, judged, noted
 from merge_runner_analysis.web.marks import rate
 from merge_runner_analysis.web.scope import Scope, scope_of, unmarked
+from merge_runner_analysis.web.search import search
 from merge_runner_analysis.web.site import NotThere, Site
 from merge_runner_analysis.wording import MEASURES
 
@@ -77,7 +78,8 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         **values | {"human": humans_of(values["table"], driver)},
         awaited=awaited,
         first=first,
-        was_asked=was_asked,
+        result=search(site.catalogue, trials) if was_asked else None,
+        kept=trials,
         attempts=site.catalogue.ask(ATTEMPTS, unmarked(name), scope.prompt),
         accounts=[
             row
