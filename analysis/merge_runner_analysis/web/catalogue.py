@@ -17,7 +17,7 @@ from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.text_safety import csv_writer, first_line
 from merge_runner_analysis.web.display_text import csv_cell
-from merge_runner_analysis.web.listing import FACTOR, Listing, columns_of, list_trials
+from merge_runner_analysis.web.listing import BOTH, FACTOR, Listing, columns_of, list_trials
 from merge_runner_analysis.web.phrases import condition_text
 from merge_runner_analysis.web.reading import Copies, Copy, Row, records
 
@@ -180,7 +180,9 @@ class Catalogue:
     def cursor(self) -> duckdb.DuckDBPyConnection:
         """Return another connection: its queries keep no page waiting."""
         with self._lock:
-            return self.listing.cursor()
+            connection = self.listing.connection.cursor()
+        connection.execute(BOTH)
+        return connection
 
     def keep(self, numbers: Sequence[int]) -> None:
         """List no trials but those with these numbers."""

@@ -26,10 +26,9 @@ from merge_runner.paths import check_kind
 from merge_runner_analysis.cache import stamp_of
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.tables import TABLES
-from merge_runner_analysis.web.app import explorer
+from merge_runner_analysis.web.app import LOOPBACK, explorer
 from merge_runner_analysis.web.catalogue import FACETS
 from merge_runner_analysis.web.computing import processes
-from merge_runner_analysis.web.guard import LOOPBACK
 from merge_runner_analysis.web.leaks import check_leaks
 from merge_runner_analysis.web.listing import FACTOR
 from merge_runner_analysis.web.pages.trial import READ_AT_ONCE, trial_pages

@@ -167,12 +167,6 @@ class Listing(NamedTuple):
     others: list[Pair]
     state: Row
 
-    def cursor(self) -> duckdb.DuckDBPyConnection:
-        """Return another connection to the same tables."""
-        connection = self.connection.cursor()
-        connection.execute(BOTH)
-        return connection
-
 
 def list_trials(copy: Copy) -> Listing:
     """List all trials of a copy; raises duckdb.Error where they cannot be read."""

@@ -12,7 +12,6 @@ from merge_runner_analysis.tables.model import Row as TableRow
 from merge_runner_analysis.web.comparison import compared
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.display_text import with_minus
-from merge_runner_analysis.web.effect_rows import MIDDLE, ends_text
 from merge_runner_analysis.web.judged import by_condition, by_kind, humans_of, judged, noted
 from merge_runner_analysis.web.marks import rate
 from merge_runner_analysis.web.scope import Scope, scope_of, unmarked
@@ -72,8 +71,6 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         compared=job if is_awaited else None,
         apart=apart,
         linked=True,
-        ends_text=ends_text,
-        middle=MIDDLE,
         others=[(other, other) for other in by_name if other != name],
         **values | {"human": humans_of(values["table"], driver)},
         awaited=awaited,

@@ -15,7 +15,7 @@ from merge_runner.records import SIDES
 from merge_runner_analysis.metrics import COLLISIONS
 from merge_runner_analysis.tables.formats import printed
 from merge_runner_analysis.tables.model import Table
-from merge_runner_analysis.web.effect_rows import MIDDLE, difference_mark, ends_of, metric_of
+from merge_runner_analysis.web.effect_rows import difference_mark, ends_of, metric_of
 from merge_runner_analysis.web.phrases import UNKNOWN, block_meaning
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.scope import carried, scope_of, unmarked
@@ -95,7 +95,6 @@ def prompts_page(site: Site, asked: Mapping[str, str]) -> str:
         left_out=partial(left_out, site),
         drivers=drivers,
         ends=ends,
-        middle=MIDDLE,
         collisions=COLLISIONS.name,
         reworded=any(prompts != [BASELINE] for prompts in played.values()),
         several=several,
