@@ -127,7 +127,6 @@ def _first(site: Site, driver: str, scope: Scope) -> tuple[Job | None, str]:
 def _harder(row: TableRow) -> str:
     """Return by how many m/s² a faster driver brakes, or speeds up, harder; with interval."""
     values: Mapping[str, Any] = row.values
-    brakes = values["slope"] < 0
-    low, high = sorted(-end if brakes else end for end in values["slope_ci"])
-    word, slope = ("brake", -values["slope"]) if brakes else ("speed up", values["slope"])
-    return f"{word} {slope:.2f} m/s² harder [{low:.2f}, {high:.2f}]"
+    word, sign = ("brake", -1) if values["slope"] < 0 else ("speed up", 1)
+    low, high = sorted(sign * end for end in values["slope_ci"])
+    return f"{word} {sign * values['slope']:.2f} m/s² harder [{low:.2f}, {high:.2f}]"
