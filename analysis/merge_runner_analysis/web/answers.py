@@ -29,6 +29,7 @@ TABLE_REQUESTS = {"table": 1, "comparison": 2}  # requests of tables, and how ma
 Request = tuple[str, ...]
 """``table NAME [SWEEP CONDITION]``, ``comparison GROUP GROUP SWEEP CONDITION``,
 ``cell TABLE ROW COLUMN SWEEP CONDITION``, ``figure NAME FORM``, ``digest``, ``audit``."""
+TRIALS = "SELECT count(*) FROM trials WHERE source <> 'first_decision'"
 RUNS = """
 SELECT sweep_id, coalesce(exit_code = 0, false) FROM sweeps
 ORDER BY started_at DESC, sweep_id DESC
@@ -58,12 +59,9 @@ def cached_answer(db: Path, request: Request) -> dict[str, Any] | None:
 def _cache_key(kind: str, *named: str) -> tuple[str, Selection]:
     """Return the name of a requested table in the file of finished ones, and its trials."""
     names, part = named[: TABLE_REQUESTS[kind]], named[TABLE_REQUESTS[kind] :]
+    sweep, condition = part or ("", "")
     name = names[0] if kind == "table" else " ".join((kind, *names))
-    return name, _selected(*part)
-
-
-def _selected(sweep: str = "", condition: str = "") -> Selection:
-    return Selection(sweep=sweep, condition=condition)
+    return name, Selection(sweep=sweep, condition=condition)
 
 
 class Numbers:
@@ -83,9 +81,10 @@ class Numbers:
             case ["cell", table, row, column, *part]:
                 result = self._cell(table, row, column, *part)
             case ["figure", name, "svg" | "png" as form]:
-                result = {"file": self._figure(name, form), "digest": self._digest}
+                digest = digest_of(self.db, self._state)
+                result = {"file": self._figure(name, form), "digest": digest}
             case ["digest"]:
-                result = {"digest": self._digest}
+                result = {"digest": digest_of(self.db, self._state)}
             case ["audit"]:
                 result = {"notes": json.loads(self._cached("audit", self._audit))}
             case _:
@@ -94,10 +93,7 @@ class Numbers:
 
     def _count(self) -> str:
         with read_database(self.db) as connection:
-            counted = connection.execute(
-                "SELECT count(*) FROM trials WHERE source <> 'first_decision'"
-            )
-            return str(counted.fetchall()[0][0])
+            return str(connection.execute(TRIALS).fetchall()[0][0])
 
     @cached_property
     def study(self) -> StudyResults:
@@ -109,10 +105,6 @@ class Numbers:
     @cached_property
     def _state(self) -> str:
         return present_state(self.db)
-
-    @property
-    def _digest(self) -> str:
-        return digest_of(self.db, self._state)
 
     def _cached(self, name: str, make: Callable[[], str], options: str = "") -> str:
         return cached(self.db, self._state, options or Selection().key(self.db), name, make)
@@ -158,14 +150,12 @@ class Numbers:
                 notes[run] = findings + audit.notes
         return json.dumps(notes)
 
-    def _cell(
-        self, name: str, row: str, column: str, sweep: str = "", condition: str = ""
-    ) -> dict[str, Any]:
+    def _cell(self, name: str, row: str, column: str, *part: str) -> dict[str, Any]:
         """Return a cell's explanation and trials; a column that ends in OF has its denominator."""
         from merge_runner_analysis.explain import explain
 
-        table = from_text(self._table("table", name, sweep, condition))
-        study = self._part(_selected(sweep, condition))
+        table = from_text(self._table("table", name, *part))
+        study = self._part(_cache_key("table", name, *part)[1])
         column, of, _ = column.partition(OF)
         try:
             explained = explain(study, table, f"{row}:{column}")

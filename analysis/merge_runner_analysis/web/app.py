@@ -18,6 +18,7 @@ from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
+from starlette.middleware.base import BaseHTTPMiddleware, RequestResponseEndpoint
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import ClientDisconnect, Request
@@ -33,12 +34,10 @@ from starlette.staticfiles import StaticFiles
 
 from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner_analysis.web.glossary import sections
-from merge_runner_analysis.web.guard import LOOPBACK, Guard
 from merge_runner_analysis.web.pages import (
     conditions,
     drivers,
     home,
-    notes,
     prompts,
     sql,
     sweep,
@@ -49,32 +48,17 @@ from merge_runner_analysis.web.pages import (
 )
 from merge_runner_analysis.web.reading import reading
 from merge_runner_analysis.web.rendering import STATIC
-from merge_runner_analysis.web.site import (
-    NothingNew,
-    NotThere,
-    Site,
-    TooMuch,
-)
+from merge_runner_analysis.web.site import NothingNew, NotThere, Site, TooMuch
 from merge_runner_analysis.web.urls import whole
 
 # Names that a reader may type, of the pages that are called otherwise.
+_PLURALS = ("drivers", "trials", "conditions", "sweeps", "prompts", "words", "notes", "tables")
 ALIASES = {
-    "home": "",
-    "study": "",
-    "index": "",
-    "driver": "drivers",
-    "trial": "trials",
-    "condition": "conditions",
+    **dict.fromkeys(("home", "study", "index", "conditions"), ""),
+    **{name.removesuffix("s"): name for name in (*_PLURALS, "figures")},
     "run": "sweeps",
     "runs": "sweeps",
-    "sweep": "sweeps",
-    "prompt": "prompts",
-    "word": "words",
-    "note": "notes",
-    "table": "tables",
-    "figure": "figures",
     "figures": "tables",
-    "conditions": "",
 }
 LOG = logging.getLogger(__name__)
 FIRST_TIME = (
@@ -82,6 +66,21 @@ FIRST_TIME = (
     "back by itself."
 )
 MOST_NOTED, MOST_FIELDS = 65_536, 10  # bytes and fields of a form with a note
+LOOPBACK = "127.0.0.1"
+QUERIES = {"/sql", "/sql.csv"}  # where a link alone would run something
+# Scripts and styles are files of ours. What a model wrote could not run even if it were let in.
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
+    "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+)
+HEADERS = {
+    "content-security-policy": POLICY,
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "same-origin",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "cache-control": "no-store",
+}
 
 
 def serve(db: Path, port: int, say: Callable[[str], None], reader: str, study: str) -> None:
@@ -123,22 +122,18 @@ def explorer(site: Site) -> Starlette:
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
         yield
-        site.close()  # a server that gets a signal to end is killed after this
+        site.computing.close()  # a server that gets a signal to end is killed after this
 
     return Starlette(
         routes=[
             *(Route(path, partial(_page, site, render)) for path, render in PAGES.items()),
             *(Route(f"/{alias}", _redirect) for alias in ALIASES),
-            *(
-                Route(f"/{alias}/{{name:path}}", _redirect)
-                for alias, page in ALIASES.items()
-                if page
-            ),
+            *(Route(f"/{alias}/{{name:path}}", _redirect) for alias, to in ALIASES.items() if to),
             Route("/notes", partial(_noted, site), methods=["POST"]),
             Mount("/static", StaticFiles(directory=STATIC)),
         ],
         middleware=[
-            Middleware(Guard),
+            Middleware(BaseHTTPMiddleware, dispatch=guard),
             Middleware(TrustedHostMiddleware, allowed_hosts=[LOOPBACK, "localhost"]),
             Middleware(GZipMiddleware, minimum_size=2_000),
         ],
@@ -186,14 +181,14 @@ PAGES: dict[str, Callable[..., str | Response]] = {
     "/prompts": prompts.prompts_page,
     "/discordant": prompts.discordant_page,
     "/words": words.words_page,
-    "/notes": notes.notes_page,
+    "/notes": trial.notes_page,
     "/sql": sql.sql_page,
     "/sql.csv": sql.sql_csv,
 }
 
 
 async def _noted(site: Site, request: Request) -> Response:
-    """Keep what a reader notes; see ``Guard`` for who may write."""
+    """Keep what a reader notes; see ``guard`` for who may write."""
     size = whole(request.headers.get("content-length", ""))
     if size is None or size > MOST_NOTED:
         return PlainTextResponse("nothing was noted: the form is too large", 413)
@@ -202,12 +197,36 @@ async def _noted(site: Site, request: Request) -> Response:
     def write() -> Response:
         site.refresh()
         try:
-            row = notes.add_note(site, dict(parse_qsl(body, max_num_fields=MOST_FIELDS)))
+            row = trial.add_note(site, dict(parse_qsl(body, max_num_fields=MOST_FIELDS)))
         except (UsageError, ValueError) as exc:
             return PlainTextResponse(str(exc), 400)
         return RedirectResponse(site.at.trial(row), 303)
 
     return await run_in_threadpool(write)
+
+
+async def guard(request: Request, answer: RequestResponseEndpoint) -> Response:
+    """Refuse requests of other sites' pages but links, and add HEADERS to every reply."""
+    problem = _problem(request)
+    reply = PlainTextResponse(f"{problem}\n", 403) if problem else await answer(request)
+    for name, value in HEADERS.items():
+        reply.headers.setdefault(name, value)
+    return reply
+
+
+def _problem(request: Request) -> str:
+    headers = request.headers
+    origin = headers.get("origin")
+    # Every browser that shows our pages says whether another site's page led here.
+    from_elsewhere = headers.get("sec-fetch-site") in {"cross-site", "same-site"}
+    if request.method not in {"GET", "HEAD"} and (origin is None or from_elsewhere):
+        return "only a page of the explorer may write here"
+    is_link = headers.get("sec-fetch-mode", "navigate") == "navigate"
+    followed = is_link and request.url.path not in QUERIES
+    is_ours = origin in {None, f"http://{headers.get('host', '')}"}
+    if not is_ours or (from_elsewhere and not followed):
+        return "another site's page may not ask here"
+    return ""
 
 
 def _errors(site: Site) -> dict[Any, Callable[[Request, Exception], Response]]:

@@ -17,7 +17,7 @@ from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.text_safety import csv_writer, first_line
 from merge_runner_analysis.web.display_text import csv_cell
-from merge_runner_analysis.web.listing import FACTOR, Listing, columns_of, list_trials
+from merge_runner_analysis.web.listing import BOTH, FACTOR, Listing, columns_of, list_trials
 from merge_runner_analysis.web.phrases import condition_text
 from merge_runner_analysis.web.reading import Copies, Copy, Row, records
 
@@ -87,6 +87,7 @@ CAUSES = """
 SELECT number, list((value, times) ORDER BY value) AS causes FROM several
 WHERE facet = 'cause' AND value NOT LIKE 'attempt: %' GROUP BY number
 """
+CONDITIONS = "SELECT DISTINCT condition, projected_headway_m, relative_velocity_mps FROM listed"
 EXPORTED = (
     "trial_id spec_hash source model variant condition projected_headway_m relative_velocity_mps "
     "rep pair ego status merged_first end_time_s error scripted stand_in caution outcome validity "
@@ -179,7 +180,9 @@ class Catalogue:
     def cursor(self) -> duckdb.DuckDBPyConnection:
         """Return another connection: its queries keep no page waiting."""
         with self._lock:
-            return self.listing.cursor()
+            connection = self.listing.connection.cursor()
+        connection.execute(BOTH)
+        return connection
 
     def keep(self, numbers: Sequence[int]) -> None:
         """List no trials but those with these numbers."""
@@ -272,12 +275,16 @@ class Catalogue:
 
     def condition_texts(self) -> dict[str, str]:
         """Return the conditions in words, of humans' trials and of all others."""
-        numbers = "condition, projected_headway_m, relative_velocity_mps"
-        played = self.ask(f"SELECT DISTINCT {numbers} FROM listed")  # noqa: S608 # constants
-        return {
-            name: condition_text(condition.projected_headway_m, condition.relative_velocity_mps)
-            for name, condition in HUMAN_CONDITIONS.items()
-        } | {name: condition_text(*of) for name, *of in map(dict.values, played)}
+
+        def read() -> dict[str, str]:
+            known = {
+                name: (of.projected_headway_m, of.relative_velocity_mps)
+                for name, of in HUMAN_CONDITIONS.items()
+            }
+            played = {name: of for name, *of in map(dict.values, self.ask(CONDITIONS))}
+            return {name: condition_text(*of) for name, of in (known | played).items()}
+
+        return self._once("conditions", read)
 
     def export(self, filters: TrialFilter, sort: str) -> str:
         """Return all trials of a filter as CSV, with a column for each factor but the model."""

@@ -25,13 +25,7 @@ from merge_runner_analysis.web.marks import Mark
 from merge_runner_analysis.web.names import short_names
 from merge_runner_analysis.web.scope import Scope
 from merge_runner_analysis.web.site import Site
-from merge_runner_analysis.wording import (
-    LEFT_GOES_FIRST,
-    apart,
-    capital,
-    number,
-    p_value,
-)
+from merge_runner_analysis.wording import LEFT_GOES_FIRST, apart, capital, number, p_value
 
 # The trials behind a count, as a filter of their list; None where no filter keeps just these.
 Filter = dict[str, Any] | None
@@ -40,22 +34,14 @@ TrialsOf = Callable[[str, int], Filter]
 
 
 @dataclass(frozen=True, slots=True)
-class Side:
-    """A driver's value in a measure, with the trials that it counts and their filters."""
-
-    text: str
-    k: int | None
-    n: int
-    k_trials: Filter
-    n_trials: Filter
-
-
-@dataclass(frozen=True, slots=True)
 class Difference:
-    """A measure of both drivers; ``mark`` is on an axis that ends at ``end`` on both sides."""
+    """A measure of both drivers; ``mark`` is on an axis that ends at ``end`` on both sides.
+
+    ``sides`` have the value of each, the trials that it counts, and their filters.
+    """
 
     name: str
-    sides: tuple[Side, Side]
+    sides: list[dict[str, Any]]
     difference: str
     interval: str
     mark: Mark | None
@@ -158,12 +144,9 @@ def _difference(row: Row, trials: tuple[TrialsOf, TrialsOf], name: str) -> Diffe
     values: Any = row.values
     is_tested = values["difference"] is not None
     end = ends_of([row])[metric_of(row)] if is_tested else 0.0
-    first, second = (
-        _side(row, of, filter_of) for of, filter_of in zip(("", "_reference"), trials, strict=True)
-    )
     return Difference(
         capital(name),
-        (first, second),
+        [_side(row, of, to) for of, to in zip(("", "_reference"), trials, strict=True)],
         unbroken(_with_unit(row, "difference", sign="+")) if is_tested else "–",
         unbroken(interval_text(row)),
         difference_mark(row, end) if is_tested and values["p_corrected"] is not None else None,
@@ -174,14 +157,13 @@ def _difference(row: Row, trials: tuple[TrialsOf, TrialsOf], name: str) -> Diffe
     )
 
 
-def _side(row: Row, of: str, filter_of: TrialsOf) -> Side:
+def _side(row: Row, of: str, filter_of: TrialsOf) -> dict[str, Any]:
     values: Any = row.values
-    metric, k, n = metric_of(row), values[f"k{of}"], values[f"n{of}"]
+    metric, k, n, value = metric_of(row), *(values[f"{name}{of}"] for name in ("k", "n", "value"))
     unit = unit_of(row).replace("points", "%")
-    value = values[f"value{of}"]
     text = number(None) if value is None else unbroken(f"{amount(row, value)} {unit}")
     k_trials = None if k is None else filter_of(f"k {metric}", k)
-    return Side(text, k, n, k_trials, filter_of(metric, n))
+    return {"text": text, "k": k, "n": n, "k_trials": k_trials, "n_trials": filter_of(metric, n)}
 
 
 def _with_unit(row: Row, name: str, sign: str = "") -> str:

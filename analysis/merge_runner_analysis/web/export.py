@@ -26,10 +26,9 @@ from merge_runner.paths import check_kind
 from merge_runner_analysis.cache import stamp_of
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.tables import TABLES
-from merge_runner_analysis.web.app import explorer
+from merge_runner_analysis.web.app import LOOPBACK, explorer
 from merge_runner_analysis.web.catalogue import FACETS
 from merge_runner_analysis.web.computing import processes
-from merge_runner_analysis.web.guard import LOOPBACK
 from merge_runner_analysis.web.leaks import check_leaks
 from merge_runner_analysis.web.listing import FACTOR
 from merge_runner_analysis.web.pages.trial import READ_AT_ONCE, trial_pages
@@ -106,45 +105,35 @@ def export_folder(
 def export_page(db: Path, file: Path, patterns: Sequence[str]) -> Path:
     """Write one page with the trials of these names; returns its path. Raises UsageError."""
     check_kind(file, HTML, "page of HTML")
-    trials: set[tuple[str, str]] = set()
-    site = _site_of_a_page(db, trials)
+    shown: set[tuple[str, str]] = set()
+
+    def leads(address: str) -> str:
+        """Return the address of a trial that the page holds; empty for all others."""
+        parts = urlsplit(address)
+        trial, asked = unquote(parts.path.removeprefix("/trials/")), dict(parse_qsl(parts.query))
+        is_there = (trial, asked.get("spec", "")) in shown
+        return query_of({"trial": trial, **asked}) if is_there else ""
+
+    inlined = inlined_texts([STYLE, *SCRIPTS])
+    site = Site(db, Links(leads), policy=policy_of(inlined), inlined=inlined)
     with _opened(site, patterns) as rows, _staged(file.parent) as stage:
-        trials.update((row["trial_id"], row["spec_hash"]) for row in rows)
-        (stage / file.name).write_text(_page_of_trials(site, rows), encoding="utf-8")
+        shown.update((row["trial_id"], row["spec_hash"]) for row in rows)
+        if len(rows) == 1:
+            (page,) = trial_pages(site, rows)
+        else:  # rendered by templates of ours
+            trials = list(
+                zip(rows, map(Markup, trial_pages(site, rows, "_trial.html")), strict=True)
+            )
+            scripts = [*REPLAY, "single.js"]
+            page = site.render("several.html", view="trials", trials=trials, scripts=scripts)
+        check_leaks(db, "the page", page)
+        (stage / file.name).write_text(_linked(page), encoding="utf-8")
     return file
 
 
 def _linked(page: str) -> str:
     """Return a page in which a link that leads nowhere is a text."""
     return page.replace(' href=""', "")
-
-
-def _site_of_a_page(db: Path, trials: Collection[tuple[str, str]]) -> Site:
-    """Return a site for one page, which links to those trials alone that it holds: name, spec."""
-
-    def leads(address: str) -> str:
-        parts = urlsplit(address)
-        trial, asked = unquote(parts.path.removeprefix("/trials/")), dict(parse_qsl(parts.query))
-        is_there = (trial, asked.get("spec", "")) in trials
-        return query_of({"trial": trial, **asked}) if is_there else ""
-
-    inlined = inlined_texts([STYLE, *SCRIPTS])
-    return Site(db, Links(leads), policy=policy_of(inlined), inlined=inlined)
-
-
-def _page_of_trials(site: Site, rows: Sequence[Row]) -> str:
-    """Return one page with trials; raises UsageError."""
-    template = "trial.html" if len(rows) == 1 else "_trial.html"
-    pages = list(trial_pages(site, rows, template))
-    page = pages[0]
-    if len(rows) > 1:
-        # Rendered by templates of ours.
-        trials = zip(rows, map(Markup, pages), strict=True)
-        page = site.render(
-            "several.html", view="trials", trials=list(trials), scripts=[*REPLAY, "single.js"]
-        )
-    check_leaks(site.db, "the page", page)
-    return _linked(page)
 
 
 class _Crawl:
@@ -315,7 +304,7 @@ def _opened(site: Site, patterns: Sequence[str]) -> Iterator[list[Row]]:
     try:
         yield rows
     finally:
-        site.close()
+        site.computing.close()
 
 
 @contextmanager

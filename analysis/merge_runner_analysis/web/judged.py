@@ -118,25 +118,18 @@ def drivers_of(site: Site, table: Table | None, scope: Scope) -> list[Driver]:
     for group, verdicts in groups.items():
         name, _, prompt = group.rpartition("/")
         of, spec = (rows.get((unmarked(name), prompt)) for rows in (facts, specs))
-        kind = next((str(values["kind"]) for values in verdicts.values()), _kind(of))
+        usual = LANGUAGE_MODEL if of and of["asked"] else PROGRAM
+        usual = MOCK if of and of["who"] == "mocks" else usual
+        kind = next((str(values["kind"]) for values in verdicts.values()), usual)
         if kind == HUMANS:
             continue
-        body = json.loads((spec and spec["body"]) or "{}")
-        parameters = [
-            f"{key} {value}" for key, value in body.items() if isinstance(value, str | int | float)
-        ]
-        drivers.append(
-            Driver(
-                name,
-                prompt,
-                kind,
-                cells(verdicts, measures),
-                summary_of(verdicts, of, kind),
-                of,
-                spec["endpoint"] if spec else "",
-                ", ".join(parameters),
-            )
+        body = json.loads((spec and spec["body"]) or "{}").items()
+        sent = ", ".join(
+            f"{key} {value}" for key, value in body if isinstance(value, str | int | float)
         )
+        text, endpoint = summary_of(verdicts, of, kind), spec["endpoint"] if spec else ""
+        of_driver = cells(verdicts, measures)
+        drivers.append(Driver(name, prompt, kind, of_driver, text, of, endpoint, sent))
     return drivers
 
 
@@ -163,12 +156,6 @@ def summary_of(verdicts: Mapping[str, Values], facts: Row | None, kind: str) -> 
             f"people drove{once.get(kind, '')}."
         )
     return text
-
-
-def _kind(facts: Row | None) -> str:
-    if facts and facts["who"] == "mocks":
-        return MOCK
-    return LANGUAGE_MODEL if facts and facts["asked"] else PROGRAM
 
 
 def by_kind(drivers: Sequence[Driver]) -> dict[str, list[Driver]]:

@@ -22,12 +22,7 @@ from merge_runner.served_model import Pair, other_models, sql_of
 from merge_runner_analysis.calls import COUNTED
 from merge_runner_analysis.drivers import language_models, stand_in, unresponsive
 from merge_runner_analysis.web.reading import Copy, Row, records
-from merge_runner_analysis.web.trial.account import (
-    ALONE,
-    OTHER_ACCOUNTS,
-    Course,
-    collision_class,
-)
+from merge_runner_analysis.web.trial.account import ALONE, OTHER_ACCOUNTS, Course, collision_class
 from merge_runner_analysis.web.trial.reader import scenario_of
 
 # The names of both: of the list, and of the copy.
@@ -172,12 +167,6 @@ class Listing(NamedTuple):
     others: list[Pair]
     state: Row
 
-    def cursor(self) -> duckdb.DuckDBPyConnection:
-        """Return another connection to the same tables."""
-        connection = self.connection.cursor()
-        connection.execute(BOTH)
-        return connection
-
 
 def list_trials(copy: Copy) -> Listing:
     """List all trials of a copy; raises duckdb.Error where they cannot be read."""
@@ -192,9 +181,7 @@ def list_trials(copy: Copy) -> Listing:
     return Listing(connection, others, state)
 
 
-def judged_collisions(
-    connection: duckdb.DuckDBPyConnection,
-) -> list[tuple[str, str, str | None]]:
+def judged_collisions(connection: duckdb.DuckDBPyConnection) -> list[tuple[str, str, str | None]]:
     """Return each trial that collided, with its spec and the class of the collision."""
     return [
         (row["trial_id"], row["spec_hash"], _collision(row))

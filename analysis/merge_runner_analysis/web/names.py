@@ -52,9 +52,8 @@ def opponents_text(names: Iterable[str]) -> str:
     is_pair = {"+" in name for name in names}
     if is_pair == {False}:
         return "Each driver here met a copy of itself."
-    of_pair = "A+B: driver A met driver B."
-    alone = "A driver named alone met a copy of itself."
-    return " ".join([of_pair] * (True in is_pair) + [alone] * (False in is_pair))
+    alone = " A driver named alone met a copy of itself."
+    return "A+B: driver A met driver B." + alone * (False in is_pair) if is_pair else ""
 
 
 def names_mean(programs: Iterable[Mapping[str, Any]], drivers: Iterable[str]) -> dict[str, str]:

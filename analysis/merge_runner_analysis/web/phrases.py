@@ -98,3 +98,10 @@ def causes_text(causes: Iterable[tuple[str, int]]) -> str:
 def clock(time_s: float) -> str:
     """Return a time in seconds, to a tenth or, where that is not exact, a hundredth."""
     return f"{time_s:.1f}" if abs(time_s - round(time_s, 1)) < 1e-6 else f"{time_s:.2f}"
+
+
+def duration(seconds: float) -> str:
+    """Return a time span in s, min or h."""
+    if seconds < 5_400:
+        return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h"

@@ -13,10 +13,13 @@ import jinja2
 from jinja2.bccache import Bucket
 from markupsafe import Markup
 
-from merge_runner_analysis.web.display_text import visible, with_minus, with_whole_names
+from merge_runner.llm.ledger import APART
+from merge_runner_analysis.web.display_text import clamped, visible, with_minus, with_whole_names
+from merge_runner_analysis.web.effect_rows import MIDDLE, ends_text
 from merge_runner_analysis.web.glossary import used_terms
 from merge_runner_analysis.web.marks import SHAPES
-from merge_runner_analysis.web.phrases import plain
+from merge_runner_analysis.web.phrases import block_meaning, duration, plain
+from merge_runner_analysis.web.pictures import accelerations, sparkline, step_points
 from merge_runner_analysis.web.urls import Links
 from merge_runner_analysis.wording import (
     MINUS,
@@ -98,7 +101,10 @@ def environment(
     verdicts[SHAPES[SHOWN]] += f", or the {TENDENCY}"
     made.globals.update(at=at, policy=policy, inlined=inlined or {}, style=STYLE, **shared)
     made.globals.update(verdict_shapes=verdicts, verdict_rule=capital(VERDICT_RULE))
-    made.globals["peoples_rule"] = PEOPLES_RULE
+    made.globals.update(peoples_rule=PEOPLES_RULE, sums_apart=APART, middle=MIDDLE)
+    made.globals.update(ends_text=ends_text, duration=duration, clamped=clamped)
+    made.globals.update(meaning=block_meaning, sparkline=sparkline, points=step_points)
+    made.globals.update(accelerations=accelerations)
     for name in MACROS:
         macros = vars(made.get_template(f"_{name}.html").module)
         made.globals |= {k: v for k, v in macros.items() if k[0] != "_"}

@@ -17,7 +17,6 @@ from pandas.api.types import is_string_dtype
 
 from merge_runner.drivers.registry import MOCKS
 from merge_runner.errors import UsageError
-from merge_runner.llm.ledger import APART
 from merge_runner.prompts.blocks import BASELINE, title_of
 from merge_runner.records import NO_DECISION
 from merge_runner.results.database import read_database
@@ -39,7 +38,6 @@ from merge_runner_analysis.tables.formats import render, table_view
 from merge_runner_analysis.tables.model import Column, Row, Table
 from merge_runner_analysis.tables.verdicts import verdicts
 from merge_runner_analysis.web.comparison import Comparison, comparison_of, no_trials
-from merge_runner_analysis.web.effect_rows import MIDDLE
 from merge_runner_analysis.web.listing import judged_collisions
 from merge_runner_analysis.web.names import names_mean, programs_of, short_names
 from merge_runner_analysis.web.phrases import plain
@@ -157,7 +155,6 @@ def report_html(study: StudyResults, tables: list[Table], figures: dict[str, str
         ),
         linked=False,
         part={},
-        middle=MIDDLE,
         figures=[(name, FIGURES[name].caption, data) for name, data in figures.items()],
         tables=views,
         notes=_once(views),
@@ -168,7 +165,6 @@ def report_html(study: StudyResults, tables: list[Table], figures: dict[str, str
         command=sql_command(study),
         libraries=", ".join(f"{name} {version(name)}" for name in LIBRARIES),
         origin=origin,
-        sums_apart=APART,
         shown_plainly=_plain,
         readings=published("readings"),
         cited=published("sources"),

@@ -14,7 +14,7 @@ from merge_runner.driver_names import both_sides, pair_name
 from merge_runner.paths import DEFAULT_DB, command_at
 from merge_runner.run.progress_file import ProgressSnapshot, read_snapshot
 from merge_runner_analysis.web.catalogue import Catalogue, TrialFilter
-from merge_runner_analysis.web.phrases import called
+from merge_runner_analysis.web.phrases import called, duration
 from merge_runner_analysis.web.reading import Row
 
 REFUSED = 2
@@ -176,10 +176,3 @@ def assessment_of(run: Row) -> tuple[str, str]:
     if run["failed"]:
         return "stopped", f"Ended: {counted} have an outcome{failures}."
     return "stopped", f"Stopped by an error that it printed: {counted} have an outcome."
-
-
-def duration(seconds: float) -> str:
-    """Return a time span in s, min or h."""
-    if seconds < 5_400:
-        return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
-    return f"{seconds / 3600:.1f} h"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 from merge_runner_analysis.web.catalogue import Catalogue, facets_of, where_of
@@ -51,64 +50,60 @@ FROM decided JOIN listed USING (trial_id, spec_hash) WHERE {{}}
 FOUND = "hits JOIN listed USING (number)"
 
 
-@dataclass(slots=True)
-class Words:
-    """Search in the words of a database's drivers, one query at a time."""
+SEARCHING = threading.Lock()  # a search reads all texts: they are made one at a time
 
-    catalogue: Catalogue
-    _lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def search(
-        self,
-        filters: Mapping[str, str],
-        terms: Sequence[str] = (),
-        limits: Mapping[str, str] | None = None,
-        page: int = 1,
-    ) -> dict[str, Any]:
-        """Return decisions with all ``terms`` within ``limits``; ``hits`` are one page's.
+def search(
+    catalogue: Catalogue,
+    filters: Mapping[str, str],
+    terms: Sequence[str] = (),
+    limits: Mapping[str, str] | None = None,
+    page: int = 1,
+) -> dict[str, Any]:
+    """Return decisions with all ``terms`` within ``limits``; ``hits`` are one page's.
 
-        Those of mock models are the last. Each has the ``pieces`` of its words. ``crossed`` counts
-        all of them by intention, M or Y, and by plan.
-        """
-        limits = limits or {}
-        conditions = ["true", *(LIMITS[name] for name in limits)]
-        if terms:
-            holding = " AND ".join([f"contains({FOLDED}, lower(?))"] * len(terms))
-            conditions.append(f"place IN (SELECT rowid FROM decisions WHERE {holding})")  # noqa: S608 # constants
-        where, values = where_of(filters)
-        matches = f"FROM {FOUND} WHERE {where}"
-        with self._lock, self.catalogue.cursor() as connection:
-            connection.execute(HITS.format(" AND ".join(conditions)), [*limits.values(), *terms])
-            (totals,) = records(
-                connection,
-                "SELECT count(*) AS decisions, count(DISTINCT number) AS trials, "
-                "histogram(planned) FILTER (tactical = 'M') AS \"M\", "
-                f"histogram(planned) FILTER (tactical = 'Y') AS \"Y\" {matches}",
-                values,
-            )
-            last_page = max(1, -(-totals["decisions"] // PAGE))
-            page = min(page, last_page)
-            rows = records(
-                connection,
-                f"SELECT trial_id, spec_hash, outcome, hits.* {matches} "
-                "ORDER BY who, trial_id, spec_hash, hits.decision, hits.side "
-                f"LIMIT {PAGE} OFFSET ?",
-                [*values, PAGE * (page - 1)],
-            )
-            texts = dict(
-                connection.execute(
-                    f"SELECT rowid, left(rationale, {LONGEST}) FROM decisions "  # noqa: S608 # constants
-                    "WHERE rowid IN (SELECT unnest(?::BIGINT[]))",
-                    [[row["place"] for row in rows]],
-                ).fetchall()
-            )
-            facets = facets_of(connection, FOUND, FACETS, filters)
-        crossed = {letter: counts for letter in "MY" if (counts := totals.pop(letter))}
-        for row in rows:
-            text = texts.get(row["place"])
-            row["pieces"] = None if text is None else pieces_of(text, terms)
-        return {**totals, "hits": rows, "page": page, "last_page": last_page, "facets": facets,
-                "crossed": crossed}  # fmt: skip
+    Those of mock models are the last. Each has the ``pieces`` of its words. ``crossed`` counts
+    all of them by intention, M or Y, and by plan.
+    """
+    limits = limits or {}
+    conditions = ["true", *(LIMITS[name] for name in limits)]
+    if terms:
+        holding = " AND ".join([f"contains({FOLDED}, lower(?))"] * len(terms))
+        conditions.append(f"place IN (SELECT rowid FROM decisions WHERE {holding})")  # noqa: S608 # constants
+    where, values = where_of(filters)
+    matches = f"FROM {FOUND} WHERE {where}"
+    with SEARCHING, catalogue.cursor() as connection:
+        connection.execute(HITS.format(" AND ".join(conditions)), [*limits.values(), *terms])
+        (totals,) = records(
+            connection,
+            "SELECT count(*) AS decisions, count(DISTINCT number) AS trials, "
+            "histogram(planned) FILTER (tactical = 'M') AS \"M\", "
+            f"histogram(planned) FILTER (tactical = 'Y') AS \"Y\" {matches}",
+            values,
+        )
+        last_page = max(1, -(-totals["decisions"] // PAGE))
+        page = min(page, last_page)
+        rows = records(
+            connection,
+            f"SELECT trial_id, spec_hash, outcome, hits.* {matches} "
+            "ORDER BY who, trial_id, spec_hash, hits.decision, hits.side "
+            f"LIMIT {PAGE} OFFSET ?",
+            [*values, PAGE * (page - 1)],
+        )
+        texts = dict(
+            connection.execute(
+                f"SELECT rowid, left(rationale, {LONGEST}) FROM decisions "  # noqa: S608 # constants
+                "WHERE rowid IN (SELECT unnest(?::BIGINT[]))",
+                [[row["place"] for row in rows]],
+            ).fetchall()
+        )
+        facets = facets_of(connection, FOUND, FACETS, filters)
+    crossed = {letter: counts for letter in "MY" if (counts := totals.pop(letter))}
+    for row in rows:
+        text = texts.get(row["place"])
+        row["pieces"] = None if text is None else pieces_of(text, terms)
+    return {**totals, "hits": rows, "page": page, "last_page": last_page, "facets": facets,
+            "crossed": crossed}  # fmt: skip
 
 
 def terms_of(query: str) -> tuple[str, ...]:

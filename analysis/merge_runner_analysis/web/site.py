@@ -27,22 +27,14 @@ from merge_runner_analysis.web.phrases import clock, condition_text
 from merge_runner_analysis.web.queries import Queries
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.rendering import environment
-from merge_runner_analysis.web.search import Words
 from merge_runner_analysis.web.urls import HOME, Links
 from merge_runner_analysis.wording import MEASURES, TABLE
 
 # Scripts that draw and move a trial, in the order of loading.
 _PARTS = "moment track charts ribbons panel clock comparison start"
 REPLAY = [f"replay/{part}.js" for part in _PARTS.split()]
-PAGES = {
-    "Study": HOME,
-    "Drivers": "drivers",
-    "Trials": "trials",
-    "Words": "words",
-    "Prompts": "prompts",
-    "Runs": "sweeps",
-    "SQL": "sql",
-}
+PAGES = {"Study": HOME, "Drivers": "drivers", "Trials": "trials", "Words": "words",
+         "Prompts": "prompts", "Runs": "sweeps", "SQL": "sql"}  # fmt: skip
 # The parts of a scope in an address; the list of trials filters by the same names.
 SCOPE = ("sweep", "model", "variant", "condition")
 # Pages with one list of all their entries.
@@ -99,11 +91,9 @@ class Site:
 
     def __post_init__(self) -> None:
         self._first_reading: threading.Thread | None = None
-        self._conditions: dict[str, str] = {}
         self.catalogue = Catalogue(self.db)
         self.queries = Queries(self.catalogue.copies)
         self.computing = Computing(self.db)
-        self.words = Words(self.catalogue)
         self.notes = Notes(self.db, self.reader)
         self._environment = environment(
             self.at,
@@ -128,22 +118,19 @@ class Site:
     def begin(self) -> None:
         """Read the trials and make the first page's table, before anything is asked."""
         self.computing.ask(("table", TABLE, "", ""), stamp_of(self.db))
-        self._first_reading = threading.Thread(
-            target=copy_context().run, args=(self._read_first,), daemon=True
-        )
-        self._first_reading.start()
 
-    def _read_first(self) -> None:
-        # The first page tries again, and says what is wrong.
-        with contextlib.suppress(MergeRunnerError):
-            self.refresh()
+        def read() -> None:
+            with contextlib.suppress(MergeRunnerError):  # the first page says what is wrong
+                self.refresh()
+
+        self._first_reading = threading.Thread(target=copy_context().run, args=(read,), daemon=True)
+        self._first_reading.start()
 
     def refresh(self) -> None:
         """Take in what is new: in the database, and in the notes beside it."""
         if self.is_still:
             return
-        if self.catalogue.refresh():
-            self._conditions = {}
+        self.catalogue.refresh()
         self.catalogue.tag(self.notes.read().tags)
 
     def trial(self, trial_id: str, spec_hash: str) -> Row:
@@ -175,9 +162,7 @@ class Site:
 
     def in_words(self, condition: str) -> str:
         """Return a condition in words; empty where no human drove it and it has no trial."""
-        if condition not in self._conditions:
-            self._conditions = self.catalogue.condition_texts()
-        return self._conditions.get(condition, "")
+        return self.catalogue.condition_texts().get(condition, "")
 
     @property
     def beginning(self) -> bool:
@@ -198,7 +183,3 @@ class Site:
         """Return a page, or a part of one."""
         values = {"is_locked": self.catalogue.copies.is_locked, **values}
         return self._environment.get_template(template).render(values)
-
-    def close(self) -> None:
-        """Leave nothing behind."""
-        self.computing.close()

@@ -5,7 +5,8 @@ from datetime import datetime
 import pytest
 
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner_analysis.web.runs import duration, run_of
+from merge_runner_analysis.web.phrases import duration
+from merge_runner_analysis.web.runs import run_of
 from tests.support.cases import cases
 
 CONFIG = {

@@ -12,16 +12,10 @@ from merge_runner_analysis.tables.model import Row as TableRow
 from merge_runner_analysis.web.comparison import compared
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.display_text import with_minus
-from merge_runner_analysis.web.effect_rows import MIDDLE, ends_text
-from merge_runner_analysis.web.judged import (
-    by_condition,
-    by_kind,
-    humans_of,
-    judged,
-    noted,
-)
+from merge_runner_analysis.web.judged import by_condition, by_kind, humans_of, judged, noted
 from merge_runner_analysis.web.marks import rate
 from merge_runner_analysis.web.scope import Scope, scope_of, unmarked
+from merge_runner_analysis.web.search import search
 from merge_runner_analysis.web.site import NotThere, Site
 from merge_runner_analysis.wording import MEASURES
 
@@ -77,13 +71,11 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         compared=job if is_awaited else None,
         apart=apart,
         linked=True,
-        ends_text=ends_text,
-        middle=MIDDLE,
         others=[(other, other) for other in by_name if other != name],
         **values | {"human": humans_of(values["table"], driver)},
         awaited=awaited,
         first=first,
-        result=site.words.search(trials) if was_asked else None,
+        result=search(site.catalogue, trials) if was_asked else None,
         kept=trials,
         attempts=site.catalogue.ask(ATTEMPTS, unmarked(name), scope.prompt),
         accounts=[
@@ -135,7 +127,6 @@ def _first(site: Site, driver: str, scope: Scope) -> tuple[Job | None, str]:
 def _harder(row: TableRow) -> str:
     """Return by how many m/s² a faster driver brakes, or speeds up, harder; with interval."""
     values: Mapping[str, Any] = row.values
-    brakes = values["slope"] < 0
-    low, high = sorted(-end if brakes else end for end in values["slope_ci"])
-    word, slope = ("brake", -values["slope"]) if brakes else ("speed up", values["slope"])
-    return f"{word} {slope:.2f} m/s² harder [{low:.2f}, {high:.2f}]"
+    word, sign = ("brake", -1) if values["slope"] < 0 else ("speed up", 1)
+    low, high = sorted(sign * end for end in values["slope_ci"])
+    return f"{word} {sign * values['slope']:.2f} m/s² harder [{low:.2f}, {high:.2f}]"

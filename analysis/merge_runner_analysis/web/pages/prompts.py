@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -15,11 +15,10 @@ from merge_runner.records import SIDES
 from merge_runner_analysis.metrics import COLLISIONS
 from merge_runner_analysis.tables.formats import printed
 from merge_runner_analysis.tables.model import Table
-from merge_runner_analysis.web.effect_rows import MIDDLE, difference_mark, ends_of, metric_of
-from merge_runner_analysis.web.judged import Driver, judged
+from merge_runner_analysis.web.effect_rows import difference_mark, ends_of, metric_of
 from merge_runner_analysis.web.phrases import UNKNOWN, block_meaning
 from merge_runner_analysis.web.reading import Row
-from merge_runner_analysis.web.scope import scope_of, unmarked
+from merge_runner_analysis.web.scope import carried, scope_of, unmarked
 from merge_runner_analysis.web.site import NotThere, Site
 from merge_runner_analysis.web.trial.prompt_parts import Part, digests_of, level_of, parts_of
 from merge_runner_analysis.wording import ALPHA
@@ -73,45 +72,34 @@ def prompts_page(site: Site, asked: Mapping[str, str]) -> str:
     bar = scope_of(site, asked)
     chosen = bar.scope.drivers or bar.drivers
     job, contrasts = site.table("contrasts", bar.scope.sweep, bar.scope.condition)
-    played, values = judged(site, bar, asked)
-    driven: dict[str, list[Driver]] = {}
-    for driver in played:
-        if unmarked(driver.name) in chosen:
-            driven.setdefault(driver.name, []).append(driver)
     drivers, ends = differences(contrasts, chosen) if contrasts else ({}, {})
-    # Those that were played with several prompts, the baseline first.
-    kinds = {
-        name: sorted(prompts, key=lambda driver: driver.prompt != BASELINE)
-        for name, prompts in sorted(driven.items())
-        if len(prompts) > 1
-    }
+    filters = {**bar.scope.filters, "variant": "", "who": ["drivers", "mocks"]}
+    played: dict[str, list[str]] = {}
+    for row in site.catalogue.counts(filters, "model", "variant"):
+        played.setdefault(row["model"], []).append(row["variant"])
+    several = {name: prompts for name, prompts in played.items() if len(prompts) > 1}
+    otherwise = []  # k of n trials that ended otherwise than with the baseline
+    for name, prompts in () if drivers else several.items():
+        for prompt in prompts:
+            pairs, differing = pairs_of(site, name, prompt)
+            if differing:
+                otherwise.append((name, prompt, len(differing), len(pairs)))
     return site.render(
         "prompts.html",
         view="prompts",
-        **values | {"headings": {}},
+        bar=bar,
+        carried=carried(asked),
         job=job,
         contrasts=contrasts,
         prompts=_first_prompts(site),
         left_out=partial(left_out, site),
         drivers=drivers,
         ends=ends,
-        middle=MIDDLE,
         collisions=COLLISIONS.name,
-        reworded=any(driver.prompt != BASELINE for played in driven.values() for driver in played),
-        kinds=kinds,
-        otherwise=() if drivers else [*_ended_otherwise(site, kinds)],
+        reworded=any(prompts != [BASELINE] for prompts in played.values()),
+        several=several,
+        otherwise=otherwise,
     )
-
-
-def _ended_otherwise(
-    site: Site, kinds: Mapping[str, Sequence[Driver]]
-) -> Iterator[tuple[str, str, int, int]]:
-    """Yield drivers with prompts of which k of n trials ended otherwise than with the baseline."""
-    for name, (first, *others) in kinds.items():
-        for variant in others if first.prompt == BASELINE else ():
-            pairs, differing = pairs_of(site, name, variant.prompt)
-            if differing:
-                yield name, variant.prompt, len(differing), len(pairs)
 
 
 def _first_prompts(site: Site) -> dict[str, dict[str, list[Part]]]:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from merge_runner.llm.ledger import APART
 from merge_runner_analysis.task import RULE, task_settings
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.listing import MISSING
 from merge_runner_analysis.web.reading import Row
-from merge_runner_analysis.web.runs import duration, list_runs, numbers_of
+from merge_runner_analysis.web.runs import list_runs, numbers_of
 from merge_runner_analysis.web.scope import carried, scope_of
 from merge_runner_analysis.web.site import NothingNew, NotThere, Site, news_of
 from merge_runner_analysis.wording import PLAYED_RULES, RULES_MEAN
@@ -65,7 +64,6 @@ def sweeps_page(site: Site, asked: Mapping[str, str]) -> str:
         counted=counted,
         audit=audit_of(site, runs),
         shown=[rate for rate in TRUST if str(rate["count"]) in ALWAYS or rare[str(rate["count"])]],
-        duration=duration,
         seen=news_of((runs, site.catalogue.state), asked.get("seen", "")),
     )
 
@@ -94,9 +92,7 @@ def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
                 for setting in task_settings(arm.get("scenario") or {})
             )
         ),
-        sums_apart=APART,
         causes=site.catalogue.ask(CAUSES, sweep_id),
-        duration=duration,
         seen=news_of((run, site.catalogue.state), seen, state),
         # A screen reader says the sentence once a state, and not every time that a number changes.
         quiet=seen.startswith(f"{state}-"),

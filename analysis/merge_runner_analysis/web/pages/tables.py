@@ -5,6 +5,7 @@ from __future__ import annotations
 from base64 import b64encode
 from collections.abc import Collection, Mapping
 from importlib import metadata
+from typing import Any
 
 from starlette.responses import Response
 
@@ -22,15 +23,10 @@ FIGURE_FILES = {"svg": "image/svg+xml", "png": "image/png"}
 GROUPS = {
     "Do they drive like people?": ("verdicts", "first-action", "criticality"),
     "What makes a difference?": ("effects", "contrasts", "factors"),
-    "The tables of the paper": (
-        "who-first",
-        "gap",
-        "indicators",
-        "ablation-qualitative",
-        "ablation-quantitative",
-    ),
+    "The tables of the paper":
+        ("who-first", "gap", "indicators", "ablation-qualitative", "ablation-quantitative"),
     "More": ("attempts",),
-}
+}  # fmt: skip
 # Matplotlib writes styles into its SVG, and traces as pictures.
 DRAWN = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox"
 
@@ -69,21 +65,19 @@ def figure_page(site: Site, name: str, _: Mapping[str, str]) -> str:
         about=about,
         computed=job,
         image=b64encode(job.content["file"]).decode() if job.content else "",
-        descriptions=descriptions_of(site),
-        version=metadata.version("merge-runner"),
+        **_cited(site),
     )
 
 
 def cite_page(site: Site, _: Mapping[str, str]) -> str:
     """Return the page that says how to cite the results of a study."""
-    return site.render(
-        "cite.html",
-        view="cite",
-        computed=site.computed(("digest",)),
-        cited_as="Results",
-        descriptions=descriptions_of(site),
-        version=metadata.version("merge-runner"),
-    )
+    job = site.computed(("digest",))
+    return site.render("cite.html", view="cite", computed=job, cited_as="Results", **_cited(site))
+
+
+def _cited(site: Site) -> dict[str, Any]:
+    version = metadata.version("merge-runner")
+    return {"descriptions": descriptions_of(site), "version": version}
 
 
 def table_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
@@ -98,9 +92,7 @@ def table_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         about=TABLES[name].about,
         computed=job,
         table=table
-        and table_view(
-            table, lambda table, row, column: site.at.cell(table.name, row.id, column.name)
-        ),
+        and table_view(table, lambda _, row, column: site.at.cell(name, row.id, column.name)),
         columns=columns,
         places=[place for place, column in enumerate(columns) if column.name not in without],
         without=without,

@@ -1,4 +1,4 @@
-"""One trial, one decision of it, and other trials to compare: a search by words, or an offer."""
+"""One trial with its decisions and notes, and others to compare: a search by words, or an offer."""
 
 from __future__ import annotations
 
@@ -13,9 +13,7 @@ from markupsafe import Markup
 from merge_runner.llm.formats import reasoning_of
 from merge_runner.records import DAMAGED, reply_object
 from merge_runner.text_safety import quoted
-from merge_runner_analysis.web.display_text import clamped, shortened, visible
-from merge_runner_analysis.web.phrases import block_meaning
-from merge_runner_analysis.web.pictures import accelerations, step_points
+from merge_runner_analysis.web.display_text import shortened, visible
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.site import REPLAY, NotThere, Site
 from merge_runner_analysis.web.trial.account import TICK_S
@@ -29,6 +27,7 @@ from merge_runner_analysis.web.trial.sentences import (
     study_words,
     summary,
 )
+from merge_runner_analysis.web.urls import whole
 
 # Offers of a trial to compare with, and their rules.
 HUMAN, REPETITION = "nearest human", "next repetition"
@@ -132,21 +131,17 @@ def _panel(site: Site, row: Row, trial: Trial, decision: Row) -> Markup:
         d=decision | {"older_s": _older_s(decision, trial)},
         driver=row[f"model_{decision['side']}"],
         page=site.at.trial(row, **named),
-        clamped=clamped,
         before=before,
         parts=parts_of(
             decision["prompt"] or "",
             before["prompt"] if before else None,
             trial.blocks[decision["side"]],
         ),
-        meaning=block_meaning,
         others=site.catalogue.listing.others,
         reply=shortened(decision["reply"]) if decision["reply"] else None,
         reasoning=shortened(thoughts) if thoughts else None,
         raw=site.at.to("sql.csv", q=query) if site.at.served else "",
         chart=plan_chart(decision, trial),
-        points=step_points,
-        accelerations=accelerations,
     )
     return Markup(panel)  # noqa: S704 # rendered by a template of ours, which escapes
 
@@ -221,3 +216,25 @@ def _next_repetition(site: Site, row: Row) -> tuple[str, str] | None:
     alike = [(other["trial_id"], other["spec_hash"]) for other in rows]
     place = alike.index((row["trial_id"], row["spec_hash"]))
     return (alike * 2)[place + 1] if len(alike) > 1 else None
+
+
+def notes_page(site: Site, _: Mapping[str, str]) -> str:
+    """Return all notes, the latest first, each with the address of its trial or decision.
+
+    It has none where the trial is not in this database.
+    """
+    stored, shown = site.notes.read(), []
+    for note in reversed(stored.notes):
+        row = site.catalogue.find(note.trial_id, note.spec_hash)
+        at = {"side": note.side, "decision": note.decision}
+        shown.append((note, row and site.at.trial(row, **at)))
+    return site.render("notes.html", view="notes", stored=stored, shown=shown)
+
+
+def add_note(site: Site, given: Mapping[str, str]) -> Row:
+    """Note what a form gives; returns the trial. Raises NotThere and UsageError."""
+    row = site.trial(given.get("trial", ""), given.get("spec", ""))
+    side, number = given.get("side", ""), whole(given.get("decision", ""))
+    text = given.get("text", "").replace("\r\n", "\n").strip()
+    site.notes.add(row["trial_id"], row["spec_hash"], side, number, text)
+    return row

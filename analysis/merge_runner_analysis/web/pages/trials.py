@@ -12,7 +12,7 @@ from merge_runner_analysis.tables import TABLES
 from merge_runner_analysis.web.catalogue import PAGE, SORTS, TrialFilter
 from merge_runner_analysis.web.listing import FACTOR
 from merge_runner_analysis.web.phrases import causes_text, plain
-from merge_runner_analysis.web.pictures import sparkline, speed_range
+from merge_runner_analysis.web.pictures import speed_range
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.scope import HEADINGS, carried, facets_shown, filter_of, sort_of
 from merge_runner_analysis.web.site import NotThere, Site, download, news_of
@@ -72,19 +72,14 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
         news=news,
         page=page,
         last_page=last,
-        sparkline=sparkline,
         unknown=[] if rows else _unknown(site, chosen),
     )
 
 
 def _factors(row: Row) -> str:
     """Return a trial's levels, without those that its driver's name has."""
-    levels = [*(row["levels"] or ())]
-    return ", ".join(
-        level
-        for level in levels
-        if level.partition("=")[0] != OPPONENT and level not in row["model"]
-    )
+    levels = (level for level in row["levels"] or () if level not in row["model"])
+    return ", ".join(level for level in levels if not level.startswith(f"{OPPONENT}="))
 
 
 def _unknown(site: Site, chosen: TrialFilter) -> list[tuple[str, str, list[str]]]:

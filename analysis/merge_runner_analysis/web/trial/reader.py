@@ -66,10 +66,6 @@ class Trial:
             side: rows for side in SIDES if (rows := [d for d in decisions if d["side"] == side])
         }
 
-    def interval_s(self, side: Side) -> float:
-        """Return how long a decision of a side is driven."""
-        return self.paces[side].interval_steps * self.scenario.step_s
-
 
 def read_trials(connection: DuckDBPyConnection, keys: Sequence[Key]) -> list[Trial]:
     """Read trials that are known to be there, by their names and specs."""

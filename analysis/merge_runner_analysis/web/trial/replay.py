@@ -46,7 +46,7 @@ def replay_data(row: Row, trial: Trial, account: Account | None) -> dict[str, An
         ),
         "status": row["status"],
         "end": trial.end_s,
-        "every": {side: trial.interval_s(side) for side in SIDES},
+        "every": {side: of.interval_steps * scenario.step_s for side, of in trial.paces.items()},
         "sides": {
             side: {short: [round(x, 3) for x in samples[name]] for short, name in DRAWN.items()}
             for side, samples in trial.states.items()
