@@ -6,7 +6,6 @@ from html import unescape
 
 import pytest
 
-from merge_runner.study.file import read_study
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables import make_tables
@@ -14,7 +13,7 @@ from merge_runner_analysis.web.report import report_html
 from merge_runner_analysis.web.site import Site
 from merge_runner_analysis.wording import UNREADABLE, brackets, capital, money, number, p_value
 from tests.support.serving import client_of, listed, words_of
-from tests.support.studies import Said, write_study, yielding
+from tests.support.studies import Said, scaled, write_study, yielding
 from tests.support.tables import values_of
 
 A, B = "gpt-5.2", "o3"
@@ -25,13 +24,10 @@ def drives():
     """B collides in three of five repetitions, A in one and brakes harder; a trial of A is lost."""
     drives = []
     for name, crashes, strength in ((A, {5}, 1.0), (B, {3, 4, 5}, 0.8)):
-        for drive in yielding(name, reps=5):
-            sides = {s: tuple(strength * x for x in getattr(drive, s)) for s in ("left", "right")}
-            if drive.rep in crashes:
-                sides = {"left": (0.0,), "right": (0.0,)}
+        for drive in scaled(yielding(name, reps=5), strength, crashes):
             is_lost = (name, drive.condition, drive.rep) == (A, "N_0_0", 2)
             said = {1: Said(("timeout",), lost=True)} if is_lost else {}
-            drives.append(replace(drive, **sides, said=said))
+            drives.append(replace(drive, said=said))
     return drives
 
 
@@ -111,21 +107,6 @@ def test_a_comparison_that_is_computed_while_its_page_is_made_is_still_awaited(d
     monkeypatch.setattr(Site, "computed", computed)
     for address in (f"/drivers/{A}?with={B}", "/"):
         assert "Computing" in words_of(made.get(address).text), address
-
-
-def test_the_measure_that_a_study_of_models_asks_about_is_tested_by_itself(db, tmp_path):
-    (tmp_path / "study.toml").write_text(
-        f'models = ["{A}", "{B}"]\nrepetitions = 1\nprimary = "collided"'
-    )
-    together, study = values_of(StudyResults(db), "effects"), StudyResults(db)
-    study.source = read_study(str(tmp_path / "study.toml"))
-    alone = values_of(study, "effects")
-    name = f"model={B}/collided_percent"
-    assert together[name]["primary"] is None
-    assert (alone[name]["primary"], alone[name]["p_corrected"]) == ("primary", alone[name]["p"])
-    others = {row for row in alone if alone[row]["p"] is not None} - {name}
-    assert all(not alone[row]["primary"] for row in others)
-    assert any(alone[row]["p_corrected"] > alone[row]["p"] for row in others)
 
 
 @pytest.mark.parametrize(
