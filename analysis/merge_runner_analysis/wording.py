@@ -36,6 +36,8 @@ TOO_FEW = (
     f"Too few trials without a crash for a verdict (at least {ENOUGH}, and half of all, are needed)"
 )
 ALPHA = 0.05  # of all tests; importing it would load pandas, which no page needs
+# Measures in which a difference has a direction, and the sign of more.
+SIGNS = {"headway": 1, "velocity": -1, "collisions": 1, "gap": 1, "gap-headway": 1}
 # So far from people, in points and in m, a driver still is like them.
 MARGINS = {"collisions": 5.0, "gap": 1.0}
 # States in words, on every page and in every table for people; of MARGINS with a direction.
@@ -58,32 +60,33 @@ DIRECTIONS = {
         WEAKER: "depends less on who is slower",
         STRONGER: "depends more on who is slower",
     },
-    "gap-headway": {SHOWN: TENDENCY},
+    "gap-headway": {
+        SHOWN: TENDENCY,
+        WEAKER: "depends less on who is ahead",
+        STRONGER: "depends more on who is ahead",
+    },
     "collisions": {WEAKER: "fewer than people's", STRONGER: "more than people's"},
     "gap": {WEAKER: "smaller than people's", STRONGER: "larger than people's"},
 }
-# The rule of a verdict, a line a state; ``{tests}`` is the number of a driver's tests, if known,
-# and the name of a state its mark, where there are marks.
+# The rule of a verdict, a line a state; ``{tests}`` is the number of a driver's tests, if known.
 VERDICT_RULES = (
-    "{shown}Like people (crashes, gap): the whole interval of the difference lies within 5 points, "
-    "or 1 m",
-    "{shown}Same tendency as people (who goes first): the one ahead or, side by side, the slower "
+    "Like people (crashes, gap): the whole interval of the difference lies within 5 points, or 1 m",
+    "Same tendency as people (who goes first): the one ahead or, side by side, the slower "
     "one goes first more often, with p below .05 in a logistic regression (Firth) over all trials "
     "without a crash, not by the counts; and no difference is shown",
-    "{stronger}More, larger or depends more, {weaker}fewer, less, smaller or depends less, "
-    "{unlike}unlike: a difference is shown, with p below .05, corrected (Holm) for a driver's "
-    "{tests}tests; in who goes first, of that regression's slopes",
-    f"{{inconclusive}}Cannot tell: neither is shown. No verdict: fewer than {ENOUGH} trials are "
-    "counted, or fewer than half of those that ended",
+    "More, fewer, larger, smaller, or depends more or less: a difference is shown, with p below "
+    ".05, corrected (Holm) for a driver's {tests}tests; in who goes first, of that regression's "
+    "slopes",
+    f"Cannot tell: neither is shown. No verdict: fewer than {ENOUGH} trials are counted, or fewer "
+    "than half of those that ended",
 )
 FITTED_RULE = (
     "Same tendency as people in the gap by headway: more headway, more gap, with p below .05 in a "
     "linear regression. Like people in the gap by relative velocity: it moves the gap by less than "
-    "1 m; in accelerations held: within half a standard deviation of people"
+    "1 m; in accelerations held: within half a standard deviation of people. Unlike people's in "
+    "either: a difference is shown"
 )
-VERDICT_RULE = ". ".join((*VERDICT_RULES, FITTED_RULE)).format(
-    tests="", **dict.fromkeys((SHOWN, WEAKER, STRONGER, UNLIKE, OPEN), "")
-)
+VERDICT_RULE = ". ".join((*VERDICT_RULES, FITTED_RULE)).format(tests="")
 # Measures that the first page shows, with its headings.
 HEADINGS = {
     "collisions": "Crashes",
@@ -310,7 +313,6 @@ MEASURES = {
                 SHOWN: "the one ahead goes first, as with people",
                 WEAKER: "who goes first depends less on who is ahead than with people",
                 STRONGER: "who goes first depends more on who is ahead than with people",
-                UNLIKE: "who is ahead does not decide who goes first, as it does with people",
             },
         ),
         Measure(
@@ -327,7 +329,6 @@ MEASURES = {
                 SHOWN: "the faster one yields, as with people",
                 WEAKER: "who goes first depends less on who is slower than with people",
                 STRONGER: "who goes first depends more on who is slower than with people",
-                UNLIKE: "the faster one does not yield, as it does with people",
             },
         ),
         Measure(
@@ -362,12 +363,12 @@ MEASURES = {
             "m per m",
             GAP.column,
             "HC3 errors: above 0 at 5 %",
-            "with {it} each metre of headway adds {driver} m to the gap, with people {people} m",
+            "with {it} each metre that one is ahead adds {driver} m to the gap, with people "
+            "{people} m",
             (-0.6, 1.0),
             {
-                WEAKER: "each metre of headway adds less to its gap than to people's",
-                STRONGER: "each metre of headway adds more to its gap than to people's",
-                UNLIKE: "headway does not add to its gap as to people's",
+                WEAKER: "each metre that one is ahead adds less to its gap than to people's",
+                STRONGER: "each metre that one is ahead adds more to its gap than to people's",
             },
         ),
         Measure(
@@ -466,10 +467,13 @@ def _part(values: Values) -> str:
     return f"{says} ({FIRST[str(values['measure'])]} in {counted} trials, people in {people})"
 
 
-def _more(values: Values) -> str:
+def _apart(values: Values) -> float:
     apart = values.get("difference")
-    apart = values.get("estimate") if apart is None else apart
-    return "more" if (apart or 0.0) > 0 else "less"
+    return (values.get("estimate") if apart is None else apart) or 0.0
+
+
+def _more(values: Values) -> str:
+    return "more" if _apart(values) > 0 else "less"
 
 
 def crashes(values: Values) -> str:
@@ -497,8 +501,8 @@ def crash_text(rules: Sequence[tuple[str, Sequence[float]]]) -> str:
     """Return the meaning of a crash by the collision rules that were played, with their steps."""
     texts = []
     for rule, steps_s in rules:
-        text = f"{RULES_MEAN[rule]}, checked every {' or '.join(map('{:g}'.format, steps_s))} s"
-        text += ", by the driver" * (len(steps_s) > 1)
+        every = "simulation step, " * (len(steps_s) > 1) + " or ".join(map("{:g}".format, steps_s))
+        text = f"{RULES_MEAN[rule]}, checked every {every} s"
         texts.append(text if rule == "rectangle" else f"{text} ({PLAYED_RULES[rule]})")
     return " or, by the scenario of the trial, ".join(texts)
 
@@ -524,7 +528,7 @@ def apart(driver: str, other: str, rows: Mapping[str, Values], *, of_left: bool)
     difference, p, ci = (crashed.get(name) for name in ("difference", "p_corrected", "ci"))
     if min(n or 0, n_other or 0) < ENOUGH:
         return f"{claim}: too few to say more.", ""
-    if difference is None or p is None:
+    if difference is None or p is None or is_constant(crashed):
         return f"{claim}.", others
     corrected = f"corrected p {equal_p(p)}"
     if p >= ALPHA:
@@ -538,13 +542,19 @@ def apart(driver: str, other: str, rows: Mapping[str, Values], *, of_left: bool)
     return f"{claim}. {same}; {corrected}.", others
 
 
+def is_constant(values: Values) -> bool:
+    """Return whether a measure counts no trial, or every trial, of both drivers."""
+    k, n = ([values.get(name + of) for of in ("", "_reference")] for name in "kn")
+    return None not in k and k in ([0, 0], n)
+
+
 def _others(driver: str, other: str, rows: Mapping[str, Values], *, of_left: bool) -> str:
     """Return the measures besides crashes in which a driver is shown to differ, and the others."""
     shown, unshown = [], []
     for name, (more, less, what) in COMPARED.items():
         is_unasked = name == (LEFT_FIRST.name if of_left else LEFT_GOES_FIRST)
         values = rows.get(LEFT_FIRST.name if name == LEFT_GOES_FIRST else name, {})
-        if is_unasked or (p := values.get("p_corrected")) is None:
+        if is_unasked or is_constant(values) or (p := values.get("p_corrected")) is None:
             continue
         if p >= ALPHA:
             unshown.append(what)
@@ -575,15 +585,16 @@ def _suffice(trials: int, ended: int) -> bool:
 def shown_state(values: Values) -> str:
     """Return a state as sentences and marks show it: too few trials are inconclusive.
 
-    One of MARGINS within which a difference surely lies is like people's, else it has a direction.
+    A difference that surely lies within its margin is like people's; one in a measure of SIGNS has
+    a direction.
     """
     state = str(values.get("state") or "")
     if state and not _suffice(values.get("n") or 0, values.get("ended") or 0):
         return OPEN
     if _is_within(values):
         return SHOWN
-    if state == UNLIKE and values["measure"] in MARGINS:
-        return STRONGER if _more(values) == "more" else WEAKER
+    if state == UNLIKE and (sign := SIGNS.get(str(values["measure"]))):
+        return STRONGER if sign * _apart(values) > 0 else WEAKER
     return state
 
 
@@ -648,18 +659,21 @@ def _most_alike(drivers: Mapping[str, Mapping[str, Values]]) -> str:
             -sum(shown_state(of[measure]) in DIFFERS for measure in LIKENESS if measure in of),
         )
         for name, of in drivers.items()
+        if any(map(has_verdict, of.values()))
     }
-    like, unlike = best = max(ranks.values())
+    like, unlike = best = max(ranks.values(), default=(0, 0))
     names = [name for name, rank in ranks.items() if rank == best]
-    if not like or len(names) == len(drivers):
+    if not like or len(names) == len(ranks):
         return ""
+    some = f"the {len(ranks)} programs with enough trials"
+    which = some if len(ranks) < len(drivers) else f"{len(drivers)} programs"
     is_one = len(names) == 1
     named = [
         f"{name} (it was made from the human data)" if _is_from_humans(drivers[name]) else name
         for name in names
     ]
     claim = (
-        f"Of {len(drivers)} programs {joined(named)} {'is' if is_one else 'are'} most like people: "
+        f"Of {which} {joined(named)} {'is' if is_one else 'are'} most like people: "
         f"{'it agrees' if is_one else 'each agrees'} with them in {like} of {len(LIKENESS)} "
         f"measures, and is shown to differ in {-unlike or 'none'}."
     )

@@ -15,6 +15,7 @@ from merge_runner_analysis.web.effect_rows import (
     difference_mark,
     ends_of,
     interval_text,
+    is_shown,
     metric_of,
     name_of,
     unbroken,
@@ -29,10 +30,12 @@ from merge_runner_analysis.wording import (
     LEFT_GOES_FIRST,
     apart,
     capital,
+    is_constant,
     number,
     p_value,
 )
 
+SAME = "the same in all trials of both: nothing to test"
 # The trials behind a count, as a filter of their list; None where no filter keeps just these.
 Filter = dict[str, Any] | None
 TrialsOf = Callable[[str, int], Filter]
@@ -62,6 +65,7 @@ class Difference:
     end: str
     p: str
     p_corrected: str
+    is_shown: bool
     note: str
 
 
@@ -110,7 +114,7 @@ def comparison_of(
     seen = [
         f"{_name(row, of_left)} {_with_unit(row, 'detectable')}"
         for row in rows
-        if row.values["detectable"] is not None
+        if row.values["detectable"] is not None and not is_constant(row.values)
     ]
     return Comparison(
         names,
@@ -156,7 +160,7 @@ def no_trials(_what: str, _count: int) -> Filter:
 
 def _difference(row: Row, trials: tuple[TrialsOf, TrialsOf], name: str) -> Difference:
     values: Any = row.values
-    is_tested = values["difference"] is not None
+    is_tested = values["difference"] is not None and not is_constant(values)
     end = ends_of([row])[metric_of(row)] if is_tested else 0.0
     first, second = (
         _side(row, of, filter_of) for of, filter_of in zip(("", "_reference"), trials, strict=True)
@@ -165,12 +169,13 @@ def _difference(row: Row, trials: tuple[TrialsOf, TrialsOf], name: str) -> Diffe
         capital(name),
         (first, second),
         unbroken(_with_unit(row, "difference", sign="+")) if is_tested else "–",
-        unbroken(interval_text(row)),
+        unbroken(interval_text(row)) if is_tested else "",
         difference_mark(row, end) if is_tested and values["p_corrected"] is not None else None,
         unbroken(f"{amount(row, end)} {unit_of(row)}"),
-        p_value(values["p"]),
-        p_value(values["p_corrected"]),
-        row.note.replace(f"{values['measure']}: ", ""),
+        p_value(values["p"] if is_tested else None),
+        p_value(values["p_corrected"] if is_tested else None),
+        is_shown(row),
+        row.note.replace(f"{values['measure']}: ", "") or SAME * is_constant(values),
     )
 
 

@@ -24,6 +24,7 @@ from merge_runner_analysis.web.effect_rows import (
     factors_of,
     interval_of,
     interval_text,
+    is_constant,
     is_copied,
     is_interaction,
     is_shown,
@@ -36,7 +37,7 @@ from merge_runner_analysis.web.effect_rows import (
     unit_of,
     value_of,
 )
-from merge_runner_analysis.web.level_chart import REFERENCE, SHAPES, Chart, level_chart
+from merge_runner_analysis.web.level_chart import SHAPES, Chart, level_chart
 from merge_runner_analysis.web.marks import Mark
 from merge_runner_analysis.web.names import short_names
 from merge_runner_analysis.wording import (
@@ -59,7 +60,7 @@ from merge_runner_analysis.wording import (
 )
 
 # Reason for equal trials at both levels with a mock model.
-UNREAD = "not tested: the mock model does not read it; plant an effect, or run a language model"
+UNREAD = "not tested: the mock model does not read it"
 SEEN = (COLLISIONS.name, GAP.name, RMSE.name)  # the most visible measures, in this order
 
 
@@ -90,7 +91,8 @@ class Change:
     difference: str
     interval: str
     p: str
-    mark: Mark | None
+    is_shown: bool
+    mark: Mark
     end: str
     row: str
 
@@ -147,7 +149,7 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
         row
         for row in effects.rows
         if metric_of(row) in named - {metric} and not is_interaction(row) and is_tested(row)
-        and row.values["factor"] != MODEL
+        and row.values["factor"] != MODEL and not is_constant(row)
     ]  # fmt: skip
     drivers = list(
         dict.fromkeys(str(row.values["driver"]) for row in known if row.values["driver"])
@@ -369,7 +371,7 @@ def _adjusted(levels: Sequence[Row], effects: Sequence[Row]) -> list[Row]:
                 ci = ends and tuple(base + end for end in ends)
                 values |= {"value": effect.values["estimate"], "ci": ci}
             elif name == f"{effect.values['factor']}={_reference(effect)}":
-                values |= {"value": base, "ci": None, "shape": REFERENCE}
+                values |= {"value": base, "ci": None}
             else:
                 continue
             adjusted[row.id, number(values["value"])] = replace(
@@ -434,6 +436,7 @@ def _change(
         f"{difference_text(row)} {unit_of(row)}",
         interval_text(row),
         p_value(value_of(row, "p_corrected")),
+        is_shown(row),
         difference_mark(row, end),
         f"{amount(row, end)} {unit_of(row)}",
         row.id,

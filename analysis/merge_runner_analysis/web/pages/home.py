@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from merge_runner.drivers.registry import EMULATOR
 from merge_runner_analysis.web.comparison import Comparison, compared
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.effect_rows import MIDDLE
@@ -30,6 +31,7 @@ from merge_runner_analysis.wording import HEADINGS, LANGUAGE_MODEL, MOCK, PROGRA
 FACTOR_TABLES = ("effects", "levels")  # of what a study's factors change
 # Kinds of drivers whose identical trials count once.
 ONCE = {PROGRAM: "program", MOCK: "mock model"}
+DRAWN = "draws who goes first as people do"  # the emulator
 Jobs = list[Job]
 
 
@@ -84,7 +86,14 @@ def _beside_people(
             (
                 driver,
                 likeness_of(driver),
-                filter(None, (counted(driver, conditions), other_differences(driver))),
+                filter(
+                    None,
+                    (
+                        DRAWN * (EMULATOR in driver.name),
+                        counted(driver, conditions),
+                        other_differences(driver),
+                    ),
+                ),
             )
             for kind in by_kind(drivers).values()
             for driver in kind
@@ -146,7 +155,7 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         apart=apart,
         steps=next_steps(site.program, sweep, shown, short, conditions, question or apart),
         found=is_found(shown, question or apart),
-        prompted=any(driver.kind != PROGRAM for driver in shown),
+        prompted=any(driver.facts and driver.facts["asked"] for driver in shown),
         asking=asking,
         middle=MIDDLE,
         linked=True,
