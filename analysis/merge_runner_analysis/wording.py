@@ -694,13 +694,13 @@ def _is_judged(verdicts: Mapping[str, Values]) -> bool:
 
 
 def _few_trials(drivers: Mapping[str, Mapping[str, Values]]) -> str:
-    """Return the counts of crashes of drivers without a verdict on them."""
+    """Return the counts of crashes of drivers without a verdict on them, beside others with one."""
     counts = [
         f"{name} crashed in {of['collisions']['counted']} trials"
         for name, of in drivers.items()
         if not _is_judged(of) and of.get("collisions", {}).get("counted")
     ]
-    return f"Without a verdict: {'; '.join(counts)}." if counts else ""
+    return f"Without a verdict: {'; '.join(counts)}." if 0 < len(counts) < len(drivers) else ""
 
 
 def _crash_rates(drivers: Mapping[str, Mapping[str, Values]]) -> dict[str, float]:
@@ -721,7 +721,7 @@ def _tally(drivers: Sequence[Mapping[str, Values]]) -> str:
             unclear.append(what)
         else:
             who = " drivers" * (not like)
-            few = " with enough trials" * (len(states) < len(drivers))
+            few = " with enough trials" * (not like and len(states) < len(drivers))
             like.append(f"{states.count(SHOWN) or 'none'} of {len(states)}{who}{few} {does}")
     if not (like or unclear):
         return f"For {len(drivers)} drivers no verdict on likeness to people is possible."

@@ -129,8 +129,8 @@ NONE = "No language model drove here."
         (
             [of_kind(PROGRAM, headway="unlike"), of_kind(PROGRAM, collisions="unlike")],
             [
-                "None of 1 drivers with enough trials crash as often as people; none of 1 with "
-                "enough trials let the one ahead go first, as people do. No verdict on who goes "
+                "None of 1 drivers with enough trials crash as often as people; none of 1 let "
+                "the one ahead go first, as people do. No verdict on who goes "
                 "first side by side and the gap.",
                 NONE,
             ],
@@ -148,7 +148,7 @@ NONE = "No language model drove here."
                 "like people: it agrees with them in 1 of 4 measures, and is shown to differ in "
                 "none. Most crashes: d3 crashed in 9 of 21 trials.",
                 "2 of 2 drivers with enough trials let the one ahead go first, as people do; none "
-                "of 2 with enough trials leave gaps like people's. Cannot tell: crashes. No "
+                "of 2 leave gaps like people's. Cannot tell: crashes. No "
                 "verdict on who goes first side by side. Without a verdict: d2 crashed in 11 of 11 "
                 f"trials. {NONE}",
             ],
