@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from merge_runner.records import SIDES
+from merge_runner_analysis.headlines import LEFT_GOES_FIRST, apart, is_constant
 from merge_runner_analysis.metrics import COLLISIONS, LEFT_FIRST
 from merge_runner_analysis.tables.model import Row, Table, from_text
 from merge_runner_analysis.web.computing import Job
@@ -26,14 +27,7 @@ from merge_runner_analysis.web.marks import Mark
 from merge_runner_analysis.web.names import short_names
 from merge_runner_analysis.web.scope import Scope
 from merge_runner_analysis.web.site import Site
-from merge_runner_analysis.wording import (
-    LEFT_GOES_FIRST,
-    apart,
-    capital,
-    is_constant,
-    number,
-    p_value,
-)
+from merge_runner_analysis.wording import capital, number, p_value
 
 SAME = "the same in all trials of both: nothing to test"
 # The trials behind a count, as a filter of their list; None where no filter keeps just these.

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner_analysis.headlines import share
 from merge_runner_analysis.stats.score_interval import wilson
 from merge_runner_analysis.web.effect_rows import unbroken
 from merge_runner_analysis.web.judged import Driver
@@ -24,7 +25,6 @@ from merge_runner_analysis.wording import (
     has_verdict,
     joined,
     number,
-    share,
     shown_state,
     verdict_word,
 )

@@ -28,6 +28,7 @@ from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.figures.gallery import rendered, write_figures
 from merge_runner_analysis.frames import KEYS, load
 from merge_runner_analysis.grouping import levels_of
+from merge_runner_analysis.headlines import sentences
 from merge_runner_analysis.provenance import Provenance, provenance, tally
 from merge_runner_analysis.published import published
 from merge_runner_analysis.study import StudyResults
@@ -47,7 +48,7 @@ from merge_runner_analysis.web.question import answer_of
 from merge_runner_analysis.web.rendering import STYLE, environment, inlined_texts, policy_of
 from merge_runner_analysis.web.scope import DESCRIPTIONS
 from merge_runner_analysis.web.urls import Links
-from merge_runner_analysis.wording import HUMANS, LANGUAGE_MODEL, TABLE, number, sentences
+from merge_runner_analysis.wording import HUMANS, LANGUAGE_MODEL, TABLE, number
 
 # The first prompt of each variant, all of the same condition as far as that was played.
 PROMPTS = """

@@ -6,6 +6,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from merge_runner_analysis.headlines import (
+    TOO_FEW,
+    apart,
+    crash_text,
+    crashes,
+    difference_sentence,
+    headline,
+    is_constant,
+    sentence,
+)
 from merge_runner_analysis.wording import (
     DIFFERS,
     LANGUAGE_MODEL,
@@ -16,17 +26,9 @@ from merge_runner_analysis.wording import (
     RULES_MEAN,
     SHOWN,
     STRONGER,
-    TOO_FEW,
     WEAKER,
-    apart,
-    crash_text,
-    crashes,
-    difference_sentence,
     differs,
-    headline,
-    is_constant,
     money,
-    sentence,
     verdict_word,
 )
 

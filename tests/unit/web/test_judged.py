@@ -2,8 +2,9 @@
 
 import pytest
 
+from merge_runner_analysis.headlines import sentence
 from merge_runner_analysis.web.judged import summary_of
-from merge_runner_analysis.wording import LANGUAGE_MODEL, MOCK, PROGRAM, sentence
+from merge_runner_analysis.wording import LANGUAGE_MODEL, MOCK, PROGRAM
 
 
 def verdicts(crashes="inconclusive", **states):

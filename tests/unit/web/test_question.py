@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from merge_runner_analysis.tables.model import Column, Row, Table
 from merge_runner_analysis.web import effect_rows
-from merge_runner_analysis.web.question import UNREAD, answer_of, answered
+from merge_runner_analysis.web.claims import UNREAD, answered
+from merge_runner_analysis.web.question import answer_of
 from merge_runner_analysis.wording import EGO, LEFT, PLANTED, SAME_TRIALS, WORDS
 
 GOES_FIRST, GAP, COST = "goes first (%)", "gap (m)", "cost (USD)"

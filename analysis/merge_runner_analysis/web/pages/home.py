@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from merge_runner.drivers.registry import EMULATOR
+from merge_runner_analysis.headlines import headline
 from merge_runner_analysis.web.comparison import Comparison, compared
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.effect_rows import MIDDLE
@@ -26,7 +27,7 @@ from merge_runner_analysis.web.question import Answer, answer_of
 from merge_runner_analysis.web.runs import standing_of
 from merge_runner_analysis.web.scope import Bar, Scope, descriptions_of, scope_of, unmarked
 from merge_runner_analysis.web.site import Site, news_of
-from merge_runner_analysis.wording import HEADINGS, LANGUAGE_MODEL, MOCK, PROGRAM, headline
+from merge_runner_analysis.wording import HEADINGS, LANGUAGE_MODEL, MOCK, PROGRAM
 
 FACTOR_TABLES = ("effects", "levels")  # of what a study's factors change
 # Kinds of drivers whose identical trials count once.
