@@ -70,10 +70,10 @@ VERDICT_RULES = (
     "one goes first more often, with p below .05 in a logistic regression (Firth) over all trials "
     "without a crash, not by the counts; and no difference is shown",
     "More, fewer, larger, smaller, or depends more or less: a difference is shown, with p below "
-    ".05, corrected (Holm) for a driver's {tests}tests; in who goes first, of that regression's "
-    "slopes",
-    f"Cannot tell: neither is shown. No verdict: fewer than {ENOUGH} trials are counted, or fewer "
-    "than half of those that ended",
+    ".05, corrected (Holm) for all tests of a driver{tests}; in who goes first, of that "
+    "regression's slopes",
+    "Cannot tell: neither is shown",
+    f"No verdict: fewer than {ENOUGH} trials are counted, or fewer than half of those that ended",
 )
 FITTED_RULE = (
     "Same tendency as people in the gap by headway: more headway, more gap, with p below .05 in a "
@@ -324,7 +324,7 @@ MEASURES = {
         Measure(
             "gap-headway",
             "More headway, more gap (I3)",
-            "gap, by headway",
+            "gap, by who is ahead",
             "m per m",
             GAP.column,
             "HC3 errors: above 0 at 5 %",

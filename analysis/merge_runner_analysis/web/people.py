@@ -131,10 +131,16 @@ def could_see(drivers: Sequence[Driver], short: Mapping[str, str]) -> str:
 
 
 def verdict_rules(drivers: Sequence[Driver], gap: Mapping[str, Any]) -> list[str]:
-    """Return the rule of a verdict, a line a state; ``gap`` is people's value."""
-    tests = {sum(c.values.get("p_holm") is not None for c in of.cells.values()) for of in drivers}
-    ends = dict.fromkeys((min(tests, default=0), max(tests, default=0)))
-    numbers = f"{' to '.join(map(str, ends))} " if any(ends) else ""
+    """Return the rule of a verdict, a line a state, or of none; ``gap`` is people's value."""
+    if not any(has_verdict(cell.values) for of in drivers for cell in of.cells.values()):
+        return [*VERDICT_RULES[-1:]]
+    tests = {
+        sum(cell.values.get("p_holm") is not None for cell in of.cells.values())
+        for of in drivers
+        if any(has_verdict(cell.values) for cell in of.cells.values())
+    }
+    ends = " to ".join(map(str, dict.fromkeys((min(tests), max(tests))))) if any(tests) else ""
+    numbers = f" ({ends})" if ends else ""
     likeness, *others = (rule.format(tests=numbers) for rule in VERDICT_RULES)
     low, high = gap.get("ci") or (0.0, 0.0)
     if (half := (high - low) / 2) > MARGINS["gap"] / 2:

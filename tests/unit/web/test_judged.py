@@ -20,7 +20,7 @@ def verdicts(crashes="inconclusive", **states):
 @pytest.mark.parametrize(
     ("of", "ends"),
     [
-        (verdicts(gap_headway="inconclusive"), "Cannot tell: crashes; gap, by headway."),
+        (verdicts(gap_headway="inconclusive"), "Cannot tell: crashes; gap, by who is ahead."),
         (verdicts("shown", gap_velocity="inconclusive"), " Cannot tell: gap, by who is faster."),
         (verdicts(), "Cannot tell: crashes."),
     ],
