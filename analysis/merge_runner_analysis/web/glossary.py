@@ -28,7 +28,7 @@ USED = (
     ("mock model", "mock model", "mock model"),
 )
 CRASH = "<em>crash</em> on pages"  # where a page explains it, it has this word
-_ON_PAGES = re.compile(r"<strong>human (\w+)</strong> \(pages: <em>(.+?)</em>\)")
+_ON_PAGES = re.compile(r"the <strong>human (\w+)</strong> \(pages: <em>(.+?)</em>\)")
 _ROW = re.compile(r"\| (.+?) \| (.+) \|")
 _MARKED = (
     (re.compile(r"\*\*(.+?)\*\*"), r"<strong>\1</strong>"),
@@ -61,6 +61,6 @@ def used_terms(html: str) -> list[tuple[str, Markup]]:
     """Return the words of a page that are terms, with their meanings."""
     text = re.sub("<[^>]*>", " ", html).lower()
     meanings = {word: meaning for words in sections().values() for word, meaning in words}
-    meaning = meanings["collision"].removeprefix(f"{CRASH}. ")
+    meaning = str(meanings["collision"]).removeprefix(f"{CRASH}. ")
     meanings["collision"] = Markup(_ON_PAGES.sub(r"<strong>\2 \1</strong>", meaning))  # noqa: S704
     return [(words, meanings[term]) for words, term, used in USED if re.search(used, text)]
