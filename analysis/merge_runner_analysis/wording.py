@@ -44,22 +44,9 @@ VERDICTS = {
     OPEN: "cannot tell",
 }
 TENDENCY = "same tendency as people"  # its sign alone, and no difference in size is shown
+OF_TRAIT = {SHOWN: TENDENCY, WEAKER: "less than with people", STRONGER: "more than with people"}
 DIRECTIONS = {
-    "headway": {
-        SHOWN: TENDENCY,
-        WEAKER: "depends less on who is ahead",
-        STRONGER: "depends more on who is ahead",
-    },
-    "velocity": {
-        SHOWN: TENDENCY,
-        WEAKER: "depends less on who is slower",
-        STRONGER: "depends more on who is slower",
-    },
-    "gap-headway": {
-        SHOWN: TENDENCY,
-        WEAKER: "depends less on who is ahead",
-        STRONGER: "depends more on who is ahead",
-    },
+    **dict.fromkeys(("headway", "velocity", "gap-headway"), OF_TRAIT),
     "collisions": {WEAKER: "fewer than people's", STRONGER: "more than people's"},
     "gap": {WEAKER: "smaller than people's", STRONGER: "larger than people's"},
 }
@@ -69,9 +56,8 @@ VERDICT_RULES = (
     "Same tendency as people (who goes first): the one ahead or, side by side, the slower "
     "one goes first more often, with p below .05 in a logistic regression (Firth) over all trials "
     "without a crash, not by the counts; and no difference is shown",
-    "More, fewer, larger, smaller, or depends more or less: a difference is shown, with p below "
-    ".05, corrected (Holm) for all tests of a driver{tests}; in who goes first, of that "
-    "regression's slopes",
+    "More, less, fewer, larger or smaller: a difference is shown, with p below .05, corrected "
+    "(Holm) for all tests of a driver{tests}; in who goes first, of that regression's slopes",
     "Cannot tell: neither is shown",
     f"No verdict: fewer than {ENOUGH} trials are counted, or fewer than half of those that ended",
 )
