@@ -101,7 +101,8 @@ PROGRAMS.register(
     "human-odds",
     Program(
         HumanOddsDriver,
-        "draws order and gap from regressions of the human data, and does not look again",
+        "draws who goes first and the gap from regressions of the human data, "
+        "and then holds one acceleration",
         PARAMETERS,
         20.0,
         settable=True,

@@ -104,7 +104,8 @@ PROGRAMS.register(
     "quantal",
     Program(
         QuantalDriver,
-        "the better of four actions is the likelier, if the other keeps its speed (our own model)",
+        "each second draws one of four accelerations, those that cost less time, effort and "
+        "collisions more often, if the other keeps its speed (our own model)",
         {
             "horizon_s": 5.0,
             "precision": 1.7,

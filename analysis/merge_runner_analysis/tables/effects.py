@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
-from math import exp, isinf
+from math import isinf
 from textwrap import shorten
 
 from merge_runner.study.arms import PROMPT
@@ -304,15 +304,9 @@ def _planted(study: StudyResults) -> list[str]:
     for factor, levels in texts.items():
         for level, text in levels.items():
             if more := text.emulator.own_first:
-                even, sure = (100 / (1 + exp(-more) / odds) for odds in (1, 19))
-                planted.append(
-                    f"{factor}={level} turns a 50 % chance of going first into {even:.0f} %, and "
-                    f"95 % into {sure:.0f} %"
-                )
+                planted.append(f"{factor}={level} changes the log-odds of going first by {more:+g}")
             if gap_m := text.emulator.gap_m:
                 planted.append(f"{factor}={level} adds {gap_m:g} m to the gap that drivers aim at")
-    if any(text.emulator.own_first for levels in texts.values() for text in levels.values()):
-        planted.append("little can change where a situation almost decides the order")
     return planted
 
 

@@ -14,6 +14,7 @@ from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.drivers import language_models
 from merge_runner_analysis.frames import KEYS
 from merge_runner_analysis.grouping import Group
+from merge_runner_analysis.headlines import sentences
 from merge_runner_analysis.metrics import BOXES
 from merge_runner_analysis.published import HUMAN, HUMAN_TRIALS
 from merge_runner_analysis.stats.estimate import Estimate
@@ -40,7 +41,6 @@ from merge_runner_analysis.wording import (
     VERDICT_RULE,
     has_verdict,
     note_of,
-    sentences,
 )
 
 VERDICT_COLUMNS = (

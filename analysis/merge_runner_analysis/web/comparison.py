@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from merge_runner.records import SIDES
+from merge_runner_analysis.headlines import LEFT_GOES_FIRST, apart, is_constant
 from merge_runner_analysis.metrics import COLLISIONS, LEFT_FIRST
 from merge_runner_analysis.tables.model import Row, Table, from_text
 from merge_runner_analysis.web.computing import Job
@@ -15,6 +16,7 @@ from merge_runner_analysis.web.effect_rows import (
     difference_mark,
     ends_of,
     interval_text,
+    is_shown,
     metric_of,
     name_of,
     unbroken,
@@ -25,8 +27,9 @@ from merge_runner_analysis.web.marks import Mark
 from merge_runner_analysis.web.names import short_names
 from merge_runner_analysis.web.scope import Scope
 from merge_runner_analysis.web.site import Site
-from merge_runner_analysis.wording import LEFT_GOES_FIRST, apart, capital, number, p_value
+from merge_runner_analysis.wording import capital, number, p_value
 
+SAME = "the same in all trials of both: nothing to test"
 # The trials behind a count, as a filter of their list; None where no filter keeps just these.
 Filter = dict[str, Any] | None
 TrialsOf = Callable[[str, int], Filter]
@@ -48,6 +51,7 @@ class Difference:
     end: str
     p: str
     p_corrected: str
+    is_shown: bool
     note: str
 
 
@@ -96,7 +100,7 @@ def comparison_of(
     seen = [
         f"{_name(row, of_left)} {_with_unit(row, 'detectable')}"
         for row in rows
-        if row.values["detectable"] is not None
+        if row.values["detectable"] is not None and not is_constant(row.values)
     ]
     return Comparison(
         names,
@@ -142,18 +146,19 @@ def no_trials(_what: str, _count: int) -> Filter:
 
 def _difference(row: Row, trials: tuple[TrialsOf, TrialsOf], name: str) -> Difference:
     values: Any = row.values
-    is_tested = values["difference"] is not None
+    is_tested = values["difference"] is not None and not is_constant(values)
     end = ends_of([row])[metric_of(row)] if is_tested else 0.0
     return Difference(
         capital(name),
         [_side(row, of, to) for of, to in zip(("", "_reference"), trials, strict=True)],
         unbroken(_with_unit(row, "difference", sign="+")) if is_tested else "–",
-        unbroken(interval_text(row)),
+        unbroken(interval_text(row)) if is_tested else "",
         difference_mark(row, end) if is_tested and values["p_corrected"] is not None else None,
         unbroken(f"{amount(row, end)} {unit_of(row)}"),
-        p_value(values["p"]),
-        p_value(values["p_corrected"]),
-        row.note.replace(f"{values['measure']}: ", ""),
+        p_value(values["p"] if is_tested else None),
+        p_value(values["p_corrected"] if is_tested else None),
+        is_shown(row),
+        row.note.replace(f"{values['measure']}: ", "") or SAME * is_constant(values),
     )
 
 

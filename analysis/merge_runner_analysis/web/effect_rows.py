@@ -113,6 +113,12 @@ def is_copied(row: Row) -> bool:
     return bool(row.values.get("primary")) and row.untested
 
 
+def is_constant(row: Row) -> bool:
+    """Return whether a share is 0 % at both levels, or 100 % at both."""
+    values = {row.values.get(name) for name in ("estimate", "estimate_reference")}
+    return unit_of(row) == "points" and values in ({0.0}, {100.0})
+
+
 def is_tested(row: Row) -> bool:
     """Return whether a row has a p."""
     return row.values.get("p_corrected") is not None
@@ -138,8 +144,7 @@ def ends_of(rows: Iterable[Row]) -> dict[str, float]:
 
 
 def difference_mark(row: Row, end: float) -> Mark:
-    """Return a difference on an axis about 0; filled where its corrected p is below 5 %."""
+    """Return a difference on an axis about 0."""
     values = (value_of(row, "difference"), *(interval_of(row) or ()))
     at, *ends = (round(50 + 48 * value / (end or 1.0), 2) for value in values)
-    shape = "like" if is_shown(row) else "open"
-    return Mark(shape, at, (ends[0], ends[1]) if ends else None, zero=50.0)
+    return Mark("plain", at, (ends[0], ends[1]) if ends else None, zero=50.0)

@@ -19,8 +19,7 @@ USED = (
     ("interval [ ]", "interval", r"\["),
     ("p, corrected", "corrected p", "corrected"),
     ("prompt, Baseline", "prompt variant", "prompt"),
-    ("ahead, side by side", "projected headway", "ahead|side by side"),
-    ("headway", "headway", "headway"),
+    ("headway, ahead, side by side", "projected headway", "headway|ahead|side by side"),
     ("crash", "collision", "crash"),
     ("valid reply, plan", "plan", "valid|plan"),
     ("gap at the merge point", "gap", r"\bgap\b"),
@@ -29,6 +28,7 @@ USED = (
     ("mock model", "mock model", "mock model"),
 )
 CRASH = "<em>crash</em> on pages"  # where a page explains it, it has this word
+_ON_PAGES = re.compile(r"the <strong>human (\w+)</strong> \(pages: <em>(.+?)</em>\)")
 _ROW = re.compile(r"\| (.+?) \| (.+) \|")
 _MARKED = (
     (re.compile(r"\*\*(.+?)\*\*"), r"<strong>\1</strong>"),
@@ -61,5 +61,6 @@ def used_terms(html: str) -> list[tuple[str, Markup]]:
     """Return the words of a page that are terms, with their meanings."""
     text = re.sub("<[^>]*>", " ", html).lower()
     meanings = {word: meaning for words in sections().values() for word, meaning in words}
-    meanings["collision"] = meanings["collision"].removeprefix(f"{CRASH}. ")
+    meaning = str(meanings["collision"]).removeprefix(f"{CRASH}. ")
+    meanings["collision"] = Markup(_ON_PAGES.sub(r"<strong>\2 \1</strong>", meaning))  # noqa: S704
     return [(words, meanings[term]) for words, term, used in USED if re.search(used, text)]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from merge_runner.config import ScenarioConfig
+from merge_runner_analysis.headlines import crash_text, sentence
 from merge_runner_analysis.published import HUMAN, human_counts
 from merge_runner_analysis.tables.model import Table
 from merge_runner_analysis.web.marks import Cell, band, cells, measures_of
@@ -28,8 +29,6 @@ from merge_runner_analysis.wording import (
     Values,
     by_group,
     capital,
-    crash_text,
-    sentence,
     shown_state,
 )
 

@@ -14,8 +14,7 @@ from merge_runner_analysis.web.effect_rows import interval_of, value_of
 from merge_runner_analysis.wording import TIMES, brackets, number
 
 # The shapes that tell drivers apart in a chart, and more of them are not drawn.
-SHAPES = ("dot", "square", "ring", "triangle")
-REFERENCE = "ring"  # of a reference without an interval
+SHAPES = ("dot", "square", "diamond", "triangle")
 # Parts of a chart, and a letter of a name, in units of its drawing.
 LEFT, WIDTH, HEAD, ROW, APART, INDENT, LETTER = 90.0, 480.0, 12, 20, 14, 84.0, 7.5
 
@@ -113,8 +112,7 @@ def _point(row: Row, shapes: dict[str, str], x: Callable[[float], float], y: flo
     counts = "" if k is None else f"{k} of {n}, "
     says = f"{driver or 'all drivers'}: {counts}{number(value)} {brackets(ci)}".rstrip()
     ends = None if ci is None else (x(ci[0]), x(ci[1]))
-    shape = row.values.get("shape") or shapes.get(str(driver), SHAPES[0])
-    return Point(str(shape), x(value), ends, y, says)
+    return Point(shapes.get(str(driver), SHAPES[0]), x(value), ends, y, says)
 
 
 def _axis(low: float, high: float) -> tuple[float, float, float]:

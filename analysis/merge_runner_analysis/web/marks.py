@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
+from merge_runner_analysis.headlines import share
 from merge_runner_analysis.stats.score_interval import wilson
 from merge_runner_analysis.tables.model import Row
 from merge_runner_analysis.wording import (
@@ -18,7 +19,6 @@ from merge_runner_analysis.wording import (
     Values,
     brackets,
     number,
-    share,
     shown_state,
     verdict_word,
     with_interval,

@@ -8,15 +8,12 @@ from typing import Any
 
 from merge_runner_analysis.web.comparison import Comparison
 from merge_runner_analysis.web.judged import Driver
-from merge_runner_analysis.web.marks import Mark
 from merge_runner_analysis.web.people import repeated
 from merge_runner_analysis.web.question import Answer
 from merge_runner_analysis.wording import (
     DIFFERS,
     ENOUGH,
-    HEADINGS,
     MOCK,
-    OPEN,
     has_verdict,
     joined,
     shown_state,
@@ -32,7 +29,6 @@ REPEATED = (
 )
 FEW = f"{{}}: fewer than {ENOUGH} counted trials. Add repetitions"
 UNSHOWN = "No effect is shown. Estimate how many trials one would need"
-UNCLEAR = "Likeness to people cannot be told in every measure. More trials narrow all but the gap"
 
 
 def next_steps(
@@ -60,17 +56,8 @@ def next_steps(
         steps.append((REPEATED.format(joined(same)), ""))
     if others and not is_rehearsal(drivers):
         steps.append((FEW.format(joined(others)), again("--reps", "N")))
-    if isinstance(answers, Answer) and not _shown([row.mark for row in answers.changes]):
+    if isinstance(answers, Answer) and not any(row.is_shown for row in answers.changes):
         steps.append((UNSHOWN, shlex.join([program, "power", sweep[1]])))
-    states = [
-        shown_state(of.cells[name].values)
-        for of in judged
-        if of not in few
-        for name in HEADINGS
-        if name != "gap"
-    ]
-    if OPEN in states and not few and not is_rehearsal(drivers):
-        steps.append((UNCLEAR, again("--reps", "N")))
     return steps
 
 
@@ -93,13 +80,9 @@ def is_found(drivers: Sequence[Driver], answers: Answer | Comparison | None) -> 
     if is_rehearsal(drivers):
         return False
     if isinstance(answers, Answer):
-        return _shown([row.mark for row in (*answers.changes, *answers.others)])
-    if answers and _shown([row.mark for row in answers.rows]):
+        return any(row.is_shown for row in (*answers.changes, *answers.others))
+    if answers and any(row.is_shown for row in answers.rows):
         return True
     return any(
         shown_state(cell.values) in DIFFERS for driver in drivers for cell in driver.cells.values()
     )
-
-
-def _shown(marks: Sequence[Mark | None]) -> bool:
-    return any(mark is not None and mark.shape == "like" for mark in marks)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner_analysis.headlines import share
 from merge_runner_analysis.stats.score_interval import wilson
 from merge_runner_analysis.web.effect_rows import unbroken
 from merge_runner_analysis.web.judged import Driver
@@ -19,22 +20,14 @@ from merge_runner_analysis.wording import (
     OPEN,
     PLAYED_RULES,
     RULES_MEAN,
-    SHOWN,
-    STRONGER,
-    UNLIKE,
     VERDICT_RULES,
-    VERDICTS,
-    WEAKER,
     brackets,
     has_verdict,
     joined,
     number,
-    share,
     shown_state,
     verdict_word,
 )
-
-MARKS = {SHOWN: "●", STRONGER: "▲", WEAKER: "▼", UNLIKE: "✕", OPEN: "○"}
 
 # Notes on measures that no situation allows.
 UNPOSED = {
@@ -46,20 +39,18 @@ UNPOSED = {
 
 @dataclass(frozen=True, slots=True)
 class Likeness:
-    """One measure of a driver beside people's: a mark with its word, and what was counted.
+    """One measure of a driver beside people's: a verdict, and what was counted.
 
-    A count has ``k`` and ``n``, any other value a ``text``; ``row`` is the verdict's row, and
-    ``why`` says what keeps it open. Where the count is by another rule than people's, ``by_people``
-    has the bounds by theirs.
+    A count has ``k`` and ``n``, any other value a ``text``; ``row`` is the verdict's row. Where the
+    count is by another rule than people's, ``by_people`` has the bounds by theirs.
     """
 
-    mark: str
     word: str
+    is_open: bool
     k: int | None
     n: int | None
     text: str
     row: str
-    why: str = ""
     by_people: str = ""
 
 
@@ -70,7 +61,7 @@ def other_differences(driver: Driver) -> str:
         for name, cell in driver.cells.items()
         if name not in HEADINGS and shown_state(cell.values) in DIFFERS
     ]
-    return f"differs in {joined(labels)}, too" if labels else ""
+    return f"also differs in {joined(labels)}" if labels else ""
 
 
 def likeness_of(driver: Driver) -> dict[str, Likeness]:
@@ -140,35 +131,31 @@ def could_see(drivers: Sequence[Driver], short: Mapping[str, str]) -> str:
 
 
 def verdict_rules(drivers: Sequence[Driver], gap: Mapping[str, Any]) -> list[str]:
-    """Return the rule of a verdict, a line a state; ``gap`` is people's value."""
-    tests = {sum(c.values.get("p_holm") is not None for c in of.cells.values()) for of in drivers}
-    ends = dict.fromkeys((min(tests, default=0), max(tests, default=0)))
-    numbers = f"{' to '.join(map(str, ends))} " if any(ends) else ""
-    marks = {state: f"{mark} " for state, mark in MARKS.items()}
-    likeness, *others = (rule.format(tests=numbers, **marks) for rule in VERDICT_RULES)
-    if of_gap := gap.get("ci"):
-        half = _half(of_gap)
-        if half > MARGINS["gap"] / 2:
-            likeness += (
-                f". In the gap hardly any driver can be shown to be so, however many trials it "
-                f"has: people's is known only to ± {number(half)} m, by nine pairs"
-            )
+    """Return the rule of a verdict, a line a state, or of none; ``gap`` is people's value."""
+    if not any(has_verdict(cell.values) for of in drivers for cell in of.cells.values()):
+        return [*VERDICT_RULES[-1:]]
+    tests = {
+        sum(cell.values.get("p_holm") is not None for cell in of.cells.values())
+        for of in drivers
+        if any(has_verdict(cell.values) for cell in of.cells.values())
+    }
+    ends = " to ".join(map(str, dict.fromkeys((min(tests), max(tests))))) if any(tests) else ""
+    numbers = f" ({ends})" if ends else ""
+    likeness, *others = (rule.format(tests=numbers) for rule in VERDICT_RULES)
+    low, high = gap.get("ci") or (0.0, 0.0)
+    if (half := (high - low) / 2) > MARGINS["gap"] / 2:
+        likeness += (
+            ". In the gap hardly any driver can be shown to be so, however many trials it has: "
+            f"people's is known only to ± {number(half)} m, by nine pairs"
+        )
     return [likeness, *others]
-
-
-def _half(ends: Sequence[float]) -> float:
-    return (ends[1] - ends[0]) / 2
 
 
 def _likeness(cell: Cell) -> Likeness:
     values = cell.values
-    mark, word = MARKS.get(shown_state(values), MARKS[OPEN]), verdict_word(values)
-    row, counted, why = str(values["row"]), values.get("counted"), ""
-    if cell.measure.name == "gap" and word == VERDICTS[OPEN] and values.get("human_ci"):
-        half = _half(values["human_ci"])
-        if half > MARGINS["gap"] / 2:
-            why = f"people's gap is known only to ± {number(half)} m"
-    if counted:
+    word, is_open = verdict_word(values), shown_state(values) in ("", OPEN)
+    row = str(values["row"])
+    if counted := values.get("counted"):
         k, n = map(int, str(counted).split(" of "))
         text, by_people = unbroken(f"{number(100 * k / n)} %"), ""
         if undecided := values.get("undecided"):
@@ -177,14 +164,14 @@ def _likeness(cell: Cell) -> Likeness:
             by_people = unbroken(f"{bounds} by people's rule")
             (rule,) = (of for of, name in PLAYED_RULES.items() if name == values["counted_by"])
             text += f" by the rule played here: {RULES_MEAN[rule]}"
-        return Likeness(mark, word, k, n, text, row, "", by_people)
+        return Likeness(word, is_open, k, n, text, row, by_people)
     estimate = values.get("estimate")
     known = cell.measure.name == "gap" and estimate is not None
     ends = brackets(values.get("ci"))
     if estimate is not None and ends == brackets((estimate, estimate)):
         ends = "in every trial"
     text = f"{number(estimate)} m {ends}".rstrip() if known else ""
-    return Likeness(mark, word, None, None, unbroken(text), row, unbroken(why))
+    return Likeness(word, is_open, None, None, unbroken(text), row)
 
 
 def people_of(conditions: Mapping[str, Any], human: Mapping[str, Any]) -> dict[str, str]:

@@ -27,6 +27,7 @@ from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.figures.gallery import rendered, write_figures
 from merge_runner_analysis.frames import KEYS, load
 from merge_runner_analysis.grouping import levels_of
+from merge_runner_analysis.headlines import sentences
 from merge_runner_analysis.provenance import Provenance, provenance, tally
 from merge_runner_analysis.published import published
 from merge_runner_analysis.study import StudyResults
@@ -45,7 +46,7 @@ from merge_runner_analysis.web.question import answer_of
 from merge_runner_analysis.web.rendering import STYLE, environment, inlined_texts, policy_of
 from merge_runner_analysis.web.scope import DESCRIPTIONS
 from merge_runner_analysis.web.urls import Links
-from merge_runner_analysis.wording import HUMANS, LANGUAGE_MODEL, TABLE, number, sentences
+from merge_runner_analysis.wording import HUMANS, LANGUAGE_MODEL, TABLE, number
 
 # The first prompt of each variant, all of the same condition as far as that was played.
 PROMPTS = """
@@ -178,7 +179,7 @@ def report_html(study: StudyResults, tables: list[Table], figures: dict[str, str
 
 def _views(
     study: StudyResults, tables: list[Table]
-) -> tuple[list[dict[str, object]], dict[tuple[Source, ...], int]]:
+) -> tuple[list[dict[str, Any]], dict[tuple[Source, ...], int]]:
     """Return the tables as templates need them, and the sources of their rows, numbered from 1.
 
     Rows with equal sources share a number.
@@ -194,7 +195,23 @@ def _views(
         return links[place]
 
     compared = (against(table, study) if table.name in FILES else table for table in tables)
-    return [table_view(table, link) for table in compared], numbers
+    return [_without_constant(table_view(table, link)) for table in compared], numbers
+
+
+def _without_constant(view: dict[str, Any]) -> dict[str, Any]:
+    """Return a table with the ``places`` of columns to show: no prompt that all rows have.
+
+    Its heading says that prompt. Rows of people have no prompt.
+    """
+    places = [*range(len(view["columns"]))]
+    headings = [column["heading"] for column in view["columns"]]
+    if "prompt" in headings and len(view["rows"]) > 1:
+        place = headings.index("prompt")
+        prompts = {row["cells"][place]["text"] for row in view["rows"]} - {""}
+        if len(prompts) == 1:
+            places.remove(place)
+            view["heading"] += f"; prompt: {prompts.pop()}"
+    return view | {"places": places}
 
 
 def _apart(study: StudyResults) -> Comparison | None:

@@ -70,8 +70,8 @@ PROGRAMS.register(
     "cei",
     Program(
         CeiDriver,
-        "communication-enabled interaction (Siebinga et al. 2024), a model of human merging, with "
-        "other thresholds",
+        "predicts the other vehicle, and plans anew when the collision risk it perceives leaves "
+        "two thresholds (model of Siebinga et al. 2024, thresholds of our own)",
         {SET: BY_RESISTANCE, PAIR: 0},
         1 / TICK_S,
         settable=True,

@@ -12,13 +12,14 @@ import pytest
 
 from merge_runner.errors import UsageError
 from merge_runner.results.store import query
+from merge_runner_analysis.headlines import headline, sentence
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import formats, make_tables
 from merge_runner_analysis.tables.model import from_text
 from merge_runner_analysis.web.answers import answer
-from merge_runner_analysis.wording import MEASURES, by_group, headline, sentence, verdict_word
+from merge_runner_analysis.wording import MEASURES, by_group, verdict_word
 from tests.support.serving import Page, client_of, in_process, listed, never
 from tests.support.studies import Said, changed, write_study, yielding
 

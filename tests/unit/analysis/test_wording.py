@@ -6,6 +6,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from merge_runner_analysis.headlines import (
+    TOO_FEW,
+    apart,
+    crash_text,
+    crashes,
+    difference_sentence,
+    headline,
+    is_constant,
+    sentence,
+)
 from merge_runner_analysis.wording import (
     DIFFERS,
     LANGUAGE_MODEL,
@@ -16,16 +26,9 @@ from merge_runner_analysis.wording import (
     RULES_MEAN,
     SHOWN,
     STRONGER,
-    TOO_FEW,
     WEAKER,
-    apart,
-    crash_text,
-    crashes,
-    difference_sentence,
     differs,
-    headline,
     money,
-    sentence,
     verdict_word,
 )
 
@@ -128,8 +131,8 @@ NONE = "No language model drove here."
         (
             [of_kind(PROGRAM, headway="unlike"), of_kind(PROGRAM, collisions="unlike")],
             [
-                "None of 1 drivers with enough trials crash as often as people; none of 1 with "
-                "enough trials let the one ahead go first, as people do. No verdict on who goes "
+                "None of 1 drivers with enough trials crash as often as people; none of 1 let "
+                "the one ahead go first, as people do. No verdict on who goes "
                 "first side by side and the gap.",
                 NONE,
             ],
@@ -143,11 +146,11 @@ NONE = "No language model drove here."
                 {"collisions": row("collisions", OPEN, n=21, kind=PROGRAM, counted="9 of 21")},
             ],
             [
-                "Of 4 programs d0 (it was made from the human data) is most like people: it agrees "
-                "with them in 1 of 4 measures, and is shown to differ in none. Most crashes: d3 "
-                "crashed in 9 of 21 trials.",
+                "Of the 3 programs with enough trials d0 (it was made from the human data) is most "
+                "like people: it agrees with them in 1 of 4 measures, and is shown to differ in "
+                "none. Most crashes: d3 crashed in 9 of 21 trials.",
                 "2 of 2 drivers with enough trials let the one ahead go first, as people do; none "
-                "of 2 with enough trials leave gaps like people's. Cannot tell: crashes. No "
+                "of 2 leave gaps like people's. Cannot tell: crashes. No "
                 "verdict on who goes first side by side. Without a verdict: d2 crashed in 11 of 11 "
                 f"trials. {NONE}",
             ],
@@ -191,9 +194,22 @@ def test_two_drivers_are_told_apart_with_names_and_numbers():
     assert "of 110. No difference is shown: −38.64 points [−50.00, −27.00]; corrected" in claim
 
 
+@pytest.mark.parametrize("k", [0, 40])
+def test_a_count_that_cannot_differ_is_not_compared(k):
+    same = {"k": k, "n": 40, "k_reference": k, "n_reference": 40, "p_corrected": 1.0,
+            "difference": 0.0, "ci": (-9.0, 9.0)}  # fmt: skip
+    rows = {"collided_percent": same, "joint_percent": same | {"measure": "joint (%)"}}
+    assert is_constant(same)
+    assert not is_constant(same | {"k": 39})
+    assert apart("a", "b", rows, of_left=True) == (
+        f"a crashed in {k} of 40 trials, b in {k} of 40.",
+        "",
+    )
+
+
 def test_a_crash_is_explained_by_the_rules_that_were_played():
     assert crash_text([("rectangle", [0.05, 0.2])]) == (
-        "the vehicles' outlines overlap, checked every 0.05 or 0.2 s, by the driver"
+        "the vehicles' outlines overlap, checked every simulation step, 0.05 or 0.2 s"
     )
     both = crash_text([(rule, [0.2]) for rule in RULES_MEAN])
     assert " or, by the scenario of the trial, " in both
@@ -309,7 +325,10 @@ def test_an_interval_beside_a_margin_names_its_level_where_that_is_not_95_percen
             driver(headway="weaker"),
             "Who goes first depends less on who is ahead than with people (the one ahead in 75 of",
         ),
-        (driver(velocity="unlike"), "The faster one does not yield, as it does with people ("),
+        (
+            driver(velocity="unlike"),
+            "Who goes first depends more on who is slower than with people (side by side, the",
+        ),
         (driver(gap="unlike"), "Leaves a gap of 1.00 m, smaller than people (2.00 m)"),
         (driver(50, collided=50, collisions="unlike"), "Crashed in 50 of 100 trials, less often"),
         ({"": {"note": "not judged: why"}}, "Not judged: why."),
@@ -356,11 +375,13 @@ def test_no_sentence_claims_a_direction_that_the_corrected_p_does_not_carry(of):
         ("collisions", (-9.0, -5.1), "fewer than people's"),
         ("gap", (-1.0, -0.5), "like people"),
         ("gap", (-1.1, -0.5), "smaller than people's"),
-        ("headway", (-0.1, 0.1), "unlike people's"),
+        ("headway", (-0.1, -0.01), "less than with people"),
+        ("velocity", (0.01, 0.1), "less than with people"),
+        ("held", (0.1, 0.2), "unlike people's"),
     ],
 )
 def test_within_a_margin_a_driver_is_like_people_wherever_that_is_said(measure, ci, says):
-    of = row(measure, "unlike", difference_ci=ci, p_holm=0.01)
+    of = row(measure, "unlike", difference=sum(ci) / 2, difference_ci=ci, p_holm=0.01)
     assert verdict_word(of) == says
     assert differs(of) is (says != "like people")
 
@@ -378,6 +399,6 @@ def test_a_measure_of_a_sign_alone_has_another_word_than_one_with_a_margin():
     for name in ("headway", "velocity", "gap-headway"):
         assert verdict_word(row(name, SHOWN)) == "same tendency as people"
     # Nor can a slope that is smaller be read as a smaller count.
-    assert verdict_word(row("velocity", WEAKER)) == "depends less on who is slower"
-    assert verdict_word(row("headway", STRONGER)) == "depends more on who is ahead"
+    assert verdict_word(row("velocity", WEAKER)) == "less than with people"
+    assert verdict_word(row("headway", STRONGER)) == "more than with people"
     assert verdict_word(row("gap-velocity", SHOWN)) == "like people"

@@ -2,8 +2,9 @@
 
 import pytest
 
+from merge_runner_analysis.headlines import sentence
 from merge_runner_analysis.web.judged import summary_of
-from merge_runner_analysis.wording import LANGUAGE_MODEL, MOCK, PROGRAM, sentence
+from merge_runner_analysis.wording import LANGUAGE_MODEL, MOCK, PROGRAM
 
 
 def verdicts(crashes="inconclusive", **states):
@@ -19,7 +20,7 @@ def verdicts(crashes="inconclusive", **states):
 @pytest.mark.parametrize(
     ("of", "ends"),
     [
-        (verdicts(gap_headway="inconclusive"), "Cannot tell: crashes; gap, by headway."),
+        (verdicts(gap_headway="inconclusive"), "Cannot tell: crashes; gap, by who is ahead."),
         (verdicts("shown", gap_velocity="inconclusive"), " Cannot tell: gap, by who is faster."),
         (verdicts(), "Cannot tell: crashes."),
     ],

@@ -59,18 +59,29 @@ def test_the_least_and_the_largest_detectable_differences_name_their_drivers(dri
     assert could_see(named, {name: name for name in "abcd"}) == text
 
 
+JUDGED = {"gap": {"state": OPEN, "n": 30, "ended": 30}}
+
+
 @pytest.mark.parametrize(
     ("drivers", "text"),
     [
-        ([], "a driver's tests"),
-        ([{}], "a driver's tests"),
-        ([{"gap": {"p_holm": 0.3}}], "a driver's 1 tests"),
-        ([{"gap": {"p_holm": 0.3}}, {}], "a driver's 0 to 1 tests"),
+        ([JUDGED], "all tests of a driver;"),
+        ([JUDGED | {"headway": {"p_holm": 0.3}}], "all tests of a driver (1);"),
+        (
+            [JUDGED | {"headway": {"p_holm": 0.3}}, JUDGED, {"gap": {"p_holm": 0.3}}],
+            "all tests of a driver (0 to 1);",
+        ),
     ],
 )
 def test_the_rule_of_a_verdict_has_the_number_of_tests_where_it_is_known(drivers, text):
-    named = [driver(name, **of) for name, of in zip("ab", drivers, strict=False)]
+    named = [driver(name, **of) for name, of in zip("abc", drivers, strict=False)]
     assert text in verdict_rules(named, {})[2]
+
+
+@pytest.mark.parametrize("drivers", [[], [{}], [{"gap": {"state": OPEN, "n": 19, "ended": 19}}]])
+def test_without_a_verdict_only_the_rule_of_none_is_said(drivers):
+    (rule,) = verdict_rules([driver("a", **of) for of in drivers], {"ci": (2.0, 4.0)})
+    assert rule.startswith("No verdict: fewer than 20")
 
 
 def test_drivers_with_the_same_note_on_a_measure_share_it():
@@ -147,10 +158,9 @@ def test_people_s_gap_is_given_as_each_driver_is_compared_with_it():
     assert gap_weights(of[:1], NAMES) == ""
 
 
-def test_every_mark_has_its_rule():
-    rules = verdict_rules([driver("a", gap={"p_holm": 0.5})], {"ci": (2.0, 4.0)})
-    assert [rule.split()[0] for rule in rules] == ["●", "●", "▲", "○"]
-    assert "▼ fewer, less, smaller or depends less, ✕ unlike" in rules[2]
+def test_every_verdict_has_its_rule():
+    rules = verdict_rules([driver("a", **JUDGED)], {"ci": (2.0, 4.0)})
+    assert [rule.split()[0] for rule in rules] == ["Like", "Same", "More,", "Cannot", "No"]
     assert rules[0].endswith("people's is known only to ± 1.00 m, by nine pairs")
 
 
@@ -184,7 +194,7 @@ TYPED = ["sweep", "s.toml", "--model", "emulator", "--yes"]
             played(trials=110, n=110, ended=(110, 0)),
             PROGRAM,
             ["sweep", "STUDY"],
-            [("Likeness to people cannot be told", "m sweep STUDY --reps N")],
+            [],
         ),
         (
             played(trials=110, n=110, ended=(110, 0)),
@@ -209,7 +219,7 @@ def test_the_next_steps_follow_from_the_result(of, kind, sweep, steps):
 def test_a_difference_in_a_measure_without_a_column_is_named_in_the_row():
     apart = {"state": STRONGER, "n": 110, "ended": 110}
     shown = driver("a", **{"gap": apart, "gap-headway": apart})
-    assert other_differences(shown) == "differs in gap, by headway, too"
+    assert other_differences(shown) == "also differs in gap, by who is ahead"
     assert other_differences(driver("a", gap=apart)) == ""
 
 

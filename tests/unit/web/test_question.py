@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from merge_runner_analysis.tables.model import Column, Row, Table
 from merge_runner_analysis.web import effect_rows
-from merge_runner_analysis.web.question import UNREAD, answer_of, answered
+from merge_runner_analysis.web.claims import UNREAD, answered
+from merge_runner_analysis.web.question import answer_of
 from merge_runner_analysis.wording import EGO, LEFT, PLANTED, SAME_TRIALS, WORDS
 
 GOES_FIRST, GAP, COST = "goes first (%)", "gap (m)", "cost (USD)"
@@ -180,7 +181,8 @@ def test_a_side_has_its_count_and_the_chart_the_axis_of_its_data():
     assert made.asked == "Does hurry change who goes first?"
     assert (change.reference.k, change.level.k, change.level.n) == (50, 63, 100)
     assert (change.reference.name, change.level.name) == ("no", "yes")
-    assert (change.mark.shape, crashes.mark.shape) == ("like", "open")
+    assert (change.is_shown, crashes.is_shown) == (True, False)
+    assert change.mark.shape == crashes.mark.shape == "plain"
     assert (crashes.level.k, crashes.level.n, crashes.level.text[:4]) == (3, 103, "63.0")
     # Of both drivers, which are drawn.
     assert (
@@ -198,6 +200,14 @@ def test_a_side_has_its_count_and_the_chart_the_axis_of_its_data():
             assert min(places) <= point.ends[0] < point.x < point.ends[1] <= max(places)
 
 
+@pytest.mark.parametrize(("percent", "shown"), [(0.0, 0), (100.0, 0), (50.0, 1)])
+def test_a_share_that_cannot_differ_is_not_shown(percent, shown):
+    same = {"estimate": percent, "estimate_reference": percent, "difference": 0.0}
+    crashes = effect(measure="coll. (%)", p=1.0)
+    crashes = replace(crashes, values=crashes.values | same)
+    assert len(answer([effect(), crashes], levels_of("hurry")).others) == shown
+
+
 def test_the_chart_of_a_driver_has_the_values_and_the_interval_of_the_table():
     rows = [effect(), effect(level="much", difference=42.0, estimate=94.0, estimate_reference=52.0)]
     levels = [*levels_of("hurry"), *levels_of("hurry")[1:]]
@@ -207,8 +217,8 @@ def test_the_chart_of_a_driver_has_the_values_and_the_interval_of_the_table():
     assert made.is_cut
     points = [(point.shape, point.says) for line in made.charts[0].lines for point in line.points]
     assert points == [
-        ("ring", "all drivers: 50.00"),
-        ("ring", "all drivers: 52.00"),
+        ("dot", "all drivers: 50.00"),
+        ("dot", "all drivers: 52.00"),
         ("dot", "all drivers: 63.00 [56.00, 70.00]"),
         ("dot", "all drivers: 94.00 [87.00, 101.00]"),
     ]

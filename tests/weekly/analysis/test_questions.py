@@ -12,7 +12,7 @@ from scipy.stats import binom
 from merge_runner_analysis.metrics import LEFT_FIRST, METRICS
 from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables import make_tables
-from merge_runner_analysis.web.question import answered
+from merge_runner_analysis.web.claims import answered
 from tests.support.harness import FAST
 from tests.support.words_study import EXAMPLE
 

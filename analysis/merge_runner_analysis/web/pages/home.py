@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from merge_runner.drivers.registry import EMULATOR
+from merge_runner_analysis.headlines import headline
 from merge_runner_analysis.web.comparison import Comparison, compared
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.effect_rows import MIDDLE
@@ -25,11 +27,12 @@ from merge_runner_analysis.web.question import Answer, answer_of
 from merge_runner_analysis.web.runs import standing_of
 from merge_runner_analysis.web.scope import Bar, Scope, descriptions_of, scope_of, unmarked
 from merge_runner_analysis.web.site import Site, news_of
-from merge_runner_analysis.wording import HEADINGS, LANGUAGE_MODEL, MOCK, PROGRAM, headline
+from merge_runner_analysis.wording import HEADINGS, LANGUAGE_MODEL, MOCK, PROGRAM
 
 FACTOR_TABLES = ("effects", "levels")  # of what a study's factors change
 # Kinds of drivers whose identical trials count once.
 ONCE = {PROGRAM: "program", MOCK: "mock model"}
+DRAWN = "draws who goes first as people do"  # the emulator
 Jobs = list[Job]
 
 
@@ -81,7 +84,14 @@ def _beside_people(
             (
                 driver,
                 likeness_of(driver),
-                filter(None, (counted(driver, conditions), other_differences(driver))),
+                filter(
+                    None,
+                    (
+                        DRAWN * (EMULATOR in driver.name),
+                        counted(driver, conditions),
+                        other_differences(driver),
+                    ),
+                ),
             )
             for kind in by_kind(drivers).values()
             for driver in kind
@@ -143,7 +153,7 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         apart=apart,
         steps=next_steps(site.program, sweep, shown, short, conditions, question or apart),
         found=is_found(shown, question or apart),
-        prompted=any(driver.kind != PROGRAM for driver in shown),
+        prompted=any(driver.facts and driver.facts["asked"] for driver in shown),
         asking=asking,
         middle=MIDDLE,
         linked=True,

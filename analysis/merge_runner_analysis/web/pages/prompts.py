@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Collection, Mapping
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -21,7 +20,6 @@ from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.scope import carried, scope_of, unmarked
 from merge_runner_analysis.web.site import NotThere, Site
 from merge_runner_analysis.web.trial.prompt_parts import Part, digests_of, level_of, parts_of
-from merge_runner_analysis.wording import ALPHA
 
 # The blocks of a prompt, as its specs name them; a program has none.
 STORED = """
@@ -121,8 +119,8 @@ def differences(
 ) -> tuple[dict[str, dict[str, dict[str, Any]]], dict[str, float]]:
     """Return each prompt's differences by driver, pair of prompts and measure, and axis ends.
 
-    Each difference has its printed text, its mark (filled if its corrected p is below 5 %) and
-    the names for a link to its trials. An axis ends at the same distance on both sides.
+    Each difference has its printed text, its mark and the names for a link to its trials. An axis
+    ends at the same distance on both sides.
     """
     # A driver that is not judged has none.
     rows = [row for row in table.rows if row.values.get("difference") is not None]
@@ -132,8 +130,6 @@ def differences(
         driver, _, prompt = row.groups[0].rpartition("/")
         if unmarked(driver) not in chosen:
             continue
-        p: Any = row.values["p_holm"]
-        shape = "open" if p is None or p >= ALPHA else "like"
         compared = f"{prompt} against {row.values['reference']}"
         of_driver = drivers.setdefault(str(row.values["driver"]), {})
         of_driver.setdefault(compared, {})[metric_of(row)] = {
@@ -141,7 +137,7 @@ def differences(
             "row": row.id,
             "driver": driver,
             "prompt": prompt,
-            "mark": replace(difference_mark(row, ends[metric_of(row)]), shape=shape),
+            "mark": difference_mark(row, ends[metric_of(row)]),
         }
     return drivers, ends
 

@@ -1,0 +1,465 @@
+"""Sentences that compare drivers with people and with each other, of finished tables.
+
+Nothing here computes: a page, a report and a terminal say the same. pandas is not needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from merge_runner.prompts.blocks import BASELINE
+from merge_runner_analysis.metrics import COLLISIONS, COST, GAP, JOINT, LEFT_FIRST, RMSE, VALID
+from merge_runner_analysis.wording import (
+    ALPHA,
+    CHANGED,
+    DIFFERS,
+    ENOUGH,
+    FEW,
+    HUMANS,
+    LANGUAGE_MODEL,
+    MEASURES,
+    OPEN,
+    PLAYED_RULES,
+    PROGRAM,
+    RULES_MEAN,
+    SHOWN,
+    Values,
+    brackets,
+    by_group,
+    capital,
+    differs,
+    distance,
+    equal_p,
+    has_verdict,
+    joined,
+    money,
+    number,
+    shown_state,
+    suffice,
+    with_interval,
+)
+
+TOO_FEW = (
+    f"Too few trials without a crash for a verdict (at least {ENOUGH}, and half of all, are needed)"
+)
+# What drivers that are like people do in them, and what there is no verdict on.
+LIKENESS = {
+    "collisions": ("crash as often as people", "crashes"),
+    "headway": ("let the one ahead go first, as people do", "who goes first with one ahead"),
+    "velocity": ("let the slower go first side by side, as people do",
+                 "who goes first side by side"),
+    "gap": ("leave gaps like people's", "the gap"),
+}  # fmt: skip
+# Where two equal drivers met, who goes first is counted for the left vehicle.
+LEFT_GOES_FIRST = "left vehicle goes first"
+# Sentence parts: a driver has more than another, has less, or no difference is shown in it.
+COMPARED = {
+    LEFT_FIRST.name: ("goes first more often", "goes first less often", "how often it goes first"),
+    LEFT_GOES_FIRST: (
+        *(f"lets the left vehicle go first {often} often" for often in ("more", "less")),
+        "how often the left vehicle goes first",
+    ),
+    GAP.name: ("leaves a larger gap", "leaves a smaller gap", CHANGED[GAP.name]),
+    RMSE.name: (
+        "departs more from its initial speed",
+        "keeps closer to its initial speed",
+        CHANGED[RMSE.name],
+    ),
+    JOINT.name: (
+        *(f"has both drivers change their speed {often} often" for often in ("more", "less")),
+        CHANGED[JOINT.name],
+    ),
+    VALID.name: ("has more valid replies", "has fewer valid replies", CHANGED[VALID.name]),
+    COST.name: ("costs more", "costs less", CHANGED[COST.name]),
+}
+# The vehicle whose first mergers are counted, by measure.
+FIRST = {"headway": "the one ahead", "velocity": "side by side, the slower one"}
+# Measures that a person sees at once come first in a headline, fitted ones last.
+SEEN_FIRST = ("collisions", "headway", "velocity", "gap", "gap-headway", "gap-velocity", "held")
+
+
+def sentences(rows: Iterable[Any]) -> list[str]:
+    """Return the headline of a table's rows, then a sentence on each driver and prompt."""
+    groups = by_group(rows)
+    suffix = f"/{BASELINE}"
+    drivers = {name: of for name, of in groups.items() if _kind(of) != HUMANS}
+    answering = _models(drivers) or drivers
+    # A study may call its first prompt otherwise.
+    shown = {n.removesuffix(suffix): of for n, of in answering.items() if n.endswith(suffix)}
+    return [
+        " ".join(filter(None, headline(shown or answering))),
+        *(f"{name}: {sentence(of)}" for name, of in drivers.items()),
+    ]
+
+
+def _kind(verdicts: Mapping[str, Values]) -> str:
+    return str(next(iter(verdicts.values()))["kind"])
+
+
+def _models(drivers: Mapping[str, Mapping[str, Values]]) -> dict[str, Mapping[str, Values]]:
+    """Return the language models that are judged."""
+    return {n: of for n, of in drivers.items() if _kind(of) == LANGUAGE_MODEL and "" not in of}
+
+
+def sentence(verdicts: Mapping[str, Values]) -> str:
+    """Return a few sentences that compare a driver with people: crashes, then measures."""
+    if "" in verdicts:
+        return f"{capital(verdicts['']['note'])}."
+    parts = [crashes(verdicts["collisions"]), *map(_part, verdicts.values())]
+    unclear = [
+        MEASURES[name].label
+        for name in ("headway", "velocity", "collisions", "gap")
+        if shown_state(verdicts[name]) == OPEN
+    ]
+    if unclear:
+        parts.append(f"cannot tell: {'; '.join(unclear)}")
+    text = ". ".join(capital(part) for part in parts if part)
+    return f"{text or 'Nothing can be compared with people'}."
+
+
+def _part(values: Values) -> str:
+    """Return the sentence part on a measure's state; empty where there is none."""
+    says = MEASURES[str(values["measure"])].says.get(shown_state(values), "")
+    of, humans = (number(values.get(name)) for name in ("estimate", "human"))
+    counted, people = values.get("counted"), values.get("human_counted")
+    says = says.format(of=of, humans=humans, more=_more(values))
+    if not (says and counted and people):
+        return says
+    return f"{says} ({FIRST[str(values['measure'])]} in {counted} trials, people in {people})"
+
+
+def _more(values: Values) -> str:
+    return "more" if distance(values) > 0 else "less"
+
+
+def crashes(values: Values) -> str:
+    """Return the crashes by the rule that was played, then by the humans' where they differ.
+
+    ``crashed in 15 of 22 trials; people in 28 of 990``, or empty where no trial ended.
+    """
+    k, undecided = values.get("k") or 0, values.get("undecided") or 0
+    ended = (values["n"] or 0) + undecided
+    if not ended:
+        return ""
+    seen = values.get("counted") or f"{k} of {ended}"
+    text = f"crashed in {seen} trials"
+    if undecided:
+        rule = values.get("counted_by") or PLAYED_RULES["shared_lane"]
+        text += f" by {rule}, in {k} to {k + undecided} by people's rule"
+    people = values.get("human_counted")
+    if shown_state(values) in DIFFERS:
+        than = f" ({people})" if people else ""
+        return f"{text}, {_more(values)} often than people{than}"
+    return f"{text}; people in {people}" if people else text
+
+
+def crash_text(rules: Sequence[tuple[str, Sequence[float]]]) -> str:
+    """Return the meaning of a crash by the collision rules that were played, with their steps."""
+    texts = []
+    for rule, steps_s in rules:
+        every = "simulation step, " * (len(steps_s) > 1) + " or ".join(map("{:g}".format, steps_s))
+        text = f"{RULES_MEAN[rule]}, checked every {every} s"
+        texts.append(text if rule == "rectangle" else f"{text} ({PLAYED_RULES[rule]})")
+    return " or, by the scenario of the trial, ".join(texts)
+
+
+def _percent(collisions: Values, count: int) -> float:
+    ended = _ended(collisions)
+    return 100 * count / ended if ended else 0.0
+
+
+def apart(driver: str, other: str, rows: Mapping[str, Values], *, of_left: bool) -> tuple[str, str]:
+    """Return the headline of a driver less another, and other differences, of rows by their metric.
+
+    ``A crashed in 12 of 110 trials, B in 33 of 110. In the same situations A crashed less often, by
+    19.09 points [8.41, 29.78]; corrected p = 0.004.`` Who goes first is said ``of_left`` vehicles.
+    """
+    crashed = rows.get(COLLISIONS.name, {})
+    others = _others(driver, other, rows, of_left=of_left)
+    counts = [crashed.get(f"{name}{of}") for of in ("", "_reference") for name in ("k", "n")]
+    if any(count is None for count in counts):
+        return f"{driver} against {other}.", others
+    k, n, k_other, n_other = counts
+    claim = f"{driver} crashed in {k} of {n} trials, {other} in {k_other} of {n_other}"
+    difference, p, ci = (crashed.get(name) for name in ("difference", "p_corrected", "ci"))
+    if min(n or 0, n_other or 0) < ENOUGH:
+        return f"{claim}: too few to say more.", ""
+    if difference is None or p is None or is_constant(crashed):
+        return f"{claim}.", others
+    corrected = f"corrected p {equal_p(p)}"
+    if p >= ALPHA:
+        result = f"No difference is shown: {number(difference)} points {brackets(ci)}"
+        return f"{claim}. {result}; {corrected}.", others
+    # Where trials are fewer, the ends change their signs and their places.
+    ends = ci and sorted(end if difference > 0 else -end for end in ci)
+    result = f"{number(abs(difference))} points {brackets(ends)}".rstrip()
+    often = "more" if difference > 0 else "less"
+    same = f"In the same situations {driver} crashed {often} often, by {result}"
+    return f"{claim}. {same}; {corrected}.", others
+
+
+def is_constant(values: Values) -> bool:
+    """Return whether a measure counts no trial, or every trial, of both drivers."""
+    k, n = ([values.get(name + of) for of in ("", "_reference")] for name in "kn")
+    return None not in k and k in ([0, 0], n)
+
+
+def _others(driver: str, other: str, rows: Mapping[str, Values], *, of_left: bool) -> str:
+    """Return the measures besides crashes in which a driver is shown to differ, and the others."""
+    shown, unshown = [], []
+    for name, (more, less, what) in COMPARED.items():
+        is_unasked = name == (LEFT_FIRST.name if of_left else LEFT_GOES_FIRST)
+        values = rows.get(LEFT_FIRST.name if name == LEFT_GOES_FIRST else name, {})
+        if is_unasked or is_constant(values) or (p := values.get("p_corrected")) is None:
+            continue
+        if p >= ALPHA:
+            unshown.append(what)
+            continue
+        unit = str(values["measure"]).rpartition("(")[2].rstrip(")")
+        form = money if unit == "USD" else number
+        sides = (form(values[f"value{of}"]) for of in ("", "_reference"))
+        shown.append(
+            f"{more if values['difference'] > 0 else less} ({' against '.join(sides)} {unit})"
+        )
+    parts = [f"Compared with {other}, {driver} {joined(shown)}."] if shown else []
+    parts += [f"No difference is shown in {joined(unshown)}."] if unshown else []
+    return " ".join(parts)
+
+
+def share(collisions: Values) -> str:
+    """Return a rate in percent, or ``13.64 to 68.18`` where trials are undecided."""
+    k, undecided = collisions.get("k") or 0, collisions.get("undecided") or 0
+    least = number(_percent(collisions, k))
+    return f"{least} to {number(_percent(collisions, k + undecided))}" if undecided else least
+
+
+def headline(drivers: Mapping[str, Mapping[str, Values]]) -> tuple[str, str]:
+    """Return how drivers compare with people: the claim, and what else is seen at once.
+
+    It is of the language models that are judged or, without one, of all ``drivers``, by name.
+    Drivers with too few outcomes get only counts.
+    """
+    models = _models(drivers)
+    if not models:
+        return _without_models(drivers)
+    compared = {name: of for name, of in models.items() if any(v.get("state") for v in of.values())}
+    if not compared:
+        return "No language model can be compared with people yet.", ""
+    enough = {name: of for name, of in compared.items() if _enough(of)}
+    few = {name: of for name, of in compared.items() if name not in enough}
+    too_few = [_too_few(few, alone=len(models) == 1)] if few else []
+    untold = [f"{name} {crashes(of['collisions'])}." for name, of in few.items()]
+    if not enough:
+        return " ".join(too_few), " ".join(untold)
+    claim, because = _likeness(enough, every=len(enough) == len(models))
+    return claim, " ".join(filter(None, [because, *too_few, *untold]))
+
+
+def _without_models(drivers: Mapping[str, Mapping[str, Values]]) -> tuple[str, str]:
+    """Return how many drivers are like people in each measure, and the extremes of several."""
+    kinds = {_kind(of) for of in drivers.values()}
+    who = f"No language model {'is judged' if LANGUAGE_MODEL in kinds else 'drove'} here."
+    compared = {name: of for name, of in drivers.items() if "" not in of}
+    if len(compared) < 2:
+        return who, ""
+    claims = [_tally([*compared.values()]), _extremes(compared), _few_trials(compared), who]
+    if kinds == {PROGRAM}:
+        claims.insert(0, _most_alike(compared))
+    claim, *others = filter(None, claims)
+    return claim, " ".join(others)
+
+
+def _most_alike(drivers: Mapping[str, Mapping[str, Values]]) -> str:
+    """Return which of several programs are most like people, and which one crashes most."""
+    ranks = {
+        name: (
+            sum(shown_state(of[measure]) == SHOWN for measure in LIKENESS if measure in of),
+            -sum(shown_state(of[measure]) in DIFFERS for measure in LIKENESS if measure in of),
+        )
+        for name, of in drivers.items()
+        if any(map(has_verdict, of.values()))
+    }
+    like, unlike = best = max(ranks.values(), default=(0, 0))
+    names = [name for name, rank in ranks.items() if rank == best]
+    if not like or len(names) == len(ranks):
+        return ""
+    some = f"the {len(ranks)} programs with enough trials"
+    which = some if len(ranks) < len(drivers) else f"{len(drivers)} programs"
+    is_one = len(names) == 1
+    named = [
+        f"{name} (it was made from the human data)" if _is_from_humans(drivers[name]) else name
+        for name in names
+    ]
+    claim = (
+        f"Of {which} {joined(named)} {'is' if is_one else 'are'} most like people: "
+        f"{'it agrees' if is_one else 'each agrees'} with them in {like} of {len(LIKENESS)} "
+        f"measures, and is shown to differ in {-unlike or 'none'}."
+    )
+    rates = _crash_rates({name: of for name, of in drivers.items() if _is_judged(of)})
+    most = [name for name, rate in rates.items() if rate == max(rates.values()) > 0]
+    if len(most) != 1:
+        return claim
+    return f"{claim} Most crashes: {most[0]} {crashes(drivers[most[0]]['collisions'])}."
+
+
+def _is_from_humans(verdicts: Mapping[str, Values]) -> bool:
+    return any(values.get("from_humans") for values in verdicts.values())
+
+
+def _is_judged(verdicts: Mapping[str, Values]) -> bool:
+    """Return whether a driver has a verdict on crashes."""
+    return "collisions" in verdicts and has_verdict(verdicts["collisions"])
+
+
+def _few_trials(drivers: Mapping[str, Mapping[str, Values]]) -> str:
+    """Return the counts of crashes of drivers without a verdict on them, beside others with one."""
+    counts = [
+        f"{name} crashed in {of['collisions']['counted']} trials"
+        for name, of in drivers.items()
+        if not _is_judged(of) and of.get("collisions", {}).get("counted")
+    ]
+    return f"Without a verdict: {'; '.join(counts)}." if 0 < len(counts) < len(drivers) else ""
+
+
+def _crash_rates(drivers: Mapping[str, Mapping[str, Values]]) -> dict[str, float]:
+    """Return the share of trials with a crash, of drivers of which both are counted."""
+    counts = {name: of.get("collisions", {}).get("counted") for name, of in drivers.items()}
+    parts = {name: text.split(" of ") for name, text in counts.items() if text}
+    return {name: int(k) / int(n) for name, (k, n) in parts.items()}
+
+
+def _tally(drivers: Sequence[Mapping[str, Values]]) -> str:
+    """Return how many of the drivers with a verdict are like people, by measure."""
+    like, unclear, unjudged = list[str](), list[str](), list[str]()
+    for name, (does, what) in LIKENESS.items():
+        states = [shown_state(of[name]) for of in drivers if name in of and has_verdict(of[name])]
+        if not states:
+            unjudged.append(what)
+        elif {*states} == {OPEN}:
+            unclear.append(what)
+        else:
+            who = " drivers" * (not like)
+            few = " with enough trials" * (not like and len(states) < len(drivers))
+            like.append(f"{states.count(SHOWN) or 'none'} of {len(states)}{who}{few} {does}")
+    if not (like or unclear):
+        return f"For {len(drivers)} drivers no verdict on likeness to people is possible."
+    parts = [f"{'; '.join(like)}."] if like else []
+    parts += [f"cannot tell: {joined(unclear)}."] if unclear else []
+    parts += [f"no verdict on {joined(unjudged)}."] if unjudged else []
+    return " ".join(map(capital, parts))
+
+
+def _extremes(drivers: Mapping[str, Mapping[str, Values]]) -> str:
+    """Return the fewest and most crashes, and the smallest and largest gap, of many drivers.
+
+    Drivers without a verdict are left out.
+    """
+    drivers = {name: of for name, of in drivers.items() if _is_judged(of)}
+    crashed = {
+        f"{drivers[name]['collisions']['counted']} trials ({name})": rate
+        for name, rate in _crash_rates(drivers).items()
+    }
+    gaps = {}
+    for name, of in drivers.items():
+        values = of.get("gap", {})
+        gap = values.get("estimate")
+        if gap is not None and has_verdict(values):
+            gaps[f"{number(gap)} m ({name})"] = gap
+    parts = [
+        f"{what} from {min(of, key=lambda text: of[text])} to {max(of, key=lambda text: of[text])}"
+        for what, of in (("crashes range", crashed), ("mean gaps", gaps))
+        if len(of) > FEW and len({*of.values()}) > 1
+    ]
+    return f"{capital(', '.join(parts))}." if parts else ""
+
+
+def _likeness(drivers: Mapping[str, Mapping[str, Values]], *, every: bool) -> tuple[str, str]:
+    """Return both parts of a headline on drivers with enough trials; ``every``: on all drivers."""
+    unlike = {name: differences for name, of in drivers.items() if (differences := _differing(of))}
+    untold = [
+        f"{name} {crashes(of['collisions'])}."
+        for name, of in drivers.items()
+        if of["collisions"].get("undecided")
+    ]
+    alike = [name for name in drivers if name not in unlike]
+    if not unlike:
+        return f"No difference from people is shown for {joined(alike)}.", " ".join(untold)
+    names = sorted(unlike, key=lambda name: _seen_first(unlike[name][0]))
+    if len(names) == 1:
+        claim = f"{names[0]} differs from people: {difference_sentence(unlike[names[0]][0], 'it')}."
+    else:
+        is_all = every and not alike
+        count = "Both" if len(names) == 2 else f"All {len(names)}"
+        who = f"{count} language models here" if is_all else joined(names)
+        reasons = [difference_sentence(unlike[name][0], name) for name in names[:FEW]]
+        most = " most visibly" * (len(names) > FEW)
+        claim = f"{who} differ from people:{most} {'; '.join(reasons)}."
+    if alike:
+        untold.insert(0, f"No difference from people is shown for {joined(alike)}.")
+    return claim, " ".join(untold)
+
+
+def _seen_first(values: Values) -> tuple[int, float]:
+    """Return the place of a difference among others: what is seen at once, then what is surest."""
+    return SEEN_FIRST.index(str(values["measure"])), values["p_holm"]
+
+
+def _differing(verdicts: Mapping[str, Values]) -> list[Values]:
+    """Return the differing measures that rest on most trials, what is seen at once first."""
+    unlike = [values for values in verdicts.values() if differs(values) and _most(values, verdicts)]
+    return sorted(unlike, key=_seen_first)
+
+
+def _most(values: Values, verdicts: Mapping[str, Values]) -> bool:
+    """Return whether a measure has enough trials, and at least half of those that ended."""
+    return suffice(values["n"] or 0, _ended(verdicts["collisions"]))
+
+
+def _ended(collisions: Values) -> int:
+    """Return the number of trials that ended, also undecided ones."""
+    return (collisions["n"] or 0) + (collisions.get("undecided") or 0)
+
+
+def _finished(verdicts: Mapping[str, Values]) -> int:
+    return verdicts["gap"]["n"] or 0
+
+
+def _enough(verdicts: Mapping[str, Values]) -> bool:
+    """Return whether enough trials finished, or collided by the humans' rule, for a headline.
+
+    A driver that differs in measures of too few trials alone is not said to be alike.
+    """
+    outcomes = _finished(verdicts) + (verdicts["collisions"].get("k") or 0)
+    if not suffice(outcomes, _ended(verdicts["collisions"])):
+        return False
+    return bool(_differing(verdicts)) or not any(map(differs, verdicts.values()))
+
+
+def _too_few(drivers: Mapping[str, Mapping[str, Values]], *, alone: bool) -> str:
+    """Return how many trials of each driver had no crash, of those that ended."""
+    counts = [
+        f"{'' if alone else name} {_finished(of)} of {_ended(of['collisions'])}".strip()
+        for name, of in drivers.items()
+    ]
+    return f"{TOO_FEW}: {joined(counts)}."
+
+
+def difference_sentence(values: Values, it: str) -> str:
+    """Return a difference as ``it crashed in 24 of 110 trials, people in 28 of 990``.
+
+    Without counts of who goes first it is the sentence part of the state. A driver's interval
+    beside a margin has the level of its row, which is named if not 95 %.
+    """
+    measure = MEASURES[str(values["measure"])]
+    driver, people = values.get("counted"), values.get("human_counted")
+    if driver is None or people is None:
+        if measure.name in {"headway", "velocity"}:
+            return _part(values)
+        driver = with_interval(values["estimate"], values["ci"])
+        people = with_interval(values["human"], values["human_ci"])
+        if measure.name == "collisions":
+            driver, people = f"{driver} % of its", f"{people} %"
+    level = values.get("level") if measure.margin is not None and values["ci"] else None
+    at = "" if level is None or f"{level:.4g}" == "95" else f" (interval at {level:.4g} %)"
+    return f"{measure.difference.format(it=it, driver=driver, people=people)}{at}"
