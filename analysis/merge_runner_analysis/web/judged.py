@@ -131,7 +131,7 @@ def drivers_of(site: Site, table: Table | None, scope: Scope) -> list[Driver]:
                 prompt,
                 kind,
                 cells(verdicts, measures),
-                summary_of(verdicts, of, kind),
+                summary_of(verdicts),
                 of,
                 spec["endpoint"] if spec else "",
                 ", ".join(parameters),
@@ -140,8 +140,8 @@ def drivers_of(site: Site, table: Table | None, scope: Scope) -> list[Driver]:
     return drivers
 
 
-def summary_of(verdicts: Mapping[str, Values], facts: Row | None, kind: str) -> str:
-    """Return a driver's sentences, with every open measure, and the number of trials that count."""
+def summary_of(verdicts: Mapping[str, Values]) -> str:
+    """Return a driver's sentences, with every open measure."""
     if not verdicts:
         return ""
     text = sentence(verdicts)
@@ -152,16 +152,6 @@ def summary_of(verdicts: Mapping[str, Values], facts: Row | None, kind: str) -> 
     if unclear:
         begin = f"{text.removesuffix('.')}; " if CANNOT in text else f"{text} {CANNOT}: "
         text = f"{begin}{'; '.join(unclear)}."
-    n = int(str(verdicts["collisions"].get("counted") or "0 of 0").split(" of ")[1])
-    if facts and n and n != facts["trials"]:
-        once = {
-            MOCK: ", equal ones of a mock model once",
-            PROGRAM: ", equal ones of a program once",
-        }
-        text += (
-            f" {n} of its {facts['trials']} trials count: those that ended, in situations that "
-            f"people drove{once.get(kind, '')}."
-        )
     return text
 
 

@@ -16,7 +16,8 @@ from merge_runner_analysis.metrics import COLLISIONS
 from merge_runner_analysis.tables.formats import printed
 from merge_runner_analysis.tables.model import Table
 from merge_runner_analysis.web.effect_rows import MIDDLE, difference_mark, ends_of, metric_of
-from merge_runner_analysis.web.judged import Driver, judged
+from merge_runner_analysis.web.judged import Driver, by_condition, judged
+from merge_runner_analysis.web.people import counted
 from merge_runner_analysis.web.phrases import UNKNOWN, block_meaning
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.scope import scope_of, unmarked
@@ -99,6 +100,7 @@ def prompts_page(site: Site, asked: Mapping[str, str]) -> str:
         collisions=COLLISIONS.name,
         reworded=any(driver.prompt != BASELINE for played in driven.values() for driver in played),
         kinds=kinds,
+        trials_counted=partial(counted, conditions=by_condition(site, bar.scope, played)),
         otherwise=() if drivers else [*_ended_otherwise(site, kinds)],
     )
 
