@@ -30,8 +30,7 @@ A_FEW = 16
 class LocalRunner:
     """Player of at most ``in_flight`` trials at once in this process; ``running`` counts them.
 
-    With ``rounds`` their calls are submitted in batches when no trial can go on. ``workers`` is
-    None, which says that all is in this process.
+    With ``rounds`` their calls are submitted in batches when no trial can go on.
     """
 
     plan: Plan
@@ -41,7 +40,7 @@ class LocalRunner:
     rounds: Rounds | None = None
     calls: Calls = field(default_factory=Calls)
     running: int = 0
-    workers: None = None
+    place: str = ""
     # The open questions of each trial that is running and has asked.
     _asking: Counter[int] = field(default_factory=Counter)
     _gate: asyncio.Semaphore = field(default_factory=partial(asyncio.Semaphore, A_FEW))
