@@ -10,12 +10,26 @@ import sys
 
 def main() -> None:
     """Run the command line, which is imported only after the path is set."""
+    codes: list[int] = []
+    atexit.register(_end, codes)  # before all others, and so called after them
     # Trials and reports leave no reference cycles, and to search those in memory takes long.
     gc.set_threshold(100_000, 10, 1_000)
-    atexit.register(gc.freeze)  # else the end of a report takes half a second more
     from merge_runner.cli import main as run
 
-    run()
+    try:
+        run()
+    except SystemExit as exc:
+        if isinstance(exc.code, int):  # Python prints any other one
+            codes.append(exc.code)
+        raise
+
+
+def _end(codes: list[int]) -> None:
+    """End the process at once: to free all that a report has loaded takes most of a second."""
+    if codes:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(codes[0])
 
 
 if __name__ == "__main__":
