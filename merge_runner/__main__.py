@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import atexit
+import gc
 import os
 import sys
-
-codes: list[int] = []
 
 
 def main() -> None:
     """Run the command line, which is imported only after the path is set."""
-    atexit.register(_end)  # before all others, and so called after them
+    codes: list[int] = []
+    atexit.register(_end, codes)  # before all others, and so called after them
+    # Trials and reports leave no reference cycles, and to search those in memory takes long.
+    gc.set_threshold(100_000, 10, 1_000)
     from merge_runner.cli import main as run
 
     try:
         run()
     except SystemExit as exc:
-        codes.append(int(exc.code or 0))
+        if isinstance(exc.code, int):  # Python prints any other one
+            codes.append(exc.code)
         raise
 
 
-def _end() -> None:
+def _end(codes: list[int]) -> None:
     """End the process at once: to free all that a report has loaded takes most of a second."""
     if codes:
         sys.stdout.flush()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import gc
 import io
 import os
 import sys
@@ -102,10 +101,6 @@ def app_with_one_command(command: str | None) -> typer.Typer:
 
 def main() -> None:
     """Run the command line and exit with its exit code."""
-    # A trial's objects live until it ends, so frequent garbage collections would find almost none.
-    gc.set_threshold(20_000, 10, 100)
-    # Else pydantic reads the metadata of all installed packages, to find plug-ins of its own.
-    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.encoding.lower() != "utf-8":
         sys.stdout.reconfigure(errors="replace")
     debug = "--debug" in sys.argv

@@ -132,7 +132,7 @@ class ClusterRunner:
         self, client: Client, setup: RunSetup, cache: ResponseCache, ledger: Ledger
     ) -> None:
         self.meters = {name: Meter() for name in setup.plan.entries}
-        self.workers = 0
+        self._workers = 0
         self._client = client
         self._setup = setup
         self._most_shares = most_shares(setup.plan, setup.options)
@@ -154,6 +154,11 @@ class ClusterRunner:
         return sum(len(assignment.chunk.specs) for assignment in self._assigned.values())
 
     @property
+    def place(self) -> str:
+        """Text of the workers that trials are on."""
+        return f" on {self._workers} workers"
+
+    @property
     def unsaved(self) -> str:
         """Text of what an interrupted run saves before it ends."""
         return f"the replies of {len(self._assigned)} tasks"
@@ -168,7 +173,7 @@ class ClusterRunner:
         try:
             while self._groups or self._assigned:
                 addresses = list(await self._client.nthreads())
-                self.workers = len(addresses)
+                self._workers = len(addresses)
                 busy = {assignment.address for assignment in self._assigned.values()}
                 for address in addresses:
                     if self._groups and address not in busy:
@@ -195,7 +200,7 @@ class ClusterRunner:
     async def _give(self, address: str) -> None:
         """Give a chunk to a worker, unless the chunks under way hold all shares."""
         setup, options = self._setup, self._setup.options
-        slots = 1 if self._one_by_one else min(self.workers, self._most_shares)
+        slots = 1 if self._one_by_one else min(self._workers, self._most_shares)
         shares = sum(assignment.chunk.share for assignment in self._assigned.values())
         if shares + 1 / slots > 1.001:
             return

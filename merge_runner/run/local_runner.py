@@ -30,8 +30,7 @@ A_FEW = 16
 class LocalRunner:
     """Player of at most ``in_flight`` trials at once in this process.
 
-    ``running_trials`` is their number. With ``rounds`` their calls are submitted in batches when no
-    trial can go on. ``workers`` is None: there is no other process.
+    With ``rounds`` their calls are submitted in batches when no trial can go on.
     """
 
     plan: Plan
@@ -41,7 +40,7 @@ class LocalRunner:
     rounds: Rounds | None = None
     calls: Calls = field(default_factory=Calls)
     running_trials: int = 0
-    workers: None = None
+    place: str = ""
     # Numbers of open questions, by trial.
     _open_questions: Counter[int] = field(default_factory=Counter)
     _gate: asyncio.Semaphore = field(default_factory=partial(asyncio.Semaphore, A_FEW))

@@ -70,8 +70,8 @@ async def play_and_store(
 ) -> tuple[bool, bool]:
     """Play and store the missing trials; problems are noted in the session.
 
-    Returns whether all are stored, and whether the task was cancelled. They are not all stored if
-    Ctrl-C ends the wait for a database that another program holds.
+    Returns whether the database can be written, and whether the task was cancelled. It cannot if
+    Ctrl-C ends the wait for another program that holds it.
     """
     endings = Endings(session, progress, flusher)
     progress.trials.unstored = lambda: flusher.problem
@@ -80,9 +80,9 @@ async def play_and_store(
         endings.note_suspended()
     finally:
         progress.ended_at = datetime.now(UTC)
-        is_stored = await _store_rest(session, flusher, stopping)
+        is_writable = await _store_rest(session, flusher, stopping)
     endings.note_failed()
-    return is_stored, cancelled
+    return is_writable, cancelled
 
 
 async def _play(endings: Endings, stopping: Stopping) -> bool:
@@ -125,7 +125,7 @@ async def _play(endings: Endings, stopping: Stopping) -> bool:
 
 
 async def _store_rest(session: Session, flusher: Flusher, stopping: Stopping) -> bool:
-    """Store the remaining trials; False if Ctrl-C ends the wait for that."""
+    """Store the remaining trials; return whether the database can be written."""
     closing = asyncio.create_task(_store_all(session, flusher))
     with stopping(None, closing.cancel):
         try:
@@ -145,7 +145,7 @@ async def _store_rest(session: Session, flusher: Flusher, stopping: Stopping) ->
             f"{len(flusher.differing)} trials are stored otherwise in {session.options.db}, "
             f"which is left as it is: {'; '.join(shown)}. Replay into another --db.",
         )
-    return True
+    return closing.exception() is None or flusher.broken  # what breaks is not the database
 
 
 async def _store_all(session: Session, flusher: Flusher) -> None:

@@ -93,9 +93,8 @@ class Progress:
         shares = self._shares()
         left_s = None if batches else self._left_s(elapsed_s, ended + failed, shares)
         before = f" (+{self.trials.stored} stored before)" if self.trials.stored else ""
-        workers = "" if self.runner.workers is None else f" on {self.runner.workers} workers"
         waiting = self.runner.waiting_for_money
-        state = f"{max(0, self.runner.running_trials - waiting)} running{workers}"
+        state = f"{max(0, self.runner.running_trials - waiting)} running{self.runner.place}"
         state += f", {waiting} wait for money" if waiting else ""
         total = self.trials.todo.total()
         trials = f"{ended + failed}/{total} ended{before}, {state}"
@@ -276,9 +275,7 @@ class Log:
                 self.shown_once.add(kind)
         rows = dict(reversed(snapshot.rows))  # the first of each name
         ended = snapshot.ended + snapshot.failed - progress.trials.stored
-        workers = progress.runner.workers
-        line = f"trials: {ended}/{progress.trials.todo.total()} ended"
-        line += "" if workers is None else f" on {workers} workers"
+        line = f"trials: {ended}/{progress.trials.todo.total()} ended{progress.runner.place}"
         line += f"; failed: {snapshot.failed}" if snapshot.failed else ""
         line += f"; cost: {rows['cost']}" if snapshot.cost_usd >= CENT_USD else ""
         if line != self.last_line or progress.doing == "playing":

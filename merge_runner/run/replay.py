@@ -26,7 +26,7 @@ class Replay:
     running_trials: int = 0
     waiting_for_money: int = 0
     waits: Sequence[Wait] = ()
-    workers: None = None
+    place: str = ""
     unsaved: str = "0 calls in flight"
     first: FirstDecisions = field(default_factory=FirstDecisions)
     _ahead: dict[int, TrialRecord] = field(default_factory=dict)  # by order, until it is their turn

@@ -111,10 +111,10 @@ async def run(
             await stack.enter_async_context(shown)
             batch_bytes = BATCH_BYTES if options.replay else LIVE_BATCH_BYTES
             flusher = Flusher(store, sweep_id, session.say, batch_bytes)
-            is_stored, cancelled = await play_and_store(session, progress, flusher, stopping)
+            is_writable, cancelled = await play_and_store(session, progress, flusher, stopping)
             progress.doing = "checking"
             write_snapshot(db, progress.snapshot(sweep_id))
-            if is_stored:
+            if is_writable:
                 end(session, store, sweep_id)
                 checked = await check(session, store, sweep_id, player.first)
         if cancelled:

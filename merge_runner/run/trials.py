@@ -47,8 +47,8 @@ class Player(Protocol):
         """The number of them that wait for money, as far as this process knows."""
 
     @property
-    def workers(self) -> int | None:
-        """The number of workers that they are on; None: they are in this process."""
+    def place(self) -> str:
+        """Text of the workers that they are on; empty: they are in this process."""
 
     @property
     def unsaved(self) -> str:

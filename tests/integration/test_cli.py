@@ -129,7 +129,7 @@ def at_a_terminal(*words, cwd):
 
 
 ENDED = """
-import atexit, sys
+import atexit, gc, sys
 from merge_runner import cli
 from merge_runner.__main__ import main
 
@@ -139,18 +139,25 @@ class Kept:
 
 def run():
     atexit.register(print, "registered")
-    sys.exit(3)
+    before = gc.get_stats()[0]["collections"]
+    kept.some = [[] for _ in range(50_000)]
+    print("collections:", gc.get_stats()[0]["collections"] - before)
+    sys.exit({code!r})
 
 kept, cli.main = Kept(), run
 main()
 """
 
 
-def test_the_program_ends_by_its_code_after_what_is_registered_and_frees_nothing():
+@pytest.mark.parametrize(
+    ("code", "ends"), [(3, (3, "", "")), (0, (0, "", "")), ("a text", (1, "a text\n", "freed\n"))]
+)
+def test_the_program_collects_no_garbage_and_ends_by_its_code_after_what_is_registered(code, ends):
     ended = subprocess.run(
-        [sys.executable, "-c", ENDED], capture_output=True, text=True, check=False
+        [sys.executable, "-c", ENDED.format(code=code)], capture_output=True, text=True, check=False
     )
-    assert (ended.returncode, ended.stdout, ended.stderr) == (3, "registered\n", "")
+    out = ended.stdout.removeprefix("collections: 0\nregistered\n")
+    assert (ended.returncode, ended.stderr, out) == ends
 
 
 def test_explain_shows_the_trials_that_a_share_counts_and_with_all_the_others(run):

@@ -45,8 +45,8 @@ class Gate:
     def open(self) -> None:
         self._open.set()
 
-    async def quiet(self, cache: Path, trials: int) -> None:
-        """Wait until so many trials are held, none asks any more, and what passed is saved.
+    async def held_trials(self, cache: Path, trials: int) -> None:
+        """Wait until so many trials are held, and what passed is saved.
 
         How the answers that pass are spread over the trials is chance: a trial may wait for one
         of its drivers alone.
@@ -54,10 +54,6 @@ class Gate:
         async with asyncio.timeout(HANGS_S):
             while len(set(map(_trial, self.held))) < trials or _saved(cache) < self.passing:
                 await asyncio.sleep(0.05)
-            before = -1
-            while before != len(self.asked):
-                before = len(self.asked)
-                await asyncio.sleep(0.5)
 
     @property
     def asked_again(self) -> set[str]:

@@ -2,7 +2,6 @@
 
 import asyncio
 import contextvars
-import gc
 import io
 import logging
 import os
@@ -36,7 +35,6 @@ def invoke(arguments, *, cwd: Path, env: dict[str, str]) -> Run:
     with _alone, ExitStack() as changed:
         before = Path.cwd()
         changed.callback(os.chdir, before)
-        changed.callback(gc.set_threshold, *gc.get_threshold())
         changed.enter_context(patch.dict(os.environ, env, clear=True))
         changed.enter_context(patch.object(sys, "argv", ["merge-runner", *map(str, arguments)]))
         changed.enter_context(patch.object(sys, "stdin", io.StringIO()))

@@ -19,7 +19,7 @@ def runner(*meters, running_trials=0, waits=(), waiting_for_money=0):
         waits=waits,
         running_trials=running_trials,
         waiting_for_money=waiting_for_money,
-        workers=None,
+        place="",
     )
 
 

@@ -65,7 +65,7 @@ def _ratio(trials: pd.DataFrame, metric: Metric) -> Estimate:
     value, weight = known[metric.column], known[metric.weight_column]
     sample = linear(value.to_numpy(), weight.to_numpy(), np.zeros(len(known), int))
     k = round(float((value * weight).sum()) / 100)
-    return replace(mean(sample), k=k, weight=float(weight.sum()))
+    return replace(mean(sample), k=k)
 
 
 def linear(value: Array, weight: Array, cells: NDArray[np.int_]) -> Array:

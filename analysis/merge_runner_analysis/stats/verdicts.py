@@ -257,8 +257,8 @@ def _rates(both: Both) -> Estimate | None:
         return None
     (k, n), (_, humans), p = measures.counts(group, BOXES), both.estimates["collisions"], cells.p
     assert humans.value is not None
-    assert humans.weight is not None
-    rate, human_rate = (k / n, n), (humans.value / 100, humans.weight)
+    assert humans.effective_n is not None
+    rate, human_rate = (k / n, n), (humans.value / 100, humans.effective_n)
 
     def interval(level: float) -> tuple[float, float]:
         low, high = intervals.melded(rate, human_rate, p, level)
@@ -417,9 +417,9 @@ def _standardised(both: Both) -> Estimate:
     counts = shared.groupby("condition")[BOXES.column].agg(["sum", "size"]).astype(int)
     k, n = counts.to_numpy().T
     shares = played[counts.index].to_numpy() / played[counts.index].sum()
-    rate, as_good_as = float(shares @ (k / n)), 1 / float(shares**2 @ (1 / n))
-    low, high = wilson(rate, as_good_as)
-    return Estimate(100 * rate, 100 * low, 100 * high, len(shared), weight=as_good_as)
+    rate, effective_n = float(shares @ (k / n)), 1 / float(shares**2 @ (1 / n))
+    low, high = wilson(rate, effective_n)
+    return Estimate(100 * rate, 100 * low, 100 * high, len(shared), effective_n=effective_n)
 
 
 def _goes_first(indicator: str) -> Statistic:

@@ -126,14 +126,14 @@ def drivers_of(site: Site, table: Table | None, scope: Scope) -> list[Driver]:
         sent = ", ".join(
             f"{key} {value}" for key, value in body if isinstance(value, str | int | float)
         )
-        text, endpoint = summary_of(verdicts, of, kind), spec["endpoint"] if spec else ""
+        text, endpoint = summary_of(verdicts), spec["endpoint"] if spec else ""
         of_driver = cells(verdicts, measures)
         drivers.append(Driver(name, prompt, kind, of_driver, text, of, endpoint, sent))
     return drivers
 
 
-def summary_of(verdicts: Mapping[str, Values], facts: Row | None, kind: str) -> str:
-    """Return a driver's sentences, with every open measure, and the number of trials that count."""
+def summary_of(verdicts: Mapping[str, Values]) -> str:
+    """Return a driver's sentences, with every open measure."""
     if not verdicts:
         return ""
     text = sentence(verdicts)
@@ -144,16 +144,6 @@ def summary_of(verdicts: Mapping[str, Values], facts: Row | None, kind: str) -> 
     if unclear:
         begin = f"{text.removesuffix('.')}; " if CANNOT in text else f"{text} {CANNOT}: "
         text = f"{begin}{'; '.join(unclear)}."
-    n = int(str(verdicts["collisions"].get("counted") or "0 of 0").split(" of ")[1])
-    if facts and n and n != facts["trials"]:
-        once = {
-            MOCK: ", equal ones of a mock model once",
-            PROGRAM: ", equal ones of a program once",
-        }
-        text += (
-            f" {n} of its {facts['trials']} trials count: those that ended, in situations that "
-            f"people drove{once.get(kind, '')}."
-        )
     return text
 
 

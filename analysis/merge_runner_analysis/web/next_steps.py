@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from argparse import ArgumentParser
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -63,11 +64,9 @@ def next_steps(
 
 def without(option: str, words: Sequence[str]) -> list[str]:
     """Return the words of a command without an option and its values."""
-    left = list(words)
-    while option in left:
-        place = left.index(option)
-        del left[place : place + 2]
-    return left
+    parser = ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument(option)
+    return parser.parse_known_args(words)[1]
 
 
 def is_rehearsal(drivers: Sequence[Driver]) -> bool:

@@ -87,10 +87,10 @@ def counted(driver: Driver, conditions: Mapping[str, Any]) -> str:
 
 def repeated(driver: Driver, conditions: Mapping[str, Any]) -> tuple[int, int]:
     """Return how many ended trials repeat another one, of those in situations people drove."""
-    counted = str(driver.cells["collisions"].values.get("counted") or "0 of 0")
+    _, n = str(driver.cells["collisions"].values.get("counted") or "0 of 0").split(" of ")
     pairs = zip(_cells_of(driver, conditions), conditions["humans"], strict=True)
     shared = sum(cell["ended"] for cell, human in pairs if cell and human)
-    return shared - int(counted.split(" of ")[1]), shared
+    return shared - int(n), shared
 
 
 def _cells_of(driver: Driver, conditions: Mapping[str, Any]) -> list[Any]:

@@ -14,6 +14,7 @@ import pandas as pd
 
 LENGTH, WIDTH = 4.5, 1.8
 MERGE = 100.0
+COPIED = ("status", "source", "pair", "scripted", "variant")
 # Each branch leaves the centre line by 12.5 m in its 100 m.
 SINE = 12.5 / 100
 COSINE = np.sqrt(1 - SINE**2)
@@ -62,13 +63,7 @@ def read(db: str, study: str = "") -> pd.DataFrame:
             "SELECT trial_id, spec_hash, name, config->>'$.levels' AS levels, started_at "
             "FROM sweep_trials JOIN sweeps USING (sweep_id) ORDER BY started_at DESC"
         ).df()
-    played["study"] = [
-        (name, *sorted(json.loads(levels) if levels else {}))
-        for name, levels in zip(played["name"], played["levels"], strict=True)
-    ]
-    orders = {}
-    for row in played.itertuples():
-        orders.setdefault(row.study, json.loads(row.levels) if row.levels else {})
+    orders = _orders(played)
     samples = {key: _samples(rows) for key, rows in states.groupby(KEYS)}
     decided = dict(list(decisions.groupby(KEYS)))
     levels = {
@@ -76,39 +71,54 @@ def read(db: str, study: str = "") -> pd.DataFrame:
         for key, rows in factors.groupby(KEYS)
     }
     studies = {key: frozenset(rows["study"]) for key, rows in played.groupby(KEYS)}
-    found = []
+    rows = []
     for trial in trials.itertuples():
         key = (trial.trial_id, trial.spec_hash)
         spec = json.loads(specs.get(trial.spec_hash, "{}"))
         own = decided.get(key, decisions.iloc[:0])
-        row = _named(trial, spec, levels.get(key, {}), own) | {
-            "studies": studies.get(key, frozenset()),
-            "status": trial.status,
-            "source": trial.source,
-            "pair": trial.pair,
-            "scripted": trial.scripted,
-            "variant": trial.variant,
-        }
-        sign = -1 if row["ego"] == "right" else 1
-        row |= {"h": sign * trial.projected_headway_m, "dv": sign * trial.relative_velocity_mps}
-        row["way"] = (key, trial.status)  # like no other's
-        if key in samples and trial.status != "failed":
-            row |= _measured(trial, row["ego"], samples[key])
-            if row["programs"] or row["scripted"]:
-                row["way"] = (_as_seen(row["ego"], samples[key]), trial.status)
-        found.append(row)
-    every = _with_cells(pd.DataFrame(found))
+        named = _named(trial, spec, levels.get(key, {}), own)
+        named["studies"] = studies.get(key, frozenset())
+        rows.append(named | _driven(trial, named, samples.get(key)))
+    every = _with_cells(pd.DataFrame(rows))
     # Mock models sample: of theirs that went alike the first is one, and so is the second.
     again = every.groupby(["driver", "variant", "cell", "way"]).cumcount()
     posing = every["scripted"].astype(bool) & ~every["programs"]
     ways = [(*way, n) for way, n in zip(every["way"], again, strict=True)]
     every["way"] = every["way"].mask(posing, pd.Series(ways, every.index, dtype=object))
-    every.attrs["orders"] = orders
     if study:
         kept = every["studies"].map(lambda names: any(study == name[0] for name in names))
         every = every[kept | (every["source"] == "human")]
-        every.attrs["orders"] = {name: one for name, one in orders.items() if name[0] == study}
+        orders = {name: one for name, one in orders.items() if name[0] == study}
+    every.attrs["orders"] = orders
     return every
+
+
+def _orders(played: pd.DataFrame) -> dict[tuple[str, ...], dict]:
+    """The levels of each study as its newest run has them; adds the column ``study``."""
+    played["study"] = [
+        (name, *sorted(json.loads(levels) if levels else {}))
+        for name, levels in zip(played["name"], played["levels"], strict=True)
+    ]
+    orders = {}
+    for row in played.itertuples():
+        orders.setdefault(row.study, json.loads(row.levels) if row.levels else {})
+    return orders
+
+
+def _driven(trial, named: dict, samples) -> dict:
+    """The situation of a trial as its ego sees it, and its measures."""
+    sign = -1 if named["ego"] == "right" else 1
+    row = {
+        **{name: getattr(trial, name) for name in COPIED},
+        "h": sign * trial.projected_headway_m,
+        "dv": sign * trial.relative_velocity_mps,
+        "way": ((trial.trial_id, trial.spec_hash), trial.status),  # like no other's
+    }
+    if samples is not None and trial.status != "failed":
+        row |= _measured(trial, named["ego"], samples)
+        if named["programs"] or trial.scripted:
+            row["way"] = (_as_seen(named["ego"], samples), trial.status)
+    return row
 
 
 def who_first_data(trials: pd.DataFrame) -> tuple[np.ndarray, np.ndarray, pd.DataFrame]:

@@ -186,7 +186,7 @@ async def test_ctrl_c_saves_what_is_in_flight_and_the_same_command_goes_on(
     gate = Gate(60, tmp_path)
     async with watched(gate.middle) as server, asyncio.timeout(HANGS_S):
         process = await merge_runner.start(*SMALL, **server.env)
-        await gate.quiet(tmp_path / "cache/responses", trials=4)
+        await gate.held_trials(tmp_path / "cache/responses", trials=4)
         process.send_signal(signal.SIGINT)
         process.send_signal(signal.SIGTERM)  # both at once end it as one does
         await process.said("calls in flight")
@@ -219,7 +219,7 @@ async def test_a_terminal_that_closes_loses_no_call_that_is_in_flight(
         )  # fmt: skip
         os.close(theirs)
         asyncio.get_running_loop().add_reader(ours, os.read, ours, 2**16)
-        await gate.quiet(tmp_path / "cache/responses", trials=4)
+        await gate.held_trials(tmp_path / "cache/responses", trials=4)
         asyncio.get_running_loop().remove_reader(ours)
         os.close(ours)
         # As the shell does, and the service that ends what a login has left.

@@ -206,6 +206,15 @@ def test_a_driver_that_is_not_judged_has_no_verdict_and_missing_decisions_are_co
     assert "missing decisions" in client.get("/sweeps/sweep-1").text
 
 
+def test_every_page_with_a_drivers_verdicts_says_which_of_its_trials_are_not_counted(tmp_path):
+    good = [*yielding("o3"), *yielding("o3", "A1", reps=1)]
+    failed = replace(good[0], rep=4, said={0: Said(lost=True)})
+    client = client_of(write_study(tmp_path / "t.duckdb", [*good, failed]))
+    for address in ("/", "/drivers", "/drivers/o3?variant=baseline"):
+        text = Page(client.get(address).text).text
+        assert text.count("33 counted; not counted: 1 did not end") == 1, address
+
+
 def test_the_study_begins_with_its_description_and_says_what_to_type_and_counts_at_once(
     db, tmp_path
 ):

@@ -1,6 +1,7 @@
 """How a trial is played live: what it asks at an instant is asked side by side."""
 
 import asyncio
+from collections import Counter
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -9,7 +10,7 @@ import pytest
 from merge_runner.errors import ProviderDown, SweepStopped, TrialSuspended, UsageError
 from merge_runner.llm.attempts import Meter
 from merge_runner.records import SIDES, CallFailed, ChatReply, ChatRequest, Slot
-from merge_runner.run.local_runner import LocalRunner
+from merge_runner.run.local_runner import A_FEW, LocalRunner
 from merge_runner.run.plan import make_plan
 
 REPLY = f"Y\nI yield.\n```python\n{[-0.4] * 20}\n```"
@@ -81,6 +82,34 @@ async def test_different_failed_calls_are_an_outage_and_none_that_trials_share(k
         with pytest.raises(ProviderDown, match="10 different calls to emulator failed"):
             await playing
     assert failed == ["failed"] * (trials or 12)
+
+
+async def test_few_trials_begin_or_go_on_in_one_round_of_the_event_loop():
+    """Thousands of recorded replies would all be ready at once."""
+    begun, asked, rounds = Counter(), Counter(), 0
+
+    class Recorded(Client):
+        async def ask(self, prompt, slot, *, order):
+            asked[rounds] += 1
+            return ChatReply(REPLY, "ok", None, (), 0)
+
+    async def capacity():
+        begun[rounds] += 1
+
+    async def watch():
+        nonlocal rounds
+        while True:
+            await asyncio.sleep(0)
+            rounds += 1
+
+    plan = make_plan("baseline", "emulator", conditions=["N_0_0"], repetitions=5 * A_FEW)
+    runner = LocalRunner(plan, {"emulator": Recorded()}, 5 * A_FEW)
+    watching = asyncio.create_task(watch())
+    await runner.play(plan.trial_specs(), lambda *_: None, capacity)
+    watching.cancel()
+    assert begun.total() == 5 * A_FEW
+    assert max(begun.values()) <= A_FEW
+    assert max(asked.values()) <= 2 * A_FEW, "both drivers ask at once"
 
 
 async def test_a_trial_that_is_cancelled_takes_both_calls_with_it(play):

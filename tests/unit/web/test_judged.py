@@ -1,10 +1,9 @@
-"""The sentences on a driver beside people, with what is open and what counts."""
+"""The sentences on a driver beside people, with what is open."""
 
 import pytest
 
 from merge_runner_analysis.headlines import sentence
 from merge_runner_analysis.web.judged import summary_of
-from merge_runner_analysis.wording import LANGUAGE_MODEL, MOCK, PROGRAM
 
 
 def verdicts(crashes="inconclusive", **states):
@@ -26,23 +25,12 @@ def verdicts(crashes="inconclusive", **states):
     ],
 )
 def test_all_that_cannot_be_told_is_in_one_list(of, ends):
-    text = summary_of(of, None, LANGUAGE_MODEL)
+    text = summary_of(of)
     assert text.endswith(ends)
     assert text.count("Cannot tell") == 1
     assert text.startswith(sentence(of).partition(" Cannot")[0])
 
 
-@pytest.mark.parametrize(
-    ("kind", "once"),
-    [(MOCK, ", equal ones of a mock model once"), (PROGRAM, ", equal ones of a program once"),
-     (LANGUAGE_MODEL, "")],
-)  # fmt: skip
-def test_a_driver_of_which_not_all_trials_count_says_how_many_do(kind, once):
-    rule = "trials count: those that ended, in situations that people drove"
-    assert summary_of(verdicts(), {"trials": 60}, kind).endswith(f" 50 of its 60 {rule}{once}.")
-    assert "count" not in summary_of(verdicts(), {"trials": 50}, kind)
-
-
 def test_a_driver_that_is_not_judged_says_why_alone():
-    assert summary_of({"": {"note": "not judged: why"}}, {"trials": 60}, MOCK) == "Not judged: why."
-    assert summary_of({}, {"trials": 60}, MOCK) == ""
+    assert summary_of({"": {"note": "not judged: why"}}) == "Not judged: why."
+    assert summary_of({}) == ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from merge_runner.records import SIDES
@@ -14,6 +15,7 @@ from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.display_text import with_minus
 from merge_runner_analysis.web.judged import by_condition, by_kind, humans_of, judged, noted
 from merge_runner_analysis.web.marks import rate
+from merge_runner_analysis.web.people import counted
 from merge_runner_analysis.web.scope import Scope, scope_of, unmarked
 from merge_runner_analysis.web.search import search
 from merge_runner_analysis.web.site import NotThere, Site
@@ -33,7 +35,10 @@ def drivers_page(site: Site, asked: Mapping[str, str]) -> str:
     chosen = bar.scope.drivers or bar.drivers
     drivers, values = judged(site, bar, asked)
     kinds = by_kind([driver for driver in drivers if unmarked(driver.name) in chosen])
-    return site.render("drivers.html", view="drivers", kinds=kinds, **values)
+    trials_counted = partial(counted, conditions=by_condition(site, bar.scope, drivers))
+    return site.render(
+        "drivers.html", view="drivers", kinds=kinds, trials_counted=trials_counted, **values
+    )
 
 
 def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
@@ -84,6 +89,7 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
             if row["account"]
         ],
         conditions=conditions,
+        trials_counted=partial(counted, conditions=conditions),
         counted=_counted([cell for _, cells in conditions["rows"] for cell in cells if cell]),
         rates=zip(*shares, strict=True),
         notes=noted(both, {name: measure.trait for name, measure in MEASURES.items()}),
