@@ -46,7 +46,7 @@ numbers: By the robust rules it is {PASSES[10, "I1-I4", "robust"]:g} %
 numbers: I4 in {PASSES[10, "I4", "robust"]:.0f} % of data sets with 110 trials
 numbers: and in {PASSES[50, "I4", "robust"]:.0f} % with 550
 numbers: margins of {GAP_MARGIN_M:g} m and 0.5 SD
-numbers: {wording.MARGINS["collisions"]:g} points (collisions) or {wording.MARGINS["gap"]:g} m (gap)
+numbers: {wording.MARGINS["collisions"]:g} points or {wording.MARGINS["gap"]:g} m
 numbers: With fewer than {wording.ENOUGH} trials
 perception: a car {FAR_BEHIND_M:g} m behind
 perception: begin {min(AWAY_M):.0f} to {max(AWAY_M):.0f} m before the merge point

@@ -44,7 +44,6 @@ from merge_runner_analysis.web.pages import (
     tables,
     trial,
     trials,
-    words,
 )
 from merge_runner_analysis.web.reading import reading
 from merge_runner_analysis.web.rendering import STATIC
@@ -180,7 +179,7 @@ PAGES: dict[str, Callable[..., str | Response]] = {
     "/cite": tables.cite_page,
     "/prompts": prompts.prompts_page,
     "/discordant": prompts.discordant_page,
-    "/words": words.words_page,
+    "/words": trials.words_page,
     "/notes": trial.notes_page,
     "/sql": sql.sql_page,
     "/sql.csv": sql.sql_csv,

@@ -1,7 +1,8 @@
-"""The list of trials."""
+"""The list of trials, and that of decisions by their words."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 
 from starlette.responses import Response
@@ -15,10 +16,14 @@ from merge_runner_analysis.web.phrases import causes_text, plain
 from merge_runner_analysis.web.pictures import speed_range
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.scope import HEADINGS, carried, facets_shown, filter_of, sort_of
+from merge_runner_analysis.web.search import FACETS, LIMITS, search, terms_of
 from merge_runner_analysis.web.site import NotThere, Site, download, news_of
 from merge_runner_analysis.web.urls import CELL, whole
 
 MOST = 4  # drivers whose sums stand above a list
+OF_WORDS = HEADINGS | {"tactical": "said", "switch": "change of mind", "failure": "invalid"}
+# A number from -1 to 1.
+LIMIT = re.compile(r"-?(0?\.\d{1,6}|[01](\.0{1,6})?)")
 
 
 def trials_page(site: Site, asked: Mapping[str, str]) -> str:
@@ -113,3 +118,25 @@ def cell_request(cell: Mapping[str, str]) -> tuple[str, ...]:
         raise NotThere(f"a cell is named TABLE/ROW:COLUMN; the tables are {', '.join(TABLES)}")
     _, *part = CELL
     return "cell", table, row, column, *(cell.get(name, "") for name in part)
+
+
+def words_page(site: Site, asked: Mapping[str, str]) -> str:
+    """Return a page of the decisions that match an address."""
+    query = asked.get("q", "")
+    filters = filter_of(asked) | {name: asked.get(name, "") for name in FACETS}
+    filters = {name: value for name, value in filters.items() if value and name != "q"}
+    limits = {name: text for name in LIMITS if LIMIT.fullmatch(text := asked.get(name, ""))}
+    chosen = {**filters, **limits, "q": query}
+    page = whole(asked.get("page", "")) or 1
+    result = search(site.catalogue, filters, terms_of(query), limits, page)
+    return site.render(
+        "words.html",
+        view="words",
+        headings=OF_WORDS,
+        carried=carried(asked),
+        limits=LIMITS,
+        result=result,
+        facets=facets_shown(site, result["facets"]),
+        chosen=chosen,
+        kept=chosen,
+    )
