@@ -27,7 +27,7 @@ WORST = "L_0_-8"
 COLUMNS = {
     "o3": ("estimate", "ci"),
     "people": ("human", "human_ci"),
-    "difference": ("difference", "difference_ci"),
+    "difference from people": ("difference", "difference_ci"),
     "80 % power from": ("detectable", ""),
 }
 NUMBER = re.compile(r"[−-]?\d+(?:\.\d+)?(?:e-\d+)?")
@@ -106,10 +106,11 @@ def test_a_drivers_page_has_the_numbers_of_the_table_with_the_trials_behind_them
     text, own = unescape(client.get("/drivers/o3?variant=baseline").text), verdicts["o3/baseline"]
     assert sentence(own).removesuffix(".") in text
     table = text.split('class="verdicts')[1].split("</table>")[0]
+    heads = [re.sub("<[^>]*>", "", head) for head in re.findall("<th [^>]*col.*?</th>", table)]
     for name, values in own.items():
         row = table.split(f'id="{name}"')[1].split("</tr>")[0]
         assert MEASURES[name].trait in row
-        cells = dict(re.findall(r'<td[^>]*data-l="([^"]+)"[^>]*>(.*?)</td>', row, re.DOTALL))
+        cells = dict(zip(heads[1:], re.findall("<td.*?</td>", row, re.DOTALL), strict=True))
         for label, column in COLUMNS.items():
             estimate, ci = (values.get(part) for part in column)
             assert estimate is None or agree(cells[label], [estimate, *(ci or ())]), (name, label)
