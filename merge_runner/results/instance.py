@@ -105,10 +105,10 @@ def limit_memory(connection: duckdb.DuckDBPyConnection, longest: int = 0) -> Non
 
 
 def merge_small_groups(connection: duckdb.DuckDBPyConnection, added: int) -> None:
-    """Let the next write merge small row groups, unless it adds many calls or long texts.
+    """Let the next write merge a few small row groups, unless it adds many calls or long texts.
 
     Merging takes as much memory as the texts of a full group, and rewrites the group each time: the
-    file is held twice as long.
+    file is held twice as long. All groups at once would double the file.
     """
     merges = False
     if added < MANY_CALLS:
@@ -117,4 +117,4 @@ def merge_small_groups(connection: duckdb.DuckDBPyConnection, added: int) -> Non
             "WHERE database_name = current_database()"
         ).fetchall()
         merges = Path(path).stat().st_size <= calls * BYTES_OF_A_CALL + MERGED_BYTES
-    connection.execute(f"SET max_vacuum_tasks = {100 * merges}")
+    connection.execute(f"SET max_vacuum_tasks = {merges:d}")

@@ -23,7 +23,8 @@ EVERY_S, POLL_S = 1.0, 0.06
 # storing fails, as when another program holds the file.
 BATCH = 512
 MOST_PENDING = 3 * BATCH // 2
-BATCH_BYTES, MOST_PENDING_BYTES = 2**24, 2**25
+BATCH_BYTES = 3 * 2**22
+MOST_PENDING_BYTES = 3 * BATCH_BYTES // 2
 LIVE_BATCH_BYTES = 2**22  # some 1,000 decisions: a reader waits for about 0.1 s
 DECISION_BYTES = 2_000  # with its share of the states
 LOCK_PATIENCE_S = 2.0
