@@ -143,12 +143,6 @@ def test_decisions_are_made_once_a_second_from_time_0_on():
     assert moved == {"left": 0.0, "right": -2.5}
 
 
-def test_the_prompt_rate_decides_when_the_drivers_are_asked():
-    trial = play_constant(prompt_rate_hz=2.5)
-    times = [row.time_s for row in trial.decisions if row.side == "left"]
-    assert times[:4] == [0.0, 0.4, 0.8, 1.2]
-
-
 ACTIONS = (0.1, -0.2, 0.3, -0.4, 0.5)
 
 

@@ -109,20 +109,6 @@ def test_trials_of_a_stand_in_are_never_pooled_with_those_of_the_model(db):
         assert listed(study, table, f"{row}:n") == trials
 
 
-def test_trials_whose_prompt_was_changed_are_a_group_of_their_own(db):
-    study = changed(
-        db,
-        """UPDATE specs SET spec = '{"prompt_blocks": ["a"]}' WHERE spec_hash = 'o3-baseline'""",
-        """INSERT INTO specs VALUES ('changed', '{"prompt_blocks": ["b"]}')""",
-        *(
-            f"UPDATE {table} SET spec_hash = 'changed' WHERE trial_id LIKE 'o3/%/rep01'"
-            for table in ("trials", "decisions", "states")
-        ),
-    )
-    sizes = {group.id: len(group.trials) for group in study.models}
-    assert sizes == {"o3/baseline": 22, "o3 [changed]/baseline": 11, "other/baseline": 33}
-
-
 def same_each_time(who="trial_id LIKE 'o3/%'"):
     """Statements after which later repetitions are the first again."""
     return [

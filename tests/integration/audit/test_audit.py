@@ -17,7 +17,6 @@ from aiohttp import web
 
 from merge_runner.audit import checks
 from merge_runner.audit.checks import audited_database, check_sweep
-from merge_runner.errors import UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.store import CachedCall
 from merge_runner.records import SCRIPTED_FIELD, make_request
@@ -345,20 +344,6 @@ async def test_a_proxy_that_gives_old_replies_new_ids_is_a_note(merge_runner, tm
     assert "word for word as before: are they samples?" in found.notes
 
 
-async def test_another_models_answers_end_an_audit_with_1_and_no_sweep(merge_runner):
-    async def other(request, handler):
-        return web.json_response(json.loads((await handler(request)).body) | {"model": "gpt-0"})
-
-    part = ("sweep", "baseline", "--conditions", "L_4_8", "--reps", 1)
-    async with watched(other) as server:
-        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        assert (await merge_runner(*part, **env)).code == 0
-        found = await merge_runner("audit")
-        assert (found.code, "served: " in found.out) == (1, True)
-        strict = await merge_runner(*part, "--strict-model", "--db", "strict.duckdb", **env)
-        assert strict.code == 1
-
-
 def test_humans_alone_pass_and_it_says_that_there_is_no_sweep(golden_copy):
     db = golden_copy / "golden.duckdb"
     with duckdb.connect(str(db)) as connection:
@@ -505,20 +490,6 @@ def test_a_reply_that_a_replay_would_lack_is_found(db, cache, change, says):
     (finding, *_) = audit("--db", db, "--cache", cache, "--sweep", sweep_of(db, MIXED)).findings
     assert (finding["kind"], finding["trial"], finding["decision"]) == ("cache", MIXED, 2)
     assert says in finding["text"]
-
-
-def test_another_reply_in_the_cache_than_in_the_database_is_found(db, cache):
-    damage(db, f"UPDATE calls SET reply = replace(reply::VARCHAR, 'stop', 'halt') WHERE {SLOT}")
-    found = audit("--db", db, "--cache", cache, "--sweep", sweep_of(db, MIXED)).findings
-    (finding, *_) = (each for each in found if each["kind"] == "cache")
-    assert "calls.reply is " in finding["text"]
-
-
-def test_a_table_that_is_not_ours_is_an_error_and_no_traceback(db):
-    with duckdb.connect(str(db)) as connection:
-        connection.execute("ALTER TABLE states RENAME COLUMN step TO steps")
-    with pytest.raises(UsageError, match='cannot be read: Binder Error: Column "step"'):
-        audit_database(db)
 
 
 async def test_each_study_of_a_database_is_derived_by_its_own_parts(merge_runner, tmp_path):

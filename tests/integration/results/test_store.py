@@ -1,7 +1,6 @@
 """The results database: whole trials, one version, read-only queries, and patience with locks."""
 
 import asyncio
-import math
 import shutil
 import subprocess
 import sys
@@ -23,7 +22,6 @@ from merge_runner.results.instance import Instance
 from merge_runner.results.store import Store, query, results_digest
 from merge_runner.results.sweeps import sweeps_to_export
 from merge_runner.run.writer import Flusher
-from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.trial import Trial, play_trial
 from merge_runner.trial_records import TrialRecord
 from tests.support.driven_trials import ask_nobody
@@ -176,36 +174,6 @@ def test_the_digest_of_all_sweeps_is_that_of_the_whole_database_whatever_its_siz
     whole = results_digest(path)
     assert whole[1] == copies + 1
     assert [results_digest(path, ["s1"]) for _ in range(3)] == [whole] * 3
-
-
-def test_the_metrics_are_those_computed_by_hand(store, path):
-    record = played("L_4_-8")
-    store.write("s1", [record, played("N_0_0", driver="constant")], patience_s=1)
-    left, right = ([s for s in record.states if s.side == side] for side in ("left", "right"))
-    first = next(k for k in range(len(left)) if max(left[k].position_m, right[k].position_m) >= 100)
-    before, after = max(left[first - 1 : first + 1], right[first - 1 : first + 1],
-                        key=lambda pair: pair[1].position_m)  # fmt: skip
-    part = (100 - before.position_m) / (after.position_m - before.position_m)
-
-    def at_merge(trace):
-        before, after = (state.position_m for state in trace[first - 1 : first + 1])
-        return before + part * (after - before)
-
-    def rmse(trace, initial_mps):
-        squares = [(s.velocity_mps - initial_mps) ** 2 for s in trace[: first + 1]]
-        return math.sqrt(sum(squares) / len(squares))
-
-    expected = {
-        "gap_m": abs(at_merge(left) - at_merge(right)) - 4.5,
-        "rmse_left_mps": rmse(left, CONDITIONS["L_4_-8"].speeds_mps[0]),
-        "rmse_right_mps": rmse(right, CONDITIONS["L_4_-8"].speeds_mps[1]),
-        "time_to_merge_s": left[first - 1].time_s + part * 0.2,
-    }
-    columns = ", ".join(expected)
-    sql = f"select {columns} from trial_metrics order by trial_id"
-    finished, collided = query(path, sql)[1]
-    assert finished == pytest.approx(tuple(expected.values()))
-    assert collided[:3] == (None, None, None), "a collided trial has no gap and no deviation"
 
 
 def test_a_name_means_another_file_in_another_folder(tmp_path, monkeypatch):

@@ -35,7 +35,6 @@ from tests.support.harness import FAST, PROJECT, watched
 from tests.support.virtual_time import in_virtual_time, now_s
 
 ON_TWO = (*SIX, "--in-flight", 4, "--dask", "local:2")
-PAID = ("--model", "o3", "--yes", *FAST)
 # A worker is given as long as a loaded machine may need.
 DEAR = MODEL.replace("price}, output = {price}", "price}, output = 2.0") + (
     "timeout_s = {hangs_s}\ndeadline_s = {hangs_s}\n"

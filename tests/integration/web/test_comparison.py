@@ -6,7 +6,6 @@ from html import unescape
 
 import pytest
 
-from merge_runner.study.file import read_study
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables import make_tables
@@ -111,21 +110,6 @@ def test_a_comparison_that_is_computed_while_its_page_is_made_is_still_awaited(d
     monkeypatch.setattr(Site, "computed", computed)
     for address in (f"/drivers/{A}?with={B}", "/"):
         assert "Computing" in words_of(made.get(address).text), address
-
-
-def test_the_measure_that_a_study_of_models_asks_about_is_tested_by_itself(db, tmp_path):
-    (tmp_path / "study.toml").write_text(
-        f'models = ["{A}", "{B}"]\nrepetitions = 1\nprimary = "collided"'
-    )
-    together, study = values_of(StudyResults(db), "effects"), StudyResults(db)
-    study.source = read_study(str(tmp_path / "study.toml"))
-    alone = values_of(study, "effects")
-    name = f"model={B}/collided_percent"
-    assert together[name]["primary"] is None
-    assert (alone[name]["primary"], alone[name]["p_corrected"]) == ("primary", alone[name]["p"])
-    others = {row for row in alone if alone[row]["p"] is not None} - {name}
-    assert all(not alone[row]["primary"] for row in others)
-    assert any(alone[row]["p_corrected"] > alone[row]["p"] for row in others)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,6 @@ from merge_runner_analysis.tables.formats import names_of, render, shown_columns
 from merge_runner_analysis.web.report import report_html
 from tests.support.serving import client_of, words_of
 
-DECIMAL = re.compile(r"[<-]?\d+\.\d+")
 NUMBERS = {"number", "percent", "interval", "p"}
 
 
@@ -116,55 +115,3 @@ def test_a_tables_numbers_are_those_of_its_csv_in_text_on_its_page_and_in_the_re
             value = frame.loc[row, column]
             if isinstance(value, float):
                 assert isnan(value) if cells[column] == "" else float(cells[column]) == value
-
-
-def decimals_of(text):
-    return {*DECIMAL.findall(text)}
-
-
-def known_of(row):
-    """All values of a verdict as they are to be printed, a share between its two ends too."""
-    texts = {rounded(v) for name, v in row.items() if re.fullmatch(r"-?[\d.]+(e-?\d+)?", v or "")}
-    texts |= {p_value(row[name]) for name in ("p", "p_holm") if row[name]}
-    if row["undecided"]:
-        k, n = int(row["k"]), int(row["n"]) + int(row["undecided"])
-        texts |= {rounded(100 * k / n), rounded(100 * (k + int(row["undecided"])) / n)}
-    return texts
-
-
-def test_a_verdicts_numbers_are_those_of_the_csv_on_the_page_of_the_study_and_of_each_driver(
-    tables, client
-):
-    verdicts = as_csv(tables["verdicts"])
-    groups = {row.groups[0] for row in tables["verdicts"].rows if row.values.get("measure")}
-    for group in sorted(groups - {"human"}):
-        driver, _, prompt = group.rpartition("/")
-        rows = {name: row for name, row in verdicts.items() if name.rpartition("/")[0] == group}
-        html = client.get("/drivers", params={"variant": prompt, "model": driver}).text
-        (own,) = [
-            row
-            for row in re.findall(
-                r'<tr><th scope="row"><a href="/drivers/.*?</tr>', html, re.DOTALL
-            )
-            if unescape(re.search(r'title="([^"]*)"', row)[1]) == driver
-            and f"variant={prompt}" in unescape(row)
-        ]
-        known = set().union(*map(known_of, rows.values()))
-        sentence = plain(re.search(r'<td class="sentence">(.*?)</td>', own, re.DOTALL)[1])
-        assert decimals_of(sentence) <= known, group
-        page = client.get(f"/drivers/{driver}", params={"variant": prompt}).text
-        for name, row in rows.items():
-            measure = name.rpartition("/")[2]
-            ((cell, words),) = re.findall(
-                rf'#{measure}"\s+title="([^"]*)">(.*?)</a>', own, re.DOTALL
-            ) or [("", "")]
-            line = re.search(rf'<tr id="{measure}">(.*?)</tr>', page, re.DOTALL)[1]
-            printed = [
-                cell.partition(";")[0],
-                words,
-                re.sub(r"<span class=\"ends\">.*?</td>", "", line, flags=re.DOTALL),
-            ]
-            for text in map(plain, printed):
-                assert decimals_of(text) <= known_of(row), (name, text)
-                if row["estimate"] and text:
-                    assert rounded(row["estimate"]) in decimals_of(text), (name, text)

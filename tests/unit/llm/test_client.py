@@ -129,21 +129,13 @@ async def test_a_call_whose_wait_for_money_times_out_is_no_call_that_was_given_u
     await ticks()
 
 
-async def test_every_slot_is_a_sample_of_its_own(make):
-    client = make(*(answer(str(number)) for number in range(20)))
-    slots = [slot(repetition, side) for repetition in range(1, 11) for side in ("left", "right")]
-    replies = await asyncio.gather(*(client.ask("prompt", each) for each in slots))
-    assert len({reply.text for reply in replies}) == 20
-    assert [request.slot for request in client.direct.transport.sent] == slots
-    assert len({request.body for request in client.direct.transport.sent}) == 1
-
-
 async def test_what_is_sent_is_what_is_kept(make, cache):
     client = make(answer())
-    reply = await client.ask("Où?", slot())
+    reply = await client.ask("Où?", slot(3, "right"))
     (sent,) = client.direct.transport.sent
     assert sent == reply.request == cache.get(sent.key).request
     assert json.loads(sent.body)["messages"] == [{"role": "user", "content": "Où?"}]
+    assert sent.slot == slot(3, "right")
     assert (sent.endpoint, sent.model, sent.path) == ("openai", "m-1", "/chat/completions")
     assert cache.get(sent.key).attempts == reply.attempts
     assert reply.attempts[0].reply == client.direct.transport.replies[0].body
@@ -195,17 +187,6 @@ async def test_a_damaged_reply_is_told_set_aside_and_asked_again(make, cache):
     assert (await make(answer("third")).ask("prompt", slot())).text == "new"
 
 
-async def test_two_processes_that_ask_the_same_go_on_with_the_same_reply(make, tmp_path):
-    caches = [ResponseCache(tmp_path) for _ in range(2)]
-    clients = [make(answer(f"from {n}"), cache=caches[n]) for n in range(2)]
-    replies = await asyncio.gather(*(client.ask("prompt", slot()) for client in clients))
-    assert [len(client.direct.transport.sent) for client in clients] == [1, 1]
-    assert replies[0].text == replies[1].text
-    assert replies[0].attempts == replies[1].attempts
-    for own in caches:
-        own.close()
-
-
 async def test_a_rejected_request_fails_this_call_alone(make, cache):
     client = make(error(500), error(400, "bad temperature"), answer())
     with pytest.raises(CallFailed, match="bad temperature") as caught:
@@ -221,21 +202,6 @@ async def test_a_rejected_request_fails_this_call_alone(make, cache):
     with pytest.raises(EndpointRefused, match="'m-1'"):
         await unknown.ask("prompt", slot(3))
     assert len(unknown.direct.transport.sent) == 1
-
-
-async def test_an_answer_that_is_of_no_use_is_an_answer_and_kept(make):
-    useless = [
-        (answer(None, refusal="I cannot."), "refusal", "I cannot."),
-        # Azure's filter: the one answer that does not come with status 200.
-        (error(400, code="content_filter"), "refusal", ""),
-        (answer("", "length"), "truncated", ""),
-    ]
-    for number, (reply, outcome, text) in enumerate(useless, 1):
-        client = make(reply, answer("a better one"))
-        for cached in (False, True):
-            got = await client.ask("prompt", slot(number))
-            assert (got.outcome, got.text, got.cached) == (outcome, text, cached)
-        assert len(client.direct.transport.sent) == 1
 
 
 @pytest.mark.parametrize(
