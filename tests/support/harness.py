@@ -67,6 +67,10 @@ def plugin(folder: Path, source: str, module: str = "dummies") -> dict[str, str]
     return {"PYTHONPATH": os.pathsep.join(map(str, (folder, PROJECT)))}
 
 
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
 def a_model(name: str = "emulator", **fields: object) -> str:
     """The emulator's entry of models.toml with these fields."""
 

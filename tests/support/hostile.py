@@ -1,6 +1,7 @@
-"""A trial in which a model says what nobody should."""
+"""A trial in which a model says what nobody should, and an object that acts when it is read."""
 
 import json
+import os
 from dataclasses import replace
 
 from tests.support.studies import Drive, Said, played
@@ -11,6 +12,16 @@ HOSTILE = (
     "{{ 7*7 }}{% raw %} \u202etxet\u202c \x00\x1b[2J </pre></script> "
 )
 LONG = 1_000_000
+
+
+class Bomb:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, mark):
+        self.mark = mark
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.mark),)
 
 
 def hostile_trial():

@@ -20,6 +20,8 @@ import ssl
 from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass, field
 
+from merge_runner.llm.http import HttpTransport
+from merge_runner.providers import Endpoint
 from merge_runner.records import ChatRequest, Slot, make_request
 
 # A reply that every client of the format openai-chat takes for an answer.
@@ -147,3 +149,17 @@ async def raw_server(
         for task in talks:
             task.cancel()
         await asyncio.gather(*talks, return_exceptions=True)
+
+
+@contextlib.asynccontextmanager
+async def transport_to(
+    endpoint: Endpoint | str, connections: int = 1, **options: object
+) -> AsyncIterator[HttpTransport]:
+    """A transport to an endpoint, or to that of OpenAI's format at a URL."""
+    if isinstance(endpoint, str):
+        endpoint = Endpoint("openai", "openai", endpoint, {})
+    transport = HttpTransport(endpoint, connections=connections, **options)
+    try:
+        yield transport
+    finally:
+        await transport.close()

@@ -1,7 +1,7 @@
 """Databases for the analysis: trials driven by constant actions, written as any sweep's are."""
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache
@@ -215,3 +215,14 @@ def yielding(driver: str, variant: str = "baseline", reps: int = 3) -> list[Driv
             actions = (faster, slower) if left else (slower, faster)
             drives.append(Drive(driver, variant, name, rep, *actions))
     return drives
+
+
+def scaled(drives: list[Drive], share: float, crashes: Collection[int] = ()) -> list[Drive]:
+    """The drives with a share of their accelerations, and with none in repetitions that crash."""
+    changed = []
+    for drive in drives:
+        sides = {s: tuple(share * x for x in getattr(drive, s)) for s in ("left", "right")}
+        if drive.rep in crashes:
+            sides = {"left": (0.0,), "right": (0.0,)}
+        changed.append(replace(drive, **sides))
+    return changed

@@ -10,19 +10,11 @@ from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import StudyResults
 from tests.support.harness import environment
 from tests.support.program import invoke
-from tests.support.studies import changed, write_study, yielding
+from tests.support.studies import changed, scaled, write_study, yielding
 from tests.support.tables import by_id, made, notes_with, values_of
 
 SAME = "not tested: the same trials at both levels"
 PROGRAM = json.dumps({side: {"program": "own", "chance": True} for side in ("left", "right")})
-
-
-def braking(drives, share):
-    """The same drives with another strength."""
-    return [
-        replace(d, **{s: tuple(share * x for x in getattr(d, s)) for s in ("left", "right")})
-        for d in drives
-    ]
 
 
 @pytest.fixture(scope="module")
@@ -30,8 +22,8 @@ def db(tmp_path_factory):
     """Two programs and a language model, each with two prompts; the model alone heeds them."""
     drives = [
         *yielding("one", reps=4), *yielding("one", "A1", 4),
-        *braking(yielding("two", reps=4), 0.9), *braking(yielding("two", "A1", 4), 0.9),
-        *yielding("o3", reps=4), *braking(yielding("o3", "A1", 4), 0.8),
+        *scaled(yielding("two", reps=4), 0.9), *scaled(yielding("two", "A1", 4), 0.9),
+        *yielding("o3", reps=4), *scaled(yielding("o3", "A1", 4), 0.8),
     ]  # fmt: skip
     path = write_study(tmp_path_factory.mktemp("copies") / "t.duckdb", drives)
     changed(
@@ -110,7 +102,7 @@ def test_a_program_that_heeds_a_level_in_some_conditions_is_compared_in_all(tmp_
     drives = yielding("one", reps=4)
     heeded = {*sorted({drive.condition for drive in drives})[:5]}
     other = yielding("one", "A1", 4)
-    drives += [braking([d], 0.8)[0] if d.condition in heeded else d for d in other]
+    drives += [scaled([d], 0.8)[0] if d.condition in heeded else d for d in other]
     study = changed(
         write_study(tmp_path / "t.duckdb", drives),
         f"UPDATE specs SET spec = '{PROGRAM}'",

@@ -20,25 +20,17 @@ from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables import effects as tables
 from merge_runner_analysis.tables.effects import comparison
 from tests.support.harness import FAST
-from tests.support.studies import changed, write_study, yielding
+from tests.support.studies import changed, scaled, write_study, yielding
 from tests.support.tables import made, values_of
-
-
-def braking(driver, share, crashes=()):
-    """Five repetitions of a driver with another strength, which collides in some of them."""
-    drives = []
-    for drive in yielding(driver, reps=5):
-        sides = {s: tuple(share * x for x in getattr(drive, s)) for s in ("left", "right")}
-        if drive.rep in crashes:
-            sides = {"left": (0.0,), "right": (0.0,)}
-        drives.append(replace(drive, **sides))
-    return drives
 
 
 @pytest.fixture(scope="module")
 def two(tmp_path_factory):
     """Two models of one prompt, the second of which brakes less and collides more."""
-    drives = [*braking("one", 1.0, {5}), *braking("two", 0.8, {3, 4, 5})]
+    drives = [
+        *scaled(yielding("one", reps=5), 1.0, {5}),
+        *scaled(yielding("two", reps=5), 0.8, {3, 4, 5}),
+    ]
     return StudyResults(write_study(tmp_path_factory.mktemp("two") / "t.duckdb", drives))
 
 
@@ -69,7 +61,7 @@ def test_two_models_differ_by_an_independent_test_with_one_p_on_every_page(two):
 
 
 def test_a_comparison_counts_the_tests_that_holm_counts(tmp_path):
-    drives = [*braking("one", 1.0), *braking("two", 0.8)]
+    drives = [*yielding("one", reps=5), *scaled(yielding("two", reps=5), 0.8)]
     study = StudyResults(write_study(tmp_path / "t.duckdb", drives))
     table = comparison(study, *(group.id for group in study.models))
     tests = [row.values for row in table.rows if row.values["p"] is not None]
@@ -142,7 +134,7 @@ def test_a_plugins_metric_has_effects_too(played):
 
 def test_replies_of_a_trial_count_as_one_observation(tmp_path):
     """The share is that of all replies, its error that of as many trials as there are."""
-    drives = [*braking("one", 1.0), *braking("two", 0.9)]
+    drives = [*yielding("one", reps=5), *scaled(yielding("two", reps=5), 0.9)]
     invalid = (
         "UPDATE decisions SET valid = (decision + length(trial_id)) % 3 > 0 "
         "WHERE trial_id LIKE 'two/%' AND trial_id LIKE '%rep02%'"
@@ -159,7 +151,7 @@ def test_replies_of_a_trial_count_as_one_observation(tmp_path):
 
 
 def test_trials_of_unknown_cost_are_left_out_with_a_word(tmp_path):
-    drives = [replace(d, said={}) for name in ("one", "two") for d in braking(name, 1.0)]
+    drives = [replace(d, said={}) for name in ("one", "two") for d in yielding(name, reps=5)]
     unknown = "UPDATE calls SET cost_usd = NULL WHERE trial_id LIKE 'two/%rep02%'"
     study = changed(write_study(tmp_path / "t.duckdb", drives), unknown)
     row = next(row for row in made(study, "effects").rows if row.id == "model=two/cost_usd")

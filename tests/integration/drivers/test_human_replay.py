@@ -7,7 +7,6 @@ from pathlib import Path
 
 import duckdb
 import pytest
-from starlette.testclient import TestClient
 
 from merge_runner.drivers.human_replay import HUMAN_REPLAY, SAMPLE_S, ImportedHumans
 from merge_runner.errors import UsageError
@@ -17,10 +16,9 @@ from merge_runner.run.plan import make_plan
 from merge_runner.run.stored_replay import audit_database
 from merge_runner.trial import Trial, play_trial
 from merge_runner_analysis.humans.load import import_trials, sort_files
-from merge_runner_analysis.web.app import explorer
-from merge_runner_analysis.web.site import Site
 from tests.support.driven_trials import ask_nobody
 from tests.support.recordings import drive, file
+from tests.support.serving import client_of
 
 HUMAN = '\nrepetitions = 1\nconditions = ["L_4_0"]\n[scenario]\nresistance = "human"\n'
 FILES = {
@@ -200,7 +198,7 @@ async def test_a_sweep_of_them_is_stored_audited_and_shown_with_a_caution(
     said = "the human on the left is replayed and does not react"
     tables = await merge_runner("tables", "ablation-quantitative")
     assert f"human-replay+idm: {said}" in " ".join(tables.out.split())
-    explored = TestClient(explorer(Site(db)), base_url="http://127.0.0.1:1")
+    explored = client_of(db)
     assert explored.get("/trials").text.count(said) == 1, "of five trials one"
     assert f",{said}," in explored.get("/trials.csv").text
     page = explored.get("/trials/human-replay+idm/baseline/L_4_0/rep01").text

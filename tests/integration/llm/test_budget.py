@@ -24,13 +24,6 @@ from tests.support.gate import HANGS_S
 from tests.support.harness import each
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory):
-    opened = ResponseCache(tmp_path_factory.mktemp("responses"))
-    yield opened
-    opened.close()
-
-
 @pytest.fixture
 def ledger(cache, request):
     return Ledger(cache, request.node.name)

@@ -2,7 +2,6 @@ import asyncio
 import contextlib
 import gc
 import json
-import os
 import shutil
 import sqlite3
 import stat
@@ -25,6 +24,7 @@ from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.store import CachedCall
 from merge_runner.records import Attempt, ChatRequest, Slot, Usage, make_request
 from tests.support.cases import cases
+from tests.support.hostile import Bomb
 from tests.support.json_values import paths, replaced
 
 
@@ -266,16 +266,6 @@ def test_the_folder_is_for_its_owner_alone(folder):
     folder.chmod(0o755)
     ResponseCache(folder).close()
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
-
-
-class Bomb:
-    """Makes a folder when it is unpickled."""
-
-    def __init__(self, mark):
-        self.mark = mark
-
-    def __reduce__(self):
-        return os.mkdir, (str(self.mark),)
 
 
 # The stock library keeps a long value in a file of its own.

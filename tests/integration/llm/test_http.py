@@ -11,13 +11,13 @@ import pytest
 from aiohttp import web
 
 from merge_runner.errors import UsageError
-from merge_runner.llm.http import Connections, HttpTransport
+from merge_runner.llm.http import Connections
 from merge_runner.llm.http_outcome import TransportFailure
 from merge_runner.providers import Endpoint, ModelEntry, resolve_endpoint
 from merge_runner.records import Slot, call_key, canonical_json, make_request
 from tests.support.harness import listening
 from tests.support.mock_server import FaultPlan
-from tests.support.raw_server import raw_server
+from tests.support.raw_server import raw_server, transport_to
 
 SLOT = Slot("N_0_0", 1, "left", 0, 0)
 KEY = "sk-dummy-0123456789"
@@ -68,15 +68,6 @@ def endpoint_at(url, provider="openai", identity=None, auth_headers=None):
 def entry(provider, url=None):
     named = {"provider": provider, "format": "openai-chat", "id": "m", "base_url": url}
     return ModelEntry(**named, max_output_tokens=10)
-
-
-@contextlib.asynccontextmanager
-async def transport_to(endpoint, connections=2, **options):
-    transport = HttpTransport(endpoint, connections=connections, **options)
-    try:
-        yield transport
-    finally:
-        await transport.close()
 
 
 async def send(endpoint, request=None, *, attempt=1, timeout_s=10.0):

@@ -9,7 +9,6 @@ import pytest
 
 from merge_runner.emulator.driver import answer
 from merge_runner.errors import MergeRunnerError
-from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.delays import FIRST_BACKOFF_S, LONGEST_BACKOFF_S, backoff_s
 from merge_runner.llm.http import HttpTransport
 from merge_runner.providers import Endpoint, ModelEntry
@@ -20,14 +19,6 @@ from tests.support.virtual_time import in_virtual_time, now_s
 
 TIMEOUT_S, DEADLINE_S = 600, 1200
 EXIT_CODES = {"CallFailed": 1, "EndpointRefused": 2, "QuotaExhausted": 3}
-
-
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory):
-    """One folder for all tests: to make a durable one takes a while."""
-    cache = ResponseCache(tmp_path_factory.mktemp("responses"))
-    yield cache
-    cache.close()
 
 
 @asynccontextmanager

@@ -12,21 +12,9 @@ import pytest
 
 from merge_runner.llm.delays import server_delay_s
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.http_outcome import TransportFailure
-from merge_runner.providers import Endpoint
 from tests.support.cases import cases
-from tests.support.raw_server import a_request, head, ok, raw_server
-
-
-@contextlib.asynccontextmanager
-async def transport_to(url, connections=1, **options):
-    endpoint = Endpoint("openai", "openai", url, {})
-    transport = HttpTransport(endpoint, connections=connections, **options)
-    try:
-        yield transport
-    finally:
-        await transport.close()
+from tests.support.raw_server import a_request, head, ok, raw_server, transport_to
 
 
 def chat(text):

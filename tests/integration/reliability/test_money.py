@@ -9,6 +9,7 @@ import pytest
 from aiohttp import web
 
 from tests.support.harness import FAST, PROJECT, a_model, as_a_model, watched
+from tests.support.priced import rows
 
 SWEEP = ("sweep", "baseline", "--conditions", "L_4_0,N_0_0,R_-4_8", "--model", "o3", "--json")
 # o3 at 2 and 8 USD per million tokens: a trial of the emulator costs about 0.08 USD, and each of
@@ -41,10 +42,6 @@ class Bill:
         return reply
 
 
-async def sql(merge_runner, query):
-    return json.loads((await merge_runner("sql", query, "--format", "json")).out)
-
-
 async def test_the_cap_holds_over_all_runs_and_a_higher_one_goes_on(merge_runner):
     bill = Bill()
     async with watched(bill.middle) as server:
@@ -58,7 +55,7 @@ async def test_the_cap_holds_over_all_runs_and_a_higher_one_goes_on(merge_runner
         assert "raise --max-cost, or the study's budget, and run the same command" in run.err
         # What is finished is balanced: no condition is far ahead of another one.
         query = "select condition, count(*) as n from trials group by all order by n"
-        counts = await sql(merge_runner, query)
+        counts = await rows(merge_runner, query)
         assert len(counts) == 3
         assert counts[-1]["n"] - counts[0]["n"] <= 2
         spent = bill.usd
@@ -67,10 +64,10 @@ async def test_the_cap_holds_over_all_runs_and_a_higher_one_goes_on(merge_runner
         assert (again.code, bill.usd) == (3, spent)
         assert again.summary["sweep_cost_usd"] == pytest.approx(spent)
         done = await merge_runner(*sweep, "--max-cost", 50, code=0, **env)
-        (calls,) = await sql(merge_runner, "select count(*) as n from calls")
+        (calls,) = await rows(merge_runner, "select count(*) as n from calls")
         assert calls["n"] == server.requests, "nothing was paid for twice"
         query = "select (config->>'max_cost_usd')::double as cap from sweeps order by started_at"
-        caps = [row["cap"] for row in await sql(merge_runner, query)]
+        caps = [row["cap"] for row in await rows(merge_runner, query)]
         assert caps == [ROOM_FOR_SOME, ROOM_FOR_SOME, 50]
     assert done.summary["sweep_cost_usd"] == pytest.approx(bill.usd)
     assert done.summary["set_aside_usd"] == 0
@@ -78,7 +75,7 @@ async def test_the_cap_holds_over_all_runs_and_a_higher_one_goes_on(merge_runner
         "select sum(cost_usd) as usd from trial_costs",
         "select cost_usd as usd from sweep_costs order by sweep_id desc limit 1",
     ):
-        assert await sql(merge_runner, query) == [{"usd": pytest.approx(bill.usd)}]
+        assert await rows(merge_runner, query) == [{"usd": pytest.approx(bill.usd)}]
 
 
 async def test_one_cap_holds_over_several_sweeps(merge_runner, experiments):
@@ -152,7 +149,7 @@ async def test_what_a_run_has_in_flight_is_not_released_and_stays_set_aside_when
     assert run.summary["attempts_of_unknown_cost"] == 3
     assert 0.38 < run.summary["set_aside_usd"] < 0.45
     query = "select fate, cached from attempts where outcome = 'unknown'"
-    assert await sql(merge_runner, query) == [{"fate": "retried", "cached": True}] * 3
+    assert await rows(merge_runner, query) == [{"fate": "retried", "cached": True}] * 3
 
 
 async def test_hits_cost_nothing_and_the_estimate_counts_what_is_missing(merge_runner, tmp_path):
@@ -179,9 +176,9 @@ async def test_hits_cost_nothing_and_the_estimate_counts_what_is_missing(merge_r
             assert (again.code, server.requests) == (0, requests), again.err
         replay = await merge_runner("replay", *sweep[1:], 2, "--db", "other", **env)
     assert replay.summary["cost_usd"] == replay.summary["calls"]["live"] == 0
-    (calls,) = await sql(merge_runner, "select count(*) as n from calls")
+    (calls,) = await rows(merge_runner, "select count(*) as n from calls")
     assert calls["n"] == server.requests
-    (paid,) = await sql(merge_runner, "select sum(paid_usd) as usd from trial_costs")
+    (paid,) = await rows(merge_runner, "select sum(paid_usd) as usd from trial_costs")
     assert paid["usd"] > 0
     other = await merge_runner("sql", "select sum(paid_usd) from trial_costs", "--db", "other")
     assert other.out.split()[-1] == "0.0"
@@ -227,7 +224,7 @@ async def test_runs_of_two_models_under_one_cap_never_pass_it_and_both_end(
         codes = [await run.wait() for run in runs]
     assert {*codes} <= {0, 3}
     assert 0 < bill.usd <= 0.4
-    (calls,) = await sql(merge_runner, "select count(distinct call_key) as n from calls")
+    (calls,) = await rows(merge_runner, "select count(distinct call_key) as n from calls")
     assert calls["n"] <= server.requests
 
 

@@ -11,21 +11,12 @@ from merge_runner.results.store import query
 from merge_runner_analysis.humans.archive import Unreadable, open_files
 from tests.support import program
 from tests.support.harness import environment
+from tests.support.hostile import Bomb
 from tests.support.recordings import drive, write_folder, write_zip
 
 GOOD_CSV = drive("L_4_0").csv()
 GOOD = {"a/experiment_4_iter_1.csv": GOOD_CSV}
 TRIAL = "experiment_9_iter_9"
-
-
-class Bomb:
-    """Makes a folder when it is unpickled."""
-
-    def __init__(self, mark):
-        self.mark = mark
-
-    def __reduce__(self):
-        return os.mkdir, (str(self.mark),)
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import pytest
 
 from merge_runner.errors import UsageError
 from merge_runner.results.store import Store, query
-from tests.support.harness import PROJECT
+from tests.support.harness import PROJECT, contents
 
 DB = Path("results/merge.duckdb")
 CASES = {
@@ -51,10 +51,6 @@ def unchanged(here):
     before = contents(here)
     yield
     assert contents(here) == before
-
-
-def contents(folder):
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def refusal(sql):

@@ -6,12 +6,10 @@ from statistics import median
 
 import duckdb
 import pytest
-from starlette.testclient import TestClient
 
 from merge_runner.results.store import query, results_digest
-from merge_runner_analysis.web.app import explorer
-from merge_runner_analysis.web.site import Site
 from tests.support.harness import FAST
+from tests.support.serving import client_of
 
 STUDY = """
 models = ["emulator", "emulator+projected-order"]
@@ -36,7 +34,6 @@ dropout = 0.3
 [perception.short]
 range_m = 3.0
 """
-HOST = "127.0.0.1:8700"
 BESIDE = """
 SELECT trial_id, side, perceived_distance_m - distance_m AS error_m,
     perceived_other_speed_mps - other_speed_mps AS error_mps, other_seen
@@ -102,7 +99,7 @@ def test_the_prompt_says_what_was_told_and_not_what_was_so(db):
 
 
 def test_the_panel_of_a_decision_shows_both_beside_each_other(db):
-    client = TestClient(explorer(Site(db)), base_url=f"http://{HOST}")
+    client = client_of(db)
 
     def panel(level):
         trial = f"emulator/told_more/L_4_0/rep01/perception={level}"

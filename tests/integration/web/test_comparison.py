@@ -13,7 +13,7 @@ from merge_runner_analysis.web.report import report_html
 from merge_runner_analysis.web.site import Site
 from merge_runner_analysis.wording import UNREADABLE, brackets, capital, money, number, p_value
 from tests.support.serving import client_of, listed, words_of
-from tests.support.studies import Said, write_study, yielding
+from tests.support.studies import Said, scaled, write_study, yielding
 from tests.support.tables import values_of
 
 A, B = "gpt-5.2", "o3"
@@ -24,13 +24,10 @@ def drives():
     """B collides in three of five repetitions, A in one and brakes harder; a trial of A is lost."""
     drives = []
     for name, crashes, strength in ((A, {5}, 1.0), (B, {3, 4, 5}, 0.8)):
-        for drive in yielding(name, reps=5):
-            sides = {s: tuple(strength * x for x in getattr(drive, s)) for s in ("left", "right")}
-            if drive.rep in crashes:
-                sides = {"left": (0.0,), "right": (0.0,)}
+        for drive in scaled(yielding(name, reps=5), strength, crashes):
             is_lost = (name, drive.condition, drive.rep) == (A, "N_0_0", 2)
             said = {1: Said(("timeout",), lost=True)} if is_lost else {}
-            drives.append(replace(drive, **sides, said=said))
+            drives.append(replace(drive, said=said))
     return drives
 
 

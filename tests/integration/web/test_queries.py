@@ -18,13 +18,10 @@ from merge_runner_analysis.web.queries import Queries
 from merge_runner_analysis.web.reading import Copies
 from tests.support.cases import cases, table
 from tests.support.gate import HANGS_S
+from tests.support.harness import contents
 from tests.support.studies import write_study, yielding
 
 ENDLESS = "WITH RECURSIVE r AS (SELECT 1 AS n UNION ALL SELECT n + 1 FROM r) SELECT max(n) FROM r"
-
-
-def contents(folder):
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def texts(rows):
