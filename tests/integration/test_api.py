@@ -15,8 +15,9 @@ from merge_runner.results.store import results_digest
 from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
 from merge_runner_analysis import table
 from merge_runner_analysis.metrics import METRICS, Metric
-from tests.support.harness import CONFIGURING, watched
+from tests.support.harness import CONFIGURING, a_model, watched
 from tests.support.mock_server import BatchPlan, FaultPlan
+from tests.support.priced import PRICE
 
 STUDY = """
 models = ["emulator"]
@@ -26,14 +27,6 @@ conditions = ["L_4_0", "N_0_0"]
 temperature = [0.2, 1.0]
 opponent = ["self", "constant"]
 memory_s = [1.0, 2.0]
-"""
-PRICED = """
-[dear]
-provider = "emulator"
-format = "openai-chat"
-id = "scripted-driver"
-max_output_tokens = 4000
-price = { input = 1.0, output = 2.0, source = "mine" }
 """
 
 
@@ -45,7 +38,7 @@ def folder(tmp_path, monkeypatch, emulator_url):
     monkeypatch.setenv("EMULATOR_BASE_URL", emulator_url)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "study.toml").write_text(STUDY)
-    (tmp_path / "models.toml").write_text(PRICED)
+    (tmp_path / "models.toml").write_text(a_model("dear", price=PRICE))
     return tmp_path
 
 

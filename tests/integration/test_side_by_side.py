@@ -17,6 +17,7 @@ from merge_runner.prompts.blocks import VARIANTS, Variant
 from merge_runner.registry import NO_STUDY, in_use
 from merge_runner.run.stored_replay import audit_database
 from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
+from tests.support.braking import deciding
 from tests.support.harness import CONFIGURING
 
 WORDS = {"a": "You are late.", "b": "You have time."}
@@ -34,19 +35,7 @@ add = [{{ after = "C3.human", text = "{words}" }}]
 [plugins]
 files = ["plugin.py", "gains.py"]
 """
-PLUGIN = """
-from merge_runner.plugin import PROGRAMS, Program
-
-class Braking:
-    def __init__(self, context):
-        self.context = context
-
-    async def decide(self, observation, number):
-        from .gains import ACTION
-        return self.context.held(ACTION)
-
-PROGRAMS.register("mine", Program(Braking, "brakes"))
-"""
+OF_ITS_FOLDER = "from .gains import ACTION\nreturn self.context.held(ACTION)"
 
 
 @pytest.fixture
@@ -59,7 +48,7 @@ def folder(tmp_path, monkeypatch):
         (tmp_path / name).mkdir()
         text = STUDY.format(words=words, headway_m=HEADWAYS_M[name])
         (tmp_path / name / "study.toml").write_text(text)
-        (tmp_path / name / "plugin.py").write_text(PLUGIN)
+        (tmp_path / name / "plugin.py").write_text(deciding(OF_ITS_FOLDER, "mine"))
         (tmp_path / name / "gains.py").write_text(f"ACTION = {BRAKING[name]}\n")
     return tmp_path
 

@@ -1,4 +1,6 @@
-"""A plug-in with a program of 20 Hz that brakes by a parameter, and the head of its study."""
+"""Plug-ins with a program: of 20 Hz that brakes by a parameter, and of a test's lines."""
+
+from textwrap import indent
 
 HEAD = 'repetitions = 1\nconditions = ["N_0_0"]\n'
 BRAKING = """
@@ -21,4 +23,21 @@ PROGRAMS.register(
     "braking",
     Program(Braking, "brakes", {"set": "mild"}, 20.0, settable=True, sets=SETS, check=check),
 )
+"""
+
+
+def deciding(lines: str, name: str = "braking", *, within: str = "") -> str:
+    """A plug-in whose program decides by these lines; ``within`` is what else its class has."""
+    return f"""
+from merge_runner.plugin import PROGRAMS, Program
+
+class Driver:
+{indent(within, "    ")}
+    def __init__(self, context):
+        self.context = context
+
+    async def decide(self, observation, number):
+{indent(lines, "        ")}
+
+PROGRAMS.register("{name}", Program(Driver, "brakes"))
 """

@@ -1,4 +1,4 @@
-"""Trials that programs drive, without a study."""
+"""Trials that programs drive."""
 
 from dataclasses import replace
 
@@ -31,3 +31,10 @@ def play(programs, condition, repetition=1, *, scenario, seeds=None):
             context = replace(context, seed=seeds[side], other_seed=seeds[OTHER[side]])
         drivers[side] = program.driver(context)
     return play_trial(Trial(trial, scenario, drivers), ask_nobody)
+
+
+def driven_by(plan, number=0):
+    """A trial of a plan whose drivers are programs."""
+    trial, (arm, *_), programs = plan.trial_specs()[number], plan.arms, plan.parts.programs
+    drivers = {side: programs[arm.sides[side]].make(arm.scenario, trial, side) for side in SIDES}
+    return play_trial(Trial(trial, arm.scenario, drivers), ask_nobody)

@@ -14,9 +14,8 @@ from merge_runner.records import SIDES
 from merge_runner.results.store import Store, query
 from merge_runner.run.plan import make_plan
 from merge_runner.run.stored_replay import audit_database
-from merge_runner.trial import Trial, play_trial
 from merge_runner_analysis.humans.load import import_trials, sort_files
-from tests.support.driven_trials import ask_nobody
+from tests.support.driven_trials import driven_by
 from tests.support.recordings import drive, file
 from tests.support.serving import client_of
 
@@ -53,12 +52,6 @@ def plan_of(tmp_path, db):
     return plan
 
 
-def played(plan, number=0):
-    spec, (arm, *_), programs = plan.trial_specs()[number], plan.arms, plan.parts.programs
-    drivers = {side: programs[arm.sides[side]].make(arm.scenario, spec, side) for side in SIDES}
-    return play_trial(Trial(spec, arm.scenario, drivers), ask_nobody)
-
-
 def humans_of(plan):
     return plan.parts.programs[HUMAN_REPLAY].data
 
@@ -81,7 +74,7 @@ TEXTS = {"human": HUMAN, "none": HUMAN.replace('"human"', '"none"'), "blurred": 
 
 @pytest.mark.parametrize("text", TEXTS.values(), ids=TEXTS)
 def test_two_replayed_sides_of_a_trial_are_the_trial(db, plan_of, text):
-    trial = played(plan_of(HUMAN_REPLAY, text))
+    trial = driven_by(plan_of(HUMAN_REPLAY, text))
     wanted, found = recorded(db, "human/pair1/L_4_0/iter001"), driven(trial)
     assert found.keys() == wanted.keys()
     assert all(found[at] == pytest.approx(wanted[at], abs=1e-6) for at in wanted)
@@ -91,7 +84,7 @@ def test_two_replayed_sides_of_a_trial_are_the_trial(db, plan_of, text):
 @pytest.mark.parametrize("side", SIDES)
 def test_a_replayed_human_keeps_its_trace_beside_a_free_driver(db, plan_of, side):
     pair = f"{HUMAN_REPLAY}+idm" if side == "left" else f"idm+{HUMAN_REPLAY}"
-    trial = played(plan_of(pair))
+    trial = driven_by(plan_of(pair))
     wanted, found = recorded(db, "human/pair1/L_4_0/iter001"), driven(trial, (side,))
     shared = wanted.keys() & found.keys()
     assert len(shared) > 100
@@ -103,7 +96,7 @@ def test_a_replayed_human_keeps_its_trace_beside_a_free_driver(db, plan_of, side
 
 def test_the_pairs_take_turns_and_a_trial_that_collided_is_left_out(db, plan_of):
     plan = plan_of(HUMAN_REPLAY, repetitions=2)
-    second = played(plan, 1)
+    second = driven_by(plan, 1)
     wanted = recorded(db, "human/pair2/L_4_0/iter001")
     assert driven(second)[0.0, "left"] == wanted[0.0, "left"]
     assert second.merged_first == "right"
@@ -114,7 +107,7 @@ def test_the_pairs_take_turns_and_a_trial_that_collided_is_left_out(db, plan_of)
 def test_a_human_keeps_its_speed_once_its_trace_has_ended(plan_of):
     text = HUMAN + '[drivers.weak]\nprogram = "idm"\ndesired_speed_factor = 0.5\n'
     plan = plan_of("weak+human-replay", text)
-    trial = played(plan)
+    trial = driven_by(plan)
     traced = humans_of(plan).trials[0].speeds_mps["right"]
     after = [row for row in trial.states if row.side == "right"][len(traced) :]
     assert len(after) > 20
@@ -123,20 +116,20 @@ def test_a_human_keeps_its_speed_once_its_trace_has_ended(plan_of):
 
 def test_another_database_that_is_read_meanwhile_changes_no_trial_of_a_plan(plan_of, tmp_path):
     plan, other = plan_of(HUMAN_REPLAY), tmp_path / "other.duckdb"
-    hashes, wanted = plan.specs().keys(), played(plan)
+    hashes, wanted = plan.specs().keys(), driven_by(plan)
     with pytest.raises(UsageError, match=r"holds none: merge-runner human import PATH"):
         plan_of(HUMAN_REPLAY, db=other)
     trials = sort_files([file("experiment_6_iter_1.csv", drive("L_4_0", yields="left").csv())])
     import_trials(trials, Store(other))
     second = plan_of(HUMAN_REPLAY, db=other)
-    assert (played(plan)).states == wanted.states != (played(second)).states
+    assert driven_by(plan).states == wanted.states != driven_by(second).states
     assert plan.specs().keys() == hashes != second.specs().keys()
 
 
 def test_a_study_names_the_pair(db, plan_of):
     text = HUMAN + '[drivers.second]\nprogram = "human-replay"\npair = "pair2"\n'
     plan = plan_of("second", text)
-    assert (played(plan)).merged_first == "right"
+    assert driven_by(plan).merged_first == "right"
     assert json.loads(plan.spec(plan.arms[0], "L_4_0"))["left"]["based_on"] == HUMAN_REPLAY
     unknown = "unknown pair of human-replay 'pair7'; valid: all, pair1, pair2"
     for changed, said in (

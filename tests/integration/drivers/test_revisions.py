@@ -11,6 +11,7 @@ from merge_runner.plugin import PROGRAMS, Program
 from merge_runner.results.store import query
 from merge_runner.run.plan import make_plan
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from tests.support.braking import deciding
 from tests.support.driven_trials import both, play
 from tests.support.harness import FAST, PROJECT
 
@@ -22,20 +23,6 @@ repetitions = 1
 conditions = ["L_4_0", "N_0_0"]
 [plugins]
 files = ["mine.py"]
-"""
-DRIVER = """
-from merge_runner.plugin import PROGRAMS, Program
-
-class Braking:
-    revision = {revision}
-
-    def __init__(self, context):
-        self.context = context
-
-    async def decide(self, observation, number):
-        return self.context.held({action})
-
-PROGRAMS.register("braking", Program(Braking, "brakes"))
 """
 
 
@@ -96,7 +83,8 @@ async def test_an_edited_program_is_refused_until_its_revision_is_raised(
     (tmp_path / "study.toml").write_text(STUDY.replace("braking", model))
 
     async def sweep(revision, action, *more):
-        (tmp_path / "mine.py").write_text(DRIVER.format(revision=revision, action=action))
+        plugin = deciding(f"return self.context.held({action})", within=f"revision = {revision}")
+        (tmp_path / "mine.py").write_text(plugin)
         return await merge_runner(
             "sweep", "study.toml", "--db", "study.duckdb", "--trust", *more, *FAST
         )

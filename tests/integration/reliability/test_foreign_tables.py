@@ -28,13 +28,22 @@ async def test_a_link_to_a_database_is_read_as_it_is(merge_runner, db, tmp_path)
     await merge_runner("digest", "--db", "link.duckdb", code=0)
 
 
-async def test_a_table_that_is_not_there_is_told_in_one_line(merge_runner, db):
+@pytest.mark.parametrize(
+    ("renamed", "says", "commands"),
+    [
+        ("TO others", "Table with name states does not exist", ["digest", "tables gap", "audit"]),
+        ("COLUMN step TO n", 'column "step" not found', ["digest", "tables gap"]),
+    ],
+)
+async def test_a_table_that_is_not_there_is_told_in_one_line(
+    merge_runner, db, renamed, says, commands
+):
     with duckdb.connect(str(db)) as connection:
-        connection.execute("ALTER TABLE states RENAME TO others")
-    for command in (("digest",), ("tables", "gap"), ("audit",)):
-        run = await merge_runner(*command, "--db", db, code=2)
+        connection.execute(f"ALTER TABLE states RENAME {renamed}")
+    for command in commands:
+        run = await merge_runner(*command.split(), "--db", db, code=2)
         (line,) = run.err.splitlines()
-        assert "Table with name states does not exist" in line
+        assert says in line
 
 
 @pytest.mark.parametrize("name", ["md:x", ":memory:"])

@@ -28,6 +28,7 @@ from merge_runner.records import SLOT_HEADER, ReplayMiss
 from merge_runner.run.cluster import Assignment
 from merge_runner.run.cluster_connection import connected
 from merge_runner.run.cluster_worker import Chunk, Played, RemoteCoordinator, WorkerRun, go_on
+from tests.support.braking import deciding
 from tests.support.cluster import SIX, SMALL, all_held, ended, held_from, repetition_of, workers_of
 from tests.support.crossed_study import MODEL
 from tests.support.gate import HANGS_S, Gate
@@ -40,20 +41,9 @@ DEAR = MODEL.replace("price}, output = {price}", "price}, output = 2.0") + (
     "timeout_s = {hangs_s}\ndeadline_s = {hangs_s}\n"
 )
 
-RAISING = """
-from merge_runner.plugin import PROGRAMS, Program
-
-class Raising:
-    def __init__(self, context):
-        self.context = context
-
-    async def decide(self, observation, number):
-        if number == 3:
-            raise ValueError("no plan")
-        return self.context.held(0.0)
-
-PROGRAMS.register("raising", Program(Raising, "raises"))
-"""
+RAISING = """if number == 3:
+    raise ValueError("no plan")
+return self.context.held(0.0)"""
 RAISING_STUDY = """
 models = ["emulator+raising"]
 repetitions = 1
@@ -164,7 +154,7 @@ async def test_a_driver_that_raises_ends_the_run_once_and_what_is_paid_is_kept(
     merge_runner, scheduler, tmp_path
 ):
     """Nothing of the run is left at the workers."""
-    (tmp_path / "mine.py").write_text(RAISING)
+    (tmp_path / "mine.py").write_text(deciding(RAISING, "raising"))
     (tmp_path / "study.toml").write_text(RAISING_STUDY)
     await scheduler("--no-nanny")
     async with watched() as server:
@@ -174,7 +164,7 @@ async def test_a_driver_that_raises_ends_the_run_once_and_what_is_paid_is_kept(
     assert (run.code, server.requests) == (1, kept), run.err
     assert kept >= 3
     (told,) = [line for line in run.err.splitlines() if line.startswith("error:")]
-    assert "Raising.decide of " in told
+    assert "Driver.decide of " in told
     assert (
         "mine.py raised ValueError('no plan') (reported by the Dask worker tcp://127.0.0.1:" in told
     )

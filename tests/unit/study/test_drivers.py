@@ -6,13 +6,11 @@ import tomllib
 import pytest
 
 from merge_runner.drivers.registry import PROGRAMS
-from merge_runner.records import SIDES
 from merge_runner.registry import using
 from merge_runner.study.file import StudyFile
 from merge_runner.study.parts import declared_catalogue
-from merge_runner.trial import Trial, play_trial
 from tests.support.braking import BRAKING
-from tests.support.driven_trials import ask_nobody
+from tests.support.driven_trials import driven_by
 
 HEAD = 'repetitions = 1\nconditions = ["N_0_0"]\n'
 
@@ -22,15 +20,6 @@ def plan_of(plan_of):
     """Makes the plan of a study's text beside a plug-in with a program of 20 Hz."""
     added = '\n[plugins]\nfiles = ["mine.py"]\n'
     return lambda text, models=(): plan_of(text + added, models, BRAKING)
-
-
-def played(plan):
-    """The first trial of a plan whose drivers are programs."""
-    (spec, *_), (arm, *_) = plan.trial_specs(), plan.arms
-    drivers = {
-        side: plan.parts.programs[arm.sides[side]].make(arm.scenario, spec, side) for side in SIDES
-    }
-    return play_trial(Trial(spec, arm.scenario, drivers), ask_nobody)
 
 
 def specs(plan):
@@ -47,7 +36,7 @@ MINE = '[drivers.mine]\nprogram = "braking"\n'
 
 def test_a_driver_of_a_study_drives_by_its_parameters_and_has_them_in_its_spec(plan_of):
     plan = plan_of(MINE + "strength = 0.5\n", "mine")
-    assert {row.decision.applied for row in (played(plan)).decisions} == {(-0.5,)}
+    assert {row.decision.applied for row in driven_by(plan).decisions} == {(-0.5,)}
     (spec,) = specs(plan)
     assert spec["left"]["parameters"] == {"set": "mild", "strength": 0.5, "unused": 1.0}
     assert (spec["left"]["program"], spec["left"]["based_on"]) == ("mine", "braking")
@@ -58,7 +47,7 @@ def test_a_driver_of_a_study_drives_by_its_parameters_and_has_them_in_its_spec(p
 def test_a_set_brings_its_parameters_and_single_ones_go_before_it(plan_of):
     plan = plan_of(MINE + 'set = "hard"\nunused = 3\n', "mine")
     assert specs(plan)[0]["left"]["parameters"] == {"set": "hard", "strength": 0.9, "unused": 3.0}
-    assert {row.decision.applied for row in (played(plan)).decisions} == {(-0.9,)}
+    assert {row.decision.applied for row in driven_by(plan).decisions} == {(-0.9,)}
 
 
 def test_it_stands_in_pairs_and_in_the_sweep_with_its_study(plan_of):
@@ -69,7 +58,7 @@ def test_it_stands_in_pairs_and_in_the_sweep_with_its_study(plan_of):
 
 def test_a_clock_holds_each_action(plan_of):
     plan = plan_of(MINE + "clock = 1.0\n", "mine")
-    trial = played(plan)
+    trial = driven_by(plan)
     left = [row for row in trial.decisions if row.side == "left"]
     assert [row.time_s for row in left] == [float(n) for n in range(len(left))]
     assert specs(plan)[0]["left"]["rate_hz"] == 1.0

@@ -15,20 +15,10 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 from merge_runner.trial import play_trial
+from tests.support.braking import deciding
 
 HEAD = 'repetitions = 1\nconditions = ["N_0_0"]\n'
-DRIVER = """
-from merge_runner.plugin import PROGRAMS, Program
-
-class Braking:
-    def __init__(self, context):
-        self.context = context
-
-    async def decide(self, observation, number):
-        return self.context.held({action})
-
-PROGRAMS.register("braking", Program(Braking, "brakes"))
-"""
+HELD = "return self.context.held(-0.2)"
 
 
 def prompt(plan, variant):
@@ -132,8 +122,8 @@ def test_an_own_condition_is_played_and_another_mean_speed_is_another_spec(plan_
 
 def test_a_plug_in_beside_the_study_drives_and_another_revision_is_another_driver(plan_of):
     text = '[plugins]\nfiles = ["mine.py"]\n'
-    hashes, plain = [], DRIVER.format(action=-0.2)
-    revised = plain.replace("class Braking:\n", "class Braking:\n    revision = 2\n")
+    hashes, plain = [], deciding(HELD)
+    revised = deciding(HELD, within="revision = 2")
     for plugin in (plain, f"# why\n{plain}", revised):
         plan = plan_of(text, ["braking"], plugin=plugin)
         hashes.append(plan.trial_specs()[0].spec_hash)
@@ -157,22 +147,6 @@ def test_what_a_plug_in_imports_is_no_part_of_its_study(plan_of, tmp_path, monke
     assert [*colours] == ["elsewhere"]
 
 
-SIBLING = """
-from merge_runner.plugin import PROGRAMS, Program
-
-class Braking:
-    def __init__(self, context):
-        self.context = context
-
-    async def decide(self, observation, number):
-        from .strength import STRENGTH
-        from {package} import more
-        return self.context.held(STRENGTH * more.FACTOR)
-
-PROGRAMS.register("braking", Program(Braking, "brakes"))
-"""
-
-
 def first_action(plan):
     trial = TrialMaker(plan).make(plan.trial_specs()[0])
     return play_trial(trial, None).decisions[0].decision.applied[0]
@@ -187,11 +161,12 @@ def test_what_a_function_of_a_plug_in_imports_is_imported_when_it_is_called(
     (package / "__init__.py").touch()
     (package / "more.py").write_text("FACTOR = 0.5\n")
     monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
+    late = f"from .strength import STRENGTH\nfrom {package.name} import more\n"
+    late += "return self.context.held(STRENGTH * more.FACTOR)"
     plans, files = {}, '[plugins]\nfiles = ["strength.py", "mine.py"]\n'
     for strength in (-0.2, -0.4):
         (tmp_path / "strength.py").write_text(f"STRENGTH = {strength}\n")
-        plugin = SIBLING.format(package=package.name)
-        plans[strength] = plan_of(files, ["braking"], plugin=plugin)
+        plans[strength] = plan_of(files, ["braking"], plugin=deciding(late))
     assert package.name not in sys.modules
     assert {strength: first_action(plan) for strength, plan in plans.items()} == {
         strength: strength * 0.5 for strength in plans
@@ -228,7 +203,7 @@ def test_a_package_that_plug_ins_import_drives_in_all_studies_of_a_process(
     package = tmp_path / f"drivers_{len(words)}"
     package.mkdir()
     (package / "__init__.py").touch()
-    (package / "drivers.py").write_text(DRIVER.format(action=-0.2))
+    (package / "drivers.py").write_text(deciding(HELD))
     for text in ("", "", "# another study\n"):
         plugin = words.format(package.name)
         plan = plan_of(f'{text}[plugins]\nfiles = ["mine.py"]\n', ["braking"], plugin=plugin)

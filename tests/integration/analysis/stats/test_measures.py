@@ -71,6 +71,7 @@ def test_the_measures_of_random_trials_are_those_of_the_recomputation(stored):
 def test_the_windows_of_the_speed_deviation_end_where_they_say(stored):
     db, records = stored
     found = load("SELECT * FROM speed_deviations", db).set_index(["trial_id", "time_window"])
+    of_trials = load("SELECT * FROM trial_metrics", db).set_index("trial_id")
     sides = ["rmse_left_mps", "rmse_right_mps"]
     for record in records:
         if record.status != "finished":
@@ -85,6 +86,8 @@ def test_the_windows_of_the_speed_deviation_end_where_they_say(stored):
             expected = np.sqrt((apart**2).mean(axis=0))
             row = found.loc[(record.spec.trial_id, name), sides].to_numpy(float)
             assert row == pytest.approx(expected), name
+            if name == "first_merge":
+                assert [*of_trials.loc[record.spec.trial_id, sides]] == [*row]
         assert ((record.spec.trial_id, "both_merges") in found.index) == both
 
 
