@@ -51,6 +51,7 @@ LIKENESS = {
                  "who goes first side by side"),
     "gap": ("leave gaps like people's", "the gap"),
 }  # fmt: skip
+DIFFER = ("differs from people", "differ from people")
 # Where two equal drivers met, who goes first is counted for the left vehicle.
 LEFT_GOES_FIRST = "left vehicle goes first"
 # Sentence parts: a driver has more than another, has less, or no difference is shown in it.
@@ -106,7 +107,7 @@ def sentence(verdicts: Mapping[str, Values]) -> str:
     """Return a few sentences that compare a driver with people: crashes, then measures."""
     if "" in verdicts:
         return f"{capital(verdicts['']['note'])}."
-    parts = [crashes(verdicts["collisions"]), *map(_part, verdicts.values())]
+    parts = [crashes(verdicts["collisions"]), *map(clause, verdicts.values())]
     unclear = [
         MEASURES[name].label
         for name in ("headway", "velocity", "collisions", "gap")
@@ -118,7 +119,7 @@ def sentence(verdicts: Mapping[str, Values]) -> str:
     return f"{text or 'Nothing can be compared with people'}."
 
 
-def _part(values: Values) -> str:
+def clause(values: Values) -> str:
     """Return the sentence part on a measure's state; empty where there is none."""
     says = MEASURES[str(values["measure"])].says.get(shown_state(values), "")
     of, humans = (number(values.get(name)) for name in ("estimate", "human"))
@@ -341,7 +342,12 @@ def _tally(drivers: Sequence[Mapping[str, Values]]) -> str:
         else:
             who = " drivers" * (not like)
             few = " with enough trials" * (not like and len(states) < len(drivers))
-            like.append(f"{states.count(SHOWN) or 'none'} of {len(states)}{who}{few} {does}")
+            alike, open_ = states.count(SHOWN), states.count(OPEN)
+            differing = len(states) - alike - open_
+            says = f"{alike or 'none'} of {len(states)}{who}{few} {does}"
+            if open_ and not alike:
+                says = f"{differing} of {len(states)}{who}{few} {DIFFER[differing > 1]} in {what}"
+            like.append(f"{says} (cannot tell: {open_})" if open_ else says)
     if not (like or unclear):
         return f"For {len(drivers)} drivers no verdict on likeness to people is possible."
     parts = [f"{'; '.join(like)}."] if like else []
@@ -455,7 +461,7 @@ def difference_sentence(values: Values, it: str) -> str:
     driver, people = values.get("counted"), values.get("human_counted")
     if driver is None or people is None:
         if measure.name in {"headway", "velocity"}:
-            return _part(values)
+            return clause(values)
         driver = with_interval(values["estimate"], values["ci"])
         people = with_interval(values["human"], values["human_ci"])
         if measure.name == "collisions":

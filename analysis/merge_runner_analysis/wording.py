@@ -44,7 +44,11 @@ VERDICTS = {
     OPEN: "cannot tell",
 }
 TENDENCY = "same tendency as people"  # its sign alone, and no difference in size is shown
-OF_TRAIT = {SHOWN: TENDENCY, WEAKER: "less than with people", STRONGER: "more than with people"}
+OF_TRAIT = {
+    SHOWN: TENDENCY,
+    WEAKER: "weaker tendency than people's",
+    STRONGER: "stronger tendency than people's",
+}
 DIRECTIONS = {
     **dict.fromkeys(("headway", "velocity", "gap-headway"), OF_TRAIT),
     "collisions": {WEAKER: "fewer than people's", STRONGER: "more than people's"},
@@ -56,8 +60,8 @@ VERDICT_RULES = (
     "Same tendency as people (who goes first): the one ahead or, side by side, the slower "
     "one goes first more often, with p below .05 in a logistic regression (Firth) over all trials "
     "without a crash, not by the counts; and no difference is shown",
-    "More, less, fewer, larger or smaller: a difference is shown, with p below .05, corrected "
-    "(Holm) for all tests of a driver{tests}; in who goes first, of that regression's slopes",
+    "More, fewer, larger, smaller, weaker or stronger: a difference is shown, with p below .05, "
+    "corrected (Holm) for all tests of a driver{tests}; of a tendency, in that regression's slope",
     "Cannot tell: neither is shown",
     f"No verdict: fewer than {ENOUGH} trials are counted, or fewer than half of those that ended",
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
-from math import isinf
+from math import isinf, tanh
 from textwrap import shorten
 
 from merge_runner.study.arms import PROMPT
@@ -304,7 +304,10 @@ def _planted(study: StudyResults) -> list[str]:
     for factor, levels in texts.items():
         for level, text in levels.items():
             if more := text.emulator.own_first:
-                planted.append(f"{factor}={level} changes the log-odds of going first by {more:+g}")
+                # The logistic function is steepest about 0.
+                most = f"{100 * tanh(more / 4):+.0f} points where it is even without, else less"
+                changes = f"changes the log-odds of going first by {more:+g} ({most})"
+                planted.append(f"{factor}={level} {changes}")
             if gap_m := text.emulator.gap_m:
                 planted.append(f"{factor}={level} adds {gap_m:g} m to the gap that drivers aim at")
     return planted

@@ -151,6 +151,7 @@ def _driver_rows(study: StudyResults, group: Group) -> Iterator[Row]:
         words = {
             "ended": crashes.n + (crashes.undecided or 0),
             "from_humans": "yes" if from_humans else None,
+            "equal": group.equal or None,
         }
         values = {**row.values, **words}
         if not has_verdict(values):  # what could have been seen is of no use then

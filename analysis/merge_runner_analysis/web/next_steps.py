@@ -29,6 +29,7 @@ REPEATED = (
     "Add situations, or another driver"
 )
 FEW = f"{{}}: fewer than {ENOUGH} counted trials. Add repetitions"
+UNASKED = ("--yes", "--quiet")  # of a rehearsal, not of a run that costs money
 UNSHOWN = "No effect is shown. Estimate how many trials one would need"
 
 
@@ -47,7 +48,7 @@ def next_steps(
 
     steps = []
     if is_rehearsal(drivers):
-        of_any = without("--model", sweep)
+        of_any = [word for word in without("--model", sweep) if word not in UNASKED]
         steps.append((REHEARSED, shlex.join([program, *of_any, "--model", "MODEL", "--dry-run"])))
     judged = [driver for driver in drivers if driver.cells]
     few = [of for of in judged if not has_verdict(of.cells["collisions"].values)]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
-from merge_runner_analysis.headlines import share
+from merge_runner_analysis.headlines import clause, share
 from merge_runner_analysis.stats.score_interval import wilson
 from merge_runner_analysis.web.effect_rows import unbroken
 from merge_runner_analysis.web.judged import Driver
@@ -16,7 +16,6 @@ from merge_runner_analysis.wording import (
     DIFFERS,
     HEADINGS,
     MARGINS,
-    MEASURES,
     OPEN,
     PLAYED_RULES,
     RULES_MEAN,
@@ -55,13 +54,13 @@ class Likeness:
 
 
 def other_differences(driver: Driver) -> str:
-    """Return in which measures without a column a driver is shown to differ from people."""
-    labels = [
-        MEASURES[name].label
+    """Return how a driver is shown to differ from people in measures without a column."""
+    clauses = [
+        clause(cell.values)
         for name, cell in driver.cells.items()
         if name not in HEADINGS and shown_state(cell.values) in DIFFERS
     ]
-    return f"also differs in {joined(labels)}" if labels else ""
+    return "; ".join(clauses)
 
 
 def likeness_of(driver: Driver) -> dict[str, Likeness]:
@@ -83,6 +82,16 @@ def counted(driver: Driver, conditions: Mapping[str, Any]) -> str:
     }
     why = ", ".join(f"{k} {reason}" for reason, k in reasons.items() if k)
     return f"{shared - repeats} counted; not counted: {why}" if why else ""
+
+
+def equal_trials(drivers: Sequence[Driver], short: Mapping[str, str]) -> str:
+    """Return of which drivers most trials went as an earlier one, and count all the same."""
+    counts = [
+        (short[of.name], of.cells["collisions"].values.get("equal") or 0, of.facts["trials"])
+        for of in drivers
+        if of.cells and of.facts
+    ]
+    return joined([f"{k} of {n} trials of {name}" for name, k, n in counts if 2 * k > n])
 
 
 def repeated(driver: Driver, conditions: Mapping[str, Any]) -> tuple[int, int]:

@@ -10,6 +10,7 @@ from merge_runner_analysis.web.next_steps import is_found, next_steps, without
 from merge_runner_analysis.web.people import (
     could_see,
     counted,
+    equal_trials,
     gap_weights,
     likeness_of,
     other_differences,
@@ -175,7 +176,7 @@ TYPED = ["sweep", "s.toml", "--model", "emulator", "--yes"]
             MOCK,
             TYPED,
             [
-                ("This was a rehearsal", "m sweep s.toml --yes --model MODEL --dry-run"),
+                ("This was a rehearsal", "m sweep s.toml --model MODEL --dry-run"),
             ],
         ),
         (
@@ -200,7 +201,7 @@ TYPED = ["sweep", "s.toml", "--model", "emulator", "--yes"]
             played(trials=110, n=110, ended=(110, 0)),
             MOCK,
             TYPED,
-            [("This was", "m sweep s.toml --yes --mo")],
+            [("This was", "m sweep s.toml --mo")],
         ),
     ],
 )
@@ -226,7 +227,8 @@ def test_an_option_is_left_out_of_a_command_however_it_was_typed():
 def test_a_difference_in_a_measure_without_a_column_is_named_in_the_row():
     apart = {"state": STRONGER, "n": 110, "ended": 110}
     shown = driver("a", **{"gap": apart, "gap-headway": apart})
-    assert other_differences(shown) == "also differs in gap, by who is ahead"
+    more = "each metre that one is ahead adds more to its gap than to people's"
+    assert other_differences(shown) == more
     assert other_differences(driver("a", gap=apart)) == ""
 
 
@@ -237,3 +239,13 @@ def test_a_difference_in_a_measure_without_a_column_is_named_in_the_row():
 def test_a_difference_from_people_is_found_where_no_mock_model_drove(state, kind, is_so):
     values = {"measure": "headway", "state": state, "n": 110, "ended": 110}
     assert is_found([replace(driver("a", headway=values), kind=kind)], None) is is_so
+
+
+def test_drivers_most_of_whose_trials_went_as_an_earlier_one_are_named_with_their_counts():
+    facts = {"trials": 110, "ended": 110}
+    of = {"state": STRONGER, "n": 110, "ended": 110}
+    most, half = (
+        replace(driver(name, collisions=of | {"equal": equal}), facts=facts)
+        for name, equal in (("a", 99), ("b", 55))
+    )
+    assert equal_trials([most, half], NAMES) == "99 of 110 trials of a"

@@ -17,6 +17,7 @@ from merge_runner_analysis.web.people import (
     UNPOSED,
     could_see,
     counted,
+    equal_trials,
     gap_weights,
     likeness_of,
     other_differences,
@@ -31,7 +32,10 @@ from merge_runner_analysis.wording import HEADINGS, LANGUAGE_MODEL, MOCK, PROGRA
 
 FACTOR_TABLES = ("effects", "levels")  # of what a study's factors change
 # Kinds of drivers whose identical trials count once.
-ONCE = {PROGRAM: "program", MOCK: "mock model"}
+ONCE = {
+    PROGRAM: "Identical trials of a program count once.",
+    MOCK: "Trials of a mock model that differ only in words it does not read count once.",
+}
 DRAWN = "draws who goes first as people do"  # the emulator
 Jobs = list[Job]
 
@@ -98,9 +102,8 @@ def _beside_people(
         ],
         "verdict_rules": verdict_rules(drivers, gap.values if gap else {}),
         "gap_weights": gap_weights(drivers, short),
-        "kinds_once": " or ".join(
-            f"a {text}" for kind, text in ONCE.items() if by_kind(drivers)[kind]
-        ),
+        "count_once": [text for kind, text in ONCE.items() if by_kind(drivers)[kind]],
+        "equal_trials": equal_trials(drivers, short),
         "is_undecided": is_undecided,
         "notes": noted(drivers, headings, unposed),
         "likeness_headings": HEADINGS,
