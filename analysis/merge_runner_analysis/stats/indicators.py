@@ -31,7 +31,7 @@ from merge_runner_analysis.stats.regressions import Regression
 from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.wording import ALPHA, INDICATORS, Fact, Why
 
-AT_ONCE = 2_500  # trials whose samples are in memory together
+AT_ONCE = 4_000  # trials whose samples are in memory together
 PUBLISHED, BY_EYE = Fact(Why.NO_TRACES), Fact(Why.BY_EYE)
 # By indicator: the term that decides it, and the sign that it needs; I4's is to have no effect.
 TESTED = {
