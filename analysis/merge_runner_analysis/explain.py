@@ -167,10 +167,8 @@ def _rows(group: Group, rests_on: str) -> list[tuple[Any, str, str, str]]:
     """Return label, trial, spec and condition of the trials that rows of a table may rest on."""
     known = {STORED: group.trials, ENDED: group.ended, FINISHED: group.finished}
     rows = known.get(rests_on, group.trials)
-    if rests_on not in known:
-        rows = rows[rows[rests_on].notna()]
-    columns = (rows[name] for name in (*KEYS, "condition"))
-    return [*zip(rows.index, *columns, strict=True)]
+    counted = slice(None) if rests_on in known else rows[rests_on].notna()
+    return [*rows.loc[counted, [*KEYS, "condition"]].itertuples(name=None)]
 
 
 def _query(group: Group, trials: Sequence[str]) -> str:

@@ -28,7 +28,7 @@ from merge_runner_analysis.figures.style import (
     wrapped,
 )
 from merge_runner_analysis.frames import KEYS
-from merge_runner_analysis.grouping import Group, of_trials
+from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.published import HUMAN, published
 from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.intervals import mean, proportion
@@ -164,16 +164,15 @@ def _played(study: StudyResults, group: Group) -> Group:
 
 
 @remembered
-def left_traces(study: StudyResults, group: Group, first: str) -> dict[float, list[Array]]:
-    """Return times in s and left speeds in m/s by velocity, where ``first`` merged first."""
-    if not group.measured:
-        return {}
-    trials = group.finished[group.finished["merged_first"] == first]
-    velocities = trials.set_index(KEYS)["relative_velocity_mps"].to_dict()
-    traces: dict[float, list[Array]] = {}
-    for row in of_trials(study.read(EGO_SPEEDS), trials).itertuples():
-        velocity = float(velocities[row.trial_id, row.spec_hash])
-        traces.setdefault(velocity, []).append(np.column_stack([row.time_s, row.velocity_mps]))
+def left_traces(study: StudyResults, group: Group) -> dict[tuple[str, float], list[Array]]:
+    """Return times in s and left speeds in m/s by who merged first and by velocity."""
+    traces: dict[tuple[str, float], list[Array]] = {}
+    if group.measured:
+        speeds = study.read(EGO_SPEEDS)
+        trials = group.finished[[*KEYS, "merged_first", "relative_velocity_mps"]]
+        for row in speeds.merge(trials, on=KEYS).itertuples():
+            key = (row.merged_first, row.relative_velocity_mps)
+            traces.setdefault(key, []).append(np.column_stack([row.time_s, row.velocity_mps]))
     return traces
 
 
@@ -186,11 +185,11 @@ def published_gap_line(velocity_mps: float) -> tuple[Array, Array]:
 
 
 def _draw_traces(axis: Axes, study: StudyResults, group: Group, first: str, styles: Styles) -> None:
-    traces = left_traces(study, group, first)
+    traces = left_traces(study, group)
     lines = [
         (line, look["color"])
         for velocity, look in styles.items()
-        for line in traces.get(velocity, ())
+        for line in traces.get((first, velocity), ())
     ]
     if not lines:
         _say(axis, "no such trial" if group.measured else MISSING)

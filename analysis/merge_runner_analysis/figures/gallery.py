@@ -11,6 +11,7 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from merge_runner.errors import UsageError
+from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.figures.effects import effects_figure
 from merge_runner_analysis.figures.figure2 import figure2
@@ -58,5 +59,10 @@ def rendered(study: StudyResults, name: str, form: Form) -> bytes:
     """Return a figure as a file, without a date, so that equal results give equal bytes."""
     out = io.BytesIO()
     with mpl.rc_context(SETTINGS):
-        MAKERS[name](study).savefig(out, format=form, metadata=METADATA[form])
+        _drawn(study, name).savefig(out, format=form, metadata=METADATA[form])
     return out.getvalue()
+
+
+@remembered
+def _drawn(study: StudyResults, name: str) -> Figure:
+    return MAKERS[name](study)

@@ -5,9 +5,12 @@ from __future__ import annotations
 import re
 from typing import Any
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.markers import TICKDOWN
 from numpy.typing import NDArray
 
 from merge_runner_analysis.stats.estimate import Estimate
@@ -54,7 +57,8 @@ def wrapped(text: str, width: int) -> str:
 def place(figure: Figure, grid: NDArray[Any] = NO_GRID) -> None:
     """Lay a figure out once: matplotlib would do so at each drawing, and draw it once more.
 
-    The inner panels of a ``grid`` with shared scales are aligned with the outer ones.
+    The inner panels of a ``grid`` with shared scales are aligned with the outer ones. The ticks of
+    an x axis that has no labels are one line: each axis takes as long to draw as all else.
     """
     inner = grid[1:-1, 1:]
     for panel in inner.flat:
@@ -66,6 +70,12 @@ def place(figure: Figure, grid: NDArray[Any] = NO_GRID) -> None:
     for (row, column), panel in np.ndenumerate(inner):
         above, left = (other.get_position() for other in (grid[0, column + 1], grid[row + 1, 0]))
         panel.set_position((above.x0, left.y0, above.width, left.height))
+    look: Style = {"ls": "", "color": "black", "marker": TICKDOWN, "clip_on": False}
+    look |= {"ms": mpl.rcParams["xtick.major.size"], "mew": mpl.rcParams["xtick.major.width"]}
+    for panel in grid[:-1].flat:
+        ticks, at = panel.xaxis.get_majorticklocs(), panel.get_xaxis_transform("tick1")
+        panel.add_artist(Line2D(ticks, 0 * ticks, transform=at, **look))
+        panel.xaxis.set_visible(False)
 
 
 def draw_points(
@@ -76,8 +86,10 @@ def draw_points(
         (place + shift, estimate.value, estimate.low, estimate.high) for place, estimate in points
     ]
     places, values, low, high = np.array(rows, dtype=float).reshape(-1, 4).T
-    errors = np.nan_to_num(np.vstack([values - low, high - values]))
-    at: Style = {"x": places, "y": values, "yerr": errors}
-    if horizontal:
-        at = {"x": values, "y": places, "xerr": errors}
-    axis.errorbar(**at, elinewidth=0.7, capsize=1.5, mew=0.8, **style)
+    # Each interval is a stroke with a cap at both ends: ``errorbar`` takes three times as long.
+    ends = np.column_stack([low, high, np.full_like(low, np.nan)]).ravel()
+    caps: Style = {"ms": 3, "mew": 0.8, "marker": "|" if horizontal else "_"}
+    strokes: Style = {"lw": 0.7, "solid_capstyle": "butt", "color": style["color"], **caps}
+    marks = style | {"mew": 0.8}
+    for x, y, look in ((np.repeat(places, 3), ends, strokes), (places, values, marks)):
+        axis.plot(*((y, x) if horizontal else (x, y)), **look)

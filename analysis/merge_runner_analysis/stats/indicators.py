@@ -19,7 +19,6 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from merge_runner.records import SIDES
 from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.frames import KEYS, SPEEDS, read
 from merge_runner_analysis.grouping import Group, of_trials
@@ -32,6 +31,7 @@ from merge_runner_analysis.stats.regressions import Regression
 from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.wording import ALPHA, INDICATORS, Fact, Why
 
+AT_ONCE = 4_000  # trials whose samples are in memory together
 PUBLISHED, BY_EYE = Fact(Why.NO_TRACES), Fact(Why.BY_EYE)
 # By indicator: the term that decides it, and the sign that it needs; I4's is to have no effect.
 TESTED = {
@@ -83,9 +83,13 @@ def profiles(study: StudyResults, group: Group) -> pd.DataFrame:
 
 @remembered
 def _all_profiles(study: StudyResults) -> pd.DataFrame:
-    # One side after the other: the samples of all vehicles take the most memory of all tables.
-    sides = (read(study.db, f"FROM ({SPEEDS}) WHERE side = '{side}'") for side in SIDES)
-    return pd.concat(map(measure_profiles, sides)).sort_values(KEY, ignore_index=True)
+    # Part after part: the samples of all vehicles take the most memory of all tables.
+    parts = len(study.frames.trials) // AT_ONCE + 1
+    speeds = (
+        read(study.db, f"FROM ({SPEEDS}) WHERE hash(trial_id) % {parts} = {part}")
+        for part in range(parts)
+    )
+    return pd.concat(map(measure_profiles, speeds)).sort_values(KEY, ignore_index=True)
 
 
 @remembered

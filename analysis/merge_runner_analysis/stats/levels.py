@@ -134,8 +134,9 @@ def _with_cells(groups: Sequence[Group], apart_from: set[str]) -> Group:
     for group in groups:
         others = [f"{n}={level}" for n, level in group.levels.items() if n not in apart_from]
         others += [group.mark.strip()] * bool(group.mark)  # another setting of the task
-        cells = [(condition, *others) for condition in group.trials["condition"]]
-        cells_of = pd.Series(cells, group.trials.index, dtype=object)
+        conditions = group.trials["condition"]
+        cells = {condition: (condition, *others) for condition in conditions.unique()}
+        cells_of = pd.Series([*map(cells.get, conditions)], group.trials.index, dtype=object)
         parts.append(group.trials.assign(cell=cells_of, group=group.id))
     return replace(groups[0], trials=pd.concat(parts, ignore_index=True))
 

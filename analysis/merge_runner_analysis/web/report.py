@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import datetime
 from difflib import unified_diff
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -21,11 +20,11 @@ from merge_runner.prompts.blocks import BASELINE, title_of
 from merge_runner.records import NO_DECISION
 from merge_runner.results.database import read_database
 from merge_runner.results.provenance import program
-from merge_runner_analysis.cache import cached, digest_of
+from merge_runner_analysis.cache import cache_finished, digest_of, finished
 from merge_runner_analysis.explain import Source, sources_of, sql_command
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.figures.gallery import rendered, write_figures
-from merge_runner_analysis.frames import KEYS, load
+from merge_runner_analysis.frames import KEYS
 from merge_runner_analysis.grouping import levels_of
 from merge_runner_analysis.headlines import sentences
 from merge_runner_analysis.provenance import Provenance, provenance, tally
@@ -111,16 +110,16 @@ def write_report(
 
 def finished_figures(study: StudyResults, say: Callable[[str], object] = str) -> dict[str, str]:
     """Return every figure by name as SVG in Base64: the stored one, else a new drawing."""
-
-    def draw(name: str) -> str:
-        say(f"drawing {name}")
-        return base64.b64encode(rendered(study, name, "svg")).decode()
-
-    return {
-        # A table may have the name alone.
-        name: cached(study.db, study.state, study.options, f"{name}.svg", partial(draw, name))
-        for name in FIGURES
-    }
+    files = {name: f"{name}.svg" for name in FIGURES}  # a table may have the name alone
+    figures = finished(study.db, study.state, study.options, [*files.values()])
+    drawn = {}
+    for name, file in files.items():
+        if file not in figures:
+            say(f"drawing {name}")
+            drawn[file] = base64.b64encode(rendered(study, name, "svg")).decode()
+    if drawn:
+        cache_finished(study.db, study.state, study.options, drawn)
+    return {name: (figures | drawn)[file] for name, file in files.items()}
 
 
 def report_html(study: StudyResults, tables: list[Table], figures: dict[str, str]) -> str:
@@ -246,7 +245,7 @@ def design(study: StudyResults) -> tuple[list[str], dict[str, list[str]], dict[s
     Levels are by factor, then conditions and trials; prompts have by title the
     text of the first one, of variants the lines that differ from the baseline's.
     """
-    described, shown_to = load(DESCRIPTIONS, study.db), load(PROMPTS, study.db)
+    described, shown_to = study.read(DESCRIPTIONS), study.read(PROMPTS)
     played, levels = study.played, levels_of(study.played, study.order)
     levels.pop("model", None)  # the drivers say it
     specs = {name for group in played for name in group.trials["spec_hash"]}

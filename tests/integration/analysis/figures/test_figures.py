@@ -5,6 +5,7 @@ from dataclasses import replace
 from itertools import combinations
 
 import matplotlib as mpl
+import numpy as np
 import pytest
 from matplotlib.text import Text
 from matplotlib.transforms import Bbox
@@ -59,7 +60,9 @@ def test_traces_are_those_of_the_left_vehicle_that_merges_first_or_second(study)
             f"spec_hash = 'o3-baseline' AND merged_first = '{first}' GROUP BY trial_id",
             study.db,
         )
-        found = [t for traces in left_traces(study, group, first).values() for t in traces]
+        found = [
+            t for at, some in left_traces(study, group).items() for t in some if at[0] == first
+        ]
         assert sorted(tuple(trace[:, 1]) for trace in found) == sorted(tuple(v) for v in rows["v"])
         assert all(trace[0, 0] == 0 for trace in found)
 
@@ -68,6 +71,11 @@ OWN = (
     "UPDATE trials SET condition = 'own_' || rep, projected_headway_m = 8, "
     "relative_velocity_mps = 10 + rep WHERE condition = 'L_4_8'"
 )
+
+
+def marks(axis):
+    """The lines of estimates in a panel: intervals and ticks are others."""
+    return [line for line in axis.lines if line.get_markerfacecolor() == "white"]
 
 
 def drawn(study, name="figure2"):
@@ -106,7 +114,7 @@ def test_conditions_that_were_not_played_are_not_drawn(tmp_path):
     assert {*study.conditions} == {"N_0_0", "L_4_0"}
     (human, _), keys = drawn(study)
     assert len(keys) == 1 + 2, "one relative velocity, and how humans are shown"
-    assert sorted({round(x) for line in human[2].lines for x in line.get_xdata()}) == [0, 4]
+    assert sorted({round(x) for line in marks(human[2]) for x in line.get_xdata()}) == [0, 4]
     assert rendered(study, "figure2", "svg").startswith(b"<?xml"), "a dollar is no formula"
     humans = StudyResults(write_study(tmp_path / "h.duckdb", []))
     assert {*humans.conditions} == {*HUMAN_CONDITIONS}
@@ -175,14 +183,17 @@ def test_each_group_has_a_row_of_its_own_by_the_same_scales(study):
         for axis, summary in zip(row[2:], (left_first, gap, deviation), strict=True):
             for index, velocity in enumerate(HUMAN_VELOCITIES_MPS):
                 found = points(group, velocity, summary)
-                line = axis.containers[index].lines[0]
+                line = marks(axis)[index]
                 assert list(line.get_ydata()) == [estimate.value for _, estimate in found]
+                ends = axis.lines[axis.lines.index(line) - 1].get_ydata()
+                known = [end for _, one in found for end in (one.low, one.high) if end is not None]
+                assert list(ends[~np.isnan(ends)]) == known
                 assert line.get_xdata() == pytest.approx([x + 0.3 * (index - 1) for x, _ in found])
     human = rows[0]
     missing = [any("not imported" in t.get_text() for t in axis.texts) for axis in human]
     assert missing == [True, True, False, False, True]
     assert dashed(human[3]) == 3
-    assert sum(len(c.lines[0].get_xdata()) for c in human[2].containers) == len(CONDITIONS)
+    assert sum(len(line.get_xdata()) for line in marks(human[2])) == len(CONDITIONS)
 
 
 @pytest.mark.parametrize(
