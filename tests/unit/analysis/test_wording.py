@@ -149,8 +149,8 @@ NONE = "No language model drove here."
                 "Of the 3 programs with enough trials d0 (it was made from the human data) is most "
                 "like people: it agrees with them in 1 of 4 measures, and is shown to differ in "
                 "none. Most crashes: d3 crashed in 9 of 21 trials.",
-                "2 of 2 drivers with enough trials let the one ahead go first, as people do; none "
-                "of 2 leave gaps like people's. Cannot tell: crashes. No "
+                "2 of 2 drivers with enough trials let the one ahead go first, as people do; 1 "
+                "of 2 differs from people in the gap (cannot tell: 1). Cannot tell: crashes. No "
                 "verdict on who goes first side by side. Without a verdict: d2 crashed in 11 of 11 "
                 f"trials. {NONE}",
             ],

@@ -226,7 +226,7 @@ def test_an_option_is_left_out_of_a_command_however_it_was_typed():
 
 def test_a_difference_in_a_measure_without_a_column_is_named_in_the_row():
     apart = {"state": STRONGER, "n": 110, "ended": 110}
-    shown = driver("a", **{"gap": apart, "gap-headway": apart})
+    shown = driver("a", **{"gap": apart, "gap-headway": apart | {"measure": "gap-headway"}})
     more = "each metre that one is ahead adds more to its gap than to people's"
     assert other_differences(shown) == more
     assert other_differences(driver("a", gap=apart)) == ""
