@@ -11,8 +11,8 @@ from merge_runner_analysis.explain import explain
 from merge_runner_analysis.provenance import provenance, tally
 from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables.attempts import attempts
-from merge_runner_analysis.web.catalogue import Catalogue
 from merge_runner_analysis.web.runs import list_runs
+from merge_runner_analysis.web.trial_index import TrialIndex
 from tests.support.studies import Drive, Said, write_study
 
 SERVED = ("another", "o3", "o3-2025", "o3-2026", "it's")
@@ -48,10 +48,10 @@ def test_all_that_tell_of_other_models_tell_the_same(db):
     assert sorted(provenance(db).mismatches.served) == OTHERS
     found = [finding.text for finding in findings if finding.kind == "served"]
     assert sorted(text.split(": ")[0] for text in found) == [f"o3 -> {name}" for name in OTHERS]
-    catalogue = Catalogue(db)
-    *_, run = list_runs(catalogue)
+    trial_index = TrialIndex(db)
+    *_, run = list_runs(trial_index)
     assert run["row"]["others"] == len(OTHERS)
-    causes = [cause for cause, _ in catalogue.facets({})["cause"]]
+    causes = [cause for cause, _ in trial_index.facets({})["cause"]]
     assert [c for c in causes if c.startswith("model: ")] == [f"model: o3 → {n}" for n in OTHERS]
 
 

@@ -141,20 +141,22 @@ def explorer(site: Site) -> Starlette:
     )
 
 
-def _page(site: Site, render: Callable[..., str | Response], asked: Request) -> Response:
+def _page(site: Site, render: Callable[..., str | Response], request: Request) -> Response:
     if site.beginning:
         text = site.render("message.html", heading="Reading the trials", text=FIRST_TIME, view="")
         return HTMLResponse(text, headers={"refresh": "1"})  # in s
     site.refresh()
-    rendered = render(site, *asked.path_params.values(), asked.query_params)
+    rendered = render(site, *request.path_params.values(), request.query_params)
     return HTMLResponse(rendered) if isinstance(rendered, str) else rendered
 
 
-def _redirect(asked: Request) -> Response:
+def _redirect(request: Request) -> Response:
     """Lead from a name that a reader may type to the page, which keeps the rest of the address."""
-    typed, _, name = asked.scope["path"].removeprefix("/").partition("/")
+    typed, _, name = request.scope["path"].removeprefix("/").partition("/")
     page = "/".join(filter(None, (ALIASES[typed], name)))
-    return RedirectResponse(f"/{quote(page)}" + (f"?{asked.url.query}" if asked.url.query else ""))
+    return RedirectResponse(
+        f"/{quote(page)}" + (f"?{request.url.query}" if request.url.query else "")
+    )
 
 
 # Functions that render the pages, from the names and the query of an address.
@@ -166,10 +168,10 @@ PAGES: dict[str, Callable[..., str | Response]] = {
     "/sweeps": sweep.sweeps_page,
     "/sweeps/{name:path}": sweep.sweep_page,
     "/trials": trials.trials_page,
-    "/trials/": lambda site, asked: RedirectResponse(site.at.to("trials", **asked)),
+    "/trials/": lambda site, params: RedirectResponse(site.at.to("trials", **params)),
     "/trials.csv": trials.trials_csv,
     "/trials/{name:path}": trial.trial_page,
-    "/others/{name:path}": lambda *asked: JSONResponse(trial.others(*asked)),
+    "/others/{name:path}": lambda *given: JSONResponse(trial.others(*given)),
     "/glossary": lambda site, _: site.render("glossary.html", view="glossary", glossary=sections()),
     "/tables": tables.tables_page,
     "/tables/{name}.{suffix}": tables.table_file,

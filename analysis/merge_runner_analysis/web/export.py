@@ -27,7 +27,6 @@ from merge_runner_analysis.cache import stamp_of
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.tables import TABLES
 from merge_runner_analysis.web.app import LOOPBACK, explorer
-from merge_runner_analysis.web.catalogue import FACETS
 from merge_runner_analysis.web.computing import processes
 from merge_runner_analysis.web.leaks import check_leaks
 from merge_runner_analysis.web.listing import FACTOR
@@ -35,6 +34,7 @@ from merge_runner_analysis.web.pages.trial import READ_AT_ONCE, trial_pages
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.rendering import STYLE, inlined_texts, policy_of
 from merge_runner_analysis.web.site import REPLAY, SCOPE, Site
+from merge_runner_analysis.web.trial_index import FACETS
 from merge_runner_analysis.web.urls import Links, query_of
 
 MOST = 1_000  # trials of drivers; of humans there are at most 990
@@ -89,7 +89,7 @@ def export_folder(
     site = Site(db, _links(heads), policy=POLICY)
     with _opened(site, patterns) as rows, _staged(folder) as stage:
         if patterns:
-            site.catalogue.keep([row["number"] for row in rows])
+            site.trial_index.keep([row["number"] for row in rows])
         else:
             # All that pages wait for; what takes long comes last.
             figures = (("figure", name, "svg") for name in FIGURES)
@@ -110,9 +110,9 @@ def export_page(db: Path, file: Path, patterns: Sequence[str]) -> Path:
     def leads(address: str) -> str:
         """Return the address of a trial that the page holds; empty for all others."""
         parts = urlsplit(address)
-        trial, asked = unquote(parts.path.removeprefix("/trials/")), dict(parse_qsl(parts.query))
-        is_there = (trial, asked.get("spec", "")) in shown
-        return query_of({"trial": trial, **asked}) if is_there else ""
+        trial, params = unquote(parts.path.removeprefix("/trials/")), dict(parse_qsl(parts.query))
+        is_there = (trial, params.get("spec", "")) in shown
+        return query_of({"trial": trial, **params}) if is_there else ""
 
     inlined = inlined_texts([STYLE, *SCRIPTS])
     site = Site(db, Links(leads), policy=policy_of(inlined), inlined=inlined)
@@ -239,8 +239,8 @@ def _links(heads: tuple[str, ...]) -> Links:
 def _still(db: Path, heads: tuple[str, ...]) -> Site:
     """Return the site of a process that helps."""
     site = Site(db, _links(heads), policy=POLICY, is_still=True)
-    site.catalogue.refresh()
-    site.catalogue.ask("SET threads = 1")  # there are several of these
+    site.trial_index.refresh()
+    site.trial_index.ask("SET threads = 1")  # there are several of these
     return site
 
 
@@ -258,11 +258,11 @@ def _page_of(address: str, heads: tuple[str, ...]) -> tuple[str, str]:
         return address, ""
     if head not in heads:
         return "", ""
-    known, asked = FOLLOWED[head], dict(parse_qsl(parts.query))
-    moment = query_of({name: asked.pop(name) for name in MOMENT if name in asked})
+    known, params = FOLLOWED[head], dict(parse_qsl(parts.query))
+    moment = query_of({name: params.pop(name) for name in MOMENT if name in params})
     # In one order, whatever the page that links to it says first.
-    kept = {n: asked[n] for n in sorted(asked) if n in known or n.startswith(FACTOR)}
-    if parts.path.endswith(".png") or asked.keys() - kept.keys() - {*SCOPE}:
+    kept = {n: params[n] for n in sorted(params) if n in known or n.startswith(FACTOR)}
+    if parts.path.endswith(".png") or params.keys() - kept.keys() - {*SCOPE}:
         return "", ""
     return parts.path + query_of(kept), moment
 
@@ -274,8 +274,8 @@ def _name_of(page: str, taken: Collection[str]) -> str:
     if page.startswith("/static/"):
         return f"{FILES}{path}"
     suffix = path.suffix if page.startswith(("/tables/", "/figures/")) else ""
-    asked = [part for pair in parse_qsl(parts.query) if pair[0] != "spec" for part in pair]
-    words = "-".join([str(path).removesuffix(suffix), *asked])
+    values = [part for pair in parse_qsl(parts.query) if pair[0] != "spec" for part in pair]
+    words = "-".join([str(path).removesuffix(suffix), *values])
     name = f"{FILES}/{_ODD.sub('-', words).strip('-')[:LONGEST_NAME]}"
     named = (f"{name}{end}{suffix or '.html'}" for end in chain([""], map("-{}".format, count(2))))
     return next(file for file in named if file.lower() not in taken)
@@ -289,7 +289,7 @@ def _opened(site: Site, patterns: Sequence[str]) -> Iterator[list[Row]]:
     site.is_still = True  # so that all pages are of the same trials
     rows = [
         row
-        for row in site.catalogue.every({})
+        for row in site.trial_index.every({})
         if not patterns or any(fnmatchcase(row["trial_id"], pattern) for pattern in patterns)
     ]
     if not rows:

@@ -72,18 +72,18 @@ class Driver:
     parameters: str
 
 
-def judged(site: Site, bar: Bar, asked: Mapping[str, str]) -> tuple[list[Driver], dict[str, Any]]:
+def judged(site: Site, bar: Bar, params: Mapping[str, str]) -> tuple[list[Driver], dict[str, Any]]:
     """Return the drivers of a scope, and the values of every page that shows their verdicts."""
     job, table = site.table(TABLE, bar.scope.sweep, bar.scope.condition)
     return drivers_of(site, table, bar.scope), {
         "bar": bar,
-        "carried": carried(asked),
+        "carried": carried(params),
         "computed": job,
         "table": table,
         "headings": KINDS,
         "human": humans_of(table),
         "measures": measures_of(table.rows if table else ()),
-        "imported": site.catalogue.has_humans,
+        "imported": site.trial_index.has_humans,
     }
 
 
@@ -109,9 +109,9 @@ def humans_of(table: Table | None, driver: Driver | None = None) -> dict[str, An
 
 def drivers_of(site: Site, table: Table | None, scope: Scope) -> list[Driver]:
     """Return every driver and prompt with trials in a scope; without a table their facts alone."""
-    counts = site.catalogue.counts(scope.trials(), "model", "variant", "who")
+    counts = site.trial_index.counts(scope.trials(), "model", "variant", "who")
     facts = {(row["model"], row["variant"]): row for row in counts if row["who"] != "humans"}
-    specs = {(row["model"], row["variant"]): row for row in site.catalogue.ask(ASKED)}
+    specs = {(row["model"], row["variant"]): row for row in site.trial_index.ask(ASKED)}
     groups = by_group(table.rows) if table else {"/".join(key): {} for key in facts}
     drivers, measures = [], measures_of(table.rows if table else ())
     for group, verdicts in groups.items():
@@ -174,7 +174,7 @@ def by_condition(site: Site, scope: Scope, drivers: Sequence[Driver]) -> dict[st
     ``crash`` is the drivers' collision rule in words. A count is None if a condition was not
     driven. Without a driver the conditions are the humans'.
     """
-    rows = site.catalogue.counts(scope.trials(), "model", "variant", "condition")
+    rows = site.trial_index.counts(scope.trials(), "model", "variant", "condition")
     counted = {(row["model"], row["variant"], row["condition"]): _merged(row) for row in rows}
     of = [(driver, (unmarked(driver.name), driver.prompt)) for driver in drivers]
     known = {name: _merged(counts._asdict()) for name, counts in human_counts().items()}
@@ -182,7 +182,7 @@ def by_condition(site: Site, scope: Scope, drivers: Sequence[Driver]) -> dict[st
     names = ordered(played or known)
     played_by = ["/".join(key) for _, key in of]
     default = ScenarioConfig()
-    rules = site.catalogue.ask(RULES, played_by, default.collision_rule, default.step_s)
+    rules = site.trial_index.ask(RULES, played_by, default.collision_rule, default.step_s)
     return {
         "names": names,
         "crash": crash_text([(row["rule"], row["steps_s"]) for row in rules]),

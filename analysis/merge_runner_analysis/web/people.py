@@ -22,7 +22,6 @@ from merge_runner_analysis.wording import (
     VERDICT_RULES,
     brackets,
     has_verdict,
-    joined,
     number,
     shown_state,
     verdict_word,
@@ -91,7 +90,7 @@ def equal_trials(drivers: Sequence[Driver], short: Mapping[str, str]) -> str:
         for of in drivers
         if of.cells and of.facts
     ]
-    return joined([f"{k} of {n} trials of {name}" for name, k, n in counts if 2 * k > n])
+    return ", ".join(f"{k} of {n} trials of {name}" for name, k, n in counts if 2 * k > n)
 
 
 def repeated(driver: Driver, conditions: Mapping[str, Any]) -> tuple[int, int]:

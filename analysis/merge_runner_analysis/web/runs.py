@@ -13,9 +13,9 @@ from merge_runner.audit.checks import not_judged
 from merge_runner.driver_names import both_sides, pair_name
 from merge_runner.paths import DEFAULT_DB, command_at
 from merge_runner.run.progress_file import ProgressSnapshot, read_snapshot
-from merge_runner_analysis.web.catalogue import Catalogue, TrialFilter
 from merge_runner_analysis.web.phrases import called, duration
 from merge_runner_analysis.web.reading import Row
+from merge_runner_analysis.web.trial_index import TrialFilter, TrialIndex
 
 REFUSED = 2
 # Reasons for an early end of a run, by exit code: in a sentence, and in a list.
@@ -30,44 +30,44 @@ REASONS = {
 }
 
 
-def list_runs(catalogue: Catalogue) -> list[Row]:
-    """Return all runs, the newest first. Raises what ``Catalogue.refresh`` does."""
+def list_runs(trial_index: TrialIndex) -> list[Row]:
+    """Return all runs, the newest first. Raises what ``TrialIndex.refresh`` does."""
     runs: list[Row] = []
     # A run notes its end in the database before its file goes: one that seems to be lost may have
-    # ended since the rows were read, by whoever refreshed the catalogue since.
+    # ended since the rows were read, by whoever refreshed the index since.
     for is_sure in (False, True):
-        catalogue.refresh(at_once=is_sure)
-        counted, newest, runs = numbers_of(catalogue, {}), dict[Any, str](), []
-        for row in catalogue.ask("FROM sweeps ORDER BY started_at DESC, sweep_id DESC"):
+        trial_index.refresh(at_once=is_sure)
+        counted, newest, runs = numbers_of(trial_index, {}), dict[Any, str](), []
+        for row in trial_index.ask("FROM sweeps ORDER BY started_at DESC, sweep_id DESC"):
             sweep_id, config = row["sweep_id"], json.loads(row["config"])
-            snapshot = None if row["ended_at"] else read_snapshot(catalogue.db, sweep_id)
+            snapshot = None if row["ended_at"] else read_snapshot(trial_index.db, sweep_id)
             # The newest run of the same trials went on with those before it.
             same = row["name"], config.get("model"), config.get("sample_set")
             later = newest.setdefault(same, sweep_id).replace(sweep_id, "")
-            row_of = {**row, **counted[sweep_id], "db": catalogue.db}
+            row_of = {**row, **counted[sweep_id], "db": trial_index.db}
             runs.append(run_of(row_of, config, snapshot, later))
         if all(run["state"] != "lost" for run in runs):
             break
     return runs
 
 
-def numbers_of(catalogue: Catalogue, filters: TrialFilter) -> Mapping[str, Row]:
+def numbers_of(trial_index: TrialIndex, filters: TrialFilter) -> Mapping[str, Row]:
     """Return counts of a filter's trials by run; the empty id has the total.
 
     Whatever several runs or trials share counts once. A run may have begun since: it has none.
     """
-    (total,) = catalogue.counts({**filters, "who": ["drivers", "mocks"]})
-    counted = {row["sweep"]: row for row in catalogue.counts(filters, "sweep")}
+    (total,) = trial_index.counts({**filters, "who": ["drivers", "mocks"]})
+    counted = {row["sweep"]: row for row in trial_index.counts(filters, "sweep")}
     return defaultdict(lambda: dict.fromkeys(total, 0), {"": total} | counted)
 
 
-def standing_of(catalogue: Catalogue) -> list[Row]:
+def standing_of(trial_index: TrialIndex) -> list[Row]:
     """Return the runs that go on, or ended early without a later run; else the newest one.
 
     One that was refused is no news once its models were asked in a later run of its study. The
-    newest come first. Raises what ``Catalogue.refresh`` does.
+    newest come first. Raises what ``TrialIndex.refresh`` does.
     """
-    runs, answered = list_runs(catalogue), dict[str, set[str]]()
+    runs, answered = list_runs(trial_index), dict[str, set[str]]()
     news = []
     for run in runs:
         of_study = answered.setdefault(run["study"], set())

@@ -11,11 +11,11 @@ from typing import Any
 from starlette.datastructures import QueryParams
 
 from merge_runner.prompts.blocks import BASELINE, title_of
-from merge_runner_analysis.web.catalogue import FACETS, SORTS, Facets
 from merge_runner_analysis.web.listing import FACTOR
 from merge_runner_analysis.web.phrases import called, ordered
 from merge_runner_analysis.web.search import LONGEST_QUERY, MOST_TERMS
 from merge_runner_analysis.web.site import SCOPE, NotThere, Site, TooMuch
+from merge_runner_analysis.web.trial_index import FACETS, SORTS, Facets
 
 # Marks that the analysis adds to names of drivers with several tasks, prompts or mock models.
 MARKS = re.compile(r"( \[([0-9a-f]{8}|scripted)\])+$")
@@ -44,7 +44,7 @@ WHERE description <> '' GROUP BY ALL ORDER BY min(started_at)
 
 def descriptions_of(site: Site) -> list[str]:
     """Return the questions of the studies that were played, each once, the first one first."""
-    return [row["description"] for row in site.catalogue.ask(DESCRIPTIONS)]
+    return [row["description"] for row in site.trial_index.ask(DESCRIPTIONS)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,13 +89,13 @@ class Bar:
 
 
 def scope_of(
-    site: Site, asked: Mapping[str, str], driver: str = "", *, any_prompt: bool = False
+    site: Site, params: Mapping[str, str], driver: str = "", *, any_prompt: bool = False
 ) -> Bar:
     """Return the scope in an address, with the choices of its form; raises NotThere.
 
     ``driver``: of this one alone. Unless it may be of ``any_prompt``, it has one.
     """
-    rows = site.catalogue.ask(
+    rows = site.trial_index.ask(
         "SELECT DISTINCT model, variant, condition FROM listed WHERE who <> 'humans' ORDER BY ALL"
     )
     drivers = list(dict.fromkeys(row["model"] for row in rows))
@@ -106,10 +106,10 @@ def scope_of(
     usual = "" if any_prompt else next(iter(prompts), BASELINE)
     usual = BASELINE if usual and BASELINE in prompts else usual
     scope = Scope(
-        _known("sweep", asked.get("sweep", ""), sweeps),
-        tuple(_known("driver", name, drivers) for name in every(asked, "model")),
-        _known("prompt", asked.get("variant", "") or usual, [*prompts, usual]),
-        _known("condition", asked.get("condition", ""), conditions),
+        _known("sweep", params.get("sweep", ""), sweeps),
+        tuple(_known("driver", name, drivers) for name in every(params, "model")),
+        _known("prompt", params.get("variant", "") or usual, [*prompts, usual]),
+        _known("condition", params.get("condition", ""), conditions),
     )
     return Bar(
         scope,
@@ -126,7 +126,7 @@ def runs_of(site: Site) -> dict[str, str]:
     return {
         row["sweep_id"]: f"{called(row['name'], json.loads(row['config']))}, "
         f"{row['started_at']:%Y-%m-%d %H:%M} UTC"
-        for row in site.catalogue.ask("FROM sweeps ORDER BY started_at DESC")
+        for row in site.trial_index.ask("FROM sweeps ORDER BY started_at DESC")
     }
 
 
@@ -137,16 +137,16 @@ def facets_shown(site: Site, facets: Facets) -> dict[str, list[tuple[str, Any]]]
     return {**facets, "sweep": runs}
 
 
-def carried(asked: Mapping[str, str]) -> dict[str, list[str]]:
+def carried(params: Mapping[str, str]) -> dict[str, list[str]]:
     """Return the scope in an address, as the addresses of other pages take it on."""
-    return {name: values for name in SCOPE if (values := every(asked, name))}
+    return {name: values for name in SCOPE if (values := every(params, name))}
 
 
-def filter_of(asked: Mapping[str, str]) -> dict[str, str]:
+def filter_of(params: Mapping[str, str]) -> dict[str, str]:
     """Return the filter in an address; raises TooMuch."""
     filters = {
         name: value
-        for name, value in asked.items()
+        for name, value in params.items()
         if value and (name in {*FACETS, "q"} or name.startswith(FACTOR))
     }
     words = filters.get("q", "")
@@ -155,7 +155,7 @@ def filter_of(asked: Mapping[str, str]) -> dict[str, str]:
             f"a search has up to {MOST_TERMS} words and {LONGEST_QUERY} characters, this one "
             f"{len(words.split()):,} and {len(words):,}"
         )
-    longest = max(map(len, asked.values()), default=0)
+    longest = max(map(len, params.values()), default=0)
     if len(filters) > MOST_CHOSEN or longest > LONGEST_VALUE:
         raise TooMuch(
             f"a filter has up to {MOST_CHOSEN} parts of up to {LONGEST_VALUE:,} characters, this "
@@ -164,9 +164,9 @@ def filter_of(asked: Mapping[str, str]) -> dict[str, str]:
     return filters
 
 
-def sort_of(asked: Mapping[str, str]) -> str:
+def sort_of(params: Mapping[str, str]) -> str:
     """Return the order in an address; by name, if it is unknown."""
-    sort = asked.get("sort", "trial")
+    sort = params.get("sort", "trial")
     return sort if sort.removeprefix("-") in SORTS else "trial"
 
 
@@ -178,9 +178,9 @@ def unmarked(driver: str) -> str:
     return MARKS.sub("", driver)
 
 
-def every(asked: Mapping[str, str], name: str) -> list[str]:
+def every(params: Mapping[str, str], name: str) -> list[str]:
     """Return all values of one name in an address."""
-    several = asked.getlist(name) if isinstance(asked, QueryParams) else [asked.get(name, "")]
+    several = params.getlist(name) if isinstance(params, QueryParams) else [params.get(name, "")]
     return [value for value in several if value]
 
 

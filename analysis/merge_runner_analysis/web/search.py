@@ -7,8 +7,8 @@ import threading
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from merge_runner_analysis.web.catalogue import Catalogue, facets_of, where_of
 from merge_runner_analysis.web.reading import records
+from merge_runner_analysis.web.trial_index import TrialIndex, facets_of, where_of
 
 PAGE = 50
 LONGEST = 65_536  # characters of a text that are searched
@@ -54,7 +54,7 @@ SEARCHING = threading.Lock()  # a search reads all texts: they are made one at a
 
 
 def search(
-    catalogue: Catalogue,
+    trial_index: TrialIndex,
     filters: Mapping[str, str],
     terms: Sequence[str] = (),
     limits: Mapping[str, str] | None = None,
@@ -72,7 +72,7 @@ def search(
         conditions.append(f"place IN (SELECT rowid FROM decisions WHERE {holding})")  # noqa: S608 # constants
     where, values = where_of(filters)
     matches = f"FROM {FOUND} WHERE {where}"
-    with SEARCHING, catalogue.cursor() as connection:
+    with SEARCHING, trial_index.cursor() as connection:
         connection.execute(HITS.format(" AND ".join(conditions)), [*limits.values(), *terms])
         (totals,) = records(
             connection,

@@ -20,13 +20,13 @@ from merge_runner_analysis.cache import stamp_of
 from merge_runner_analysis.metrics import METRICS
 from merge_runner_analysis.tables.model import Table, from_text
 from merge_runner_analysis.web.answers import Request
-from merge_runner_analysis.web.catalogue import Catalogue
 from merge_runner_analysis.web.computing import Computing, Job
 from merge_runner_analysis.web.note_file import LONGEST_TEXT, Notes
 from merge_runner_analysis.web.phrases import clock, condition_text
 from merge_runner_analysis.web.queries import Queries
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.rendering import environment
+from merge_runner_analysis.web.trial_index import TrialIndex
 from merge_runner_analysis.web.urls import HOME, Links
 from merge_runner_analysis.wording import MEASURES, TABLE
 
@@ -91,8 +91,8 @@ class Site:
 
     def __post_init__(self) -> None:
         self._first_reading: threading.Thread | None = None
-        self.catalogue = Catalogue(self.db)
-        self.queries = Queries(self.catalogue.copies)
+        self.trial_index = TrialIndex(self.db)
+        self.queries = Queries(self.trial_index.copies)
         self.computing = Computing(self.db)
         self.notes = Notes(self.db, self.reader)
         self._environment = environment(
@@ -130,12 +130,12 @@ class Site:
         """Take in what is new: in the database, and in the notes beside it."""
         if self.is_still:
             return
-        self.catalogue.refresh()
-        self.catalogue.tag(self.notes.read().tags)
+        self.trial_index.refresh()
+        self.trial_index.tag(self.notes.read().tags)
 
     def trial(self, trial_id: str, spec_hash: str) -> Row:
         """Return the trial of this name, of several specs of this one; raises NotThere."""
-        row = self.catalogue.find(trial_id, spec_hash)
+        row = self.trial_index.find(trial_id, spec_hash)
         if row is None:
             raise NotThere(f"the database holds no trial {trial_id}")
         return row
@@ -162,7 +162,7 @@ class Site:
 
     def in_words(self, condition: str) -> str:
         """Return a condition in words; empty where no human drove it and it has no trial."""
-        return self.catalogue.condition_texts().get(condition, "")
+        return self.trial_index.condition_texts().get(condition, "")
 
     @property
     def beginning(self) -> bool:
@@ -181,5 +181,5 @@ class Site:
 
     def render(self, template: str, **values: object) -> str:
         """Return a page, or a part of one."""
-        values = {"is_locked": self.catalogue.copies.is_locked, **values}
+        values = {"is_locked": self.trial_index.copies.is_locked, **values}
         return self._environment.get_template(template).render(values)

@@ -24,7 +24,7 @@ FEW = {  # which stand for all
     "pages.tables.FIGURES": {"first-action": FIGURES["first-action"]},
     "export.TABLES": {"attempts": TABLES["attempts"]},
     "export.FIGURES": {"first-action": FIGURES["first-action"]},
-    "catalogue.PAGE": 3,
+    "trial_index.PAGE": 3,
     "pages.trials.PAGE": 3,
 }
 

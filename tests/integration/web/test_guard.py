@@ -60,7 +60,7 @@ def test_what_is_not_there_is_told_and_a_page_that_is_still_read_says_so(
     study, tmp_path, monkeypatch
 ):
     with pytest.raises(UsageError, match="`merge-runner sweep baseline`"):
-        Site(tmp_path / "none.duckdb").catalogue.refresh()
+        Site(tmp_path / "none.duckdb").trial_index.refresh()
     monkeypatch.setattr(Site, "beginning", True)
     reply = client_of(study).get("/trials")
     assert ("Reading the trials" in reply.text, reply.headers["refresh"]) == (True, "1")

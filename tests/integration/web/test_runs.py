@@ -86,7 +86,7 @@ def text_of(client, url=URL):
 
 
 def page_of(site):
-    site.catalogue.refresh()
+    site.trial_index.refresh()
     return html.unescape(sweep_page(site, "sweep-1", {}))
 
 
@@ -136,7 +136,7 @@ def test_the_page_has_the_numbers_of_the_database_and_every_rate_leads_to_its_tr
     for name, url in re.findall(r'id="(rate-\d)" href="([^"]*)"', page_of(client.site)):
         asked = asked_by(url)
         assert asked["sweep"] == "sweep-1"
-        found = client.site.catalogue.every(filter_of(asked))
+        found = client.site.trial_index.every(filter_of(asked))
         trials[name] = [(row["trial_id"],) for row in found]
     assert trials["rate-3"] == trials["rate-4"] == invalid
     assert len(invalid) == 2
@@ -149,7 +149,7 @@ def test_every_arm_and_every_cause_leads_to_the_trials_that_it_counts(written):
     for url, count in links:
         asked = asked_by(url)
         causes.add(asked.get("cause"))
-        totals = site.catalogue.counts(filter_of(asked))
+        totals = site.trial_index.counts(filter_of(asked))
         there = sum(part["trials" if "cause" in asked else "ended"] for part in totals)
         assert there == int(count), url
     attempts = {f"attempt: {name}" for name in ("timeout", "rate_limit", "unknown")}
@@ -169,7 +169,7 @@ def test_an_alias_is_nothing_that_went_wrong_and_two_other_models_have_a_line_ea
     lines = re.findall(r"model: o3 → ([^<]*)</th>", page_of(site))
     assert sorted(lines) == ["another", "third"]
     for name, trials in (("o3-alias", 0), ("o3", 0), ("another", 1), ("third", 3)):
-        found = site.catalogue.every(filter_of({"cause": f"model: o3 → {name}"}))
+        found = site.trial_index.every(filter_of({"cause": f"model: o3 → {name}"}))
         assert len(found) == trials
     change(
         study,
@@ -193,9 +193,9 @@ def test_what_runs_and_trials_share_counts_once_over_all_runs(study):
             "SELECT count(*), sum(usd), count(*) FILTER (trials > 1) FROM (SELECT count(DISTINCT "
             "trial_id) AS trials, any_value(cost_usd) AS usd FROM calls GROUP BY call_key, attempt)"
         ).fetchone()
-    catalogue = Site(study).catalogue
-    assert (len(list_runs(catalogue)), shared > 0) == (2, True)
-    counted = numbers_of(catalogue, {})
+    trial_index = Site(study).trial_index
+    assert (len(list_runs(trial_index)), shared > 0) == (2, True)
+    counted = numbers_of(trial_index, {})
     for row in counted.values():
         assert (row["replies"], row["shared"], row["ended"]) == (calls, shared, 29)
         assert row["cost_usd"] == pytest.approx(usd)
@@ -321,12 +321,14 @@ def test_a_run_with_a_name_is_called_by_it_in_the_list(study):
     named = """json_merge_patch(config, '{"run_name": "the second"}')"""
     change(study, f"UPDATE sweeps SET config = {named}")
     site = Site(study)
-    (run,) = list_runs(site.catalogue)
+    (run,) = list_runs(site.trial_index)
     assert run["row"]["name"].startswith("the second (")
     assert "<h1>Run of the second (" in page_of(site)
-    facets = site.catalogue.facets({})
+    facets = site.trial_index.facets({})
     assert facets["run"] == [("the second", sum(n for _, n in facets["sweep"]))]
-    assert site.catalogue.counts({"run": "the second"}) == site.catalogue.counts({"who": "drivers"})
+    assert site.trial_index.counts({"run": "the second"}) == site.trial_index.counts(
+        {"who": "drivers"}
+    )
     assert scope_of(site, {}).sweeps[0][1].startswith("the second (")
     whole, named = (StudyResults(study, Selection(sweep=name)) for name in ("", "the second"))
     assert [len(each.trials) for each in named.played] == [len(e.trials) for e in whole.played]
@@ -336,7 +338,7 @@ def test_a_run_with_a_name_is_called_by_it_in_the_list(study):
 
 def test_a_refused_run_is_news_until_its_model_was_asked_in_a_later_run_of_the_study(study):
     def news():
-        return [run["sweep_id"] for run in standing_of(Site(study).catalogue)]
+        return [run["sweep_id"] for run in standing_of(Site(study).trial_index)]
 
     later = "started_at + INTERVAL 1 DAY AS started_at, ended_at + INTERVAL 1 DAY AS ended_at"
     other = """json_merge_patch(config, '{"model": "o4", "sample_set": 1}')"""

@@ -145,7 +145,7 @@ def test_beside_humans_who_say_nothing_stands_what_was_measured_from_control_on(
 def test_odd_rows_cost_no_other_row_its_page_and_levels_of_a_study_filter_the_list(golden_copy):
     db = golden_copy / "golden.duckdb"
     client = client_of(db)
-    state = client.site.catalogue.refresh() or client.site.catalogue.state
+    state = client.site.trial_index.refresh() or client.site.trial_index.state
     damage(
         db,
         "UPDATE trials SET condition = 'X_1_1', error = 'left: another' WHERE trial_id LIKE 'o4/%'",
@@ -156,7 +156,7 @@ def test_odd_rows_cost_no_other_row_its_page_and_levels_of_a_study_filter_the_li
     text = client.get("/trials/o4/baseline/L_4_0/rep01").text
     for said in ("X_1_1", "the left vehicle would be 4 m ahead", "left: another"):
         assert said in text
-    assert client.site.catalogue.state != state
+    assert client.site.trial_index.state != state
     assert len(Page(client.get("/trials?model=idm").text).to("/trials/idm/")) == 22
     assert client.get("/trials/idm/baseline/N_0_0/rep01").status_code == 200
     text = client.get("/trials/emulator/baseline/N_0_0/rep01").text

@@ -10,11 +10,11 @@ import duckdb
 import pytest
 
 from merge_runner.results.store import Store
-from merge_runner_analysis.web import catalogue as catalogue_module
-from merge_runner_analysis.web.catalogue import Catalogue
+from merge_runner_analysis.web import trial_index as trial_index_module
 from merge_runner_analysis.web.pictures import sparkline, speed_range
 from merge_runner_analysis.web.runs import list_runs
 from merge_runner_analysis.web.scope import filter_of
+from merge_runner_analysis.web.trial_index import TrialIndex
 from tests.support.cases import cases
 from tests.support.crashes import CLOSING_IN, EXAMPLES, drive
 from tests.support.harness import FAST
@@ -68,9 +68,9 @@ def compared(tmp_path_factory):
 
 
 def read(db):
-    catalogue = Catalogue(db)
-    catalogue.refresh()
-    return catalogue
+    trial_index = TrialIndex(db)
+    trial_index.refresh()
+    return trial_index
 
 
 def others(client, trial, **asked):
@@ -78,15 +78,15 @@ def others(client, trial, **asked):
 
 
 def test_each_trial_has_its_account_by_which_it_is_counted_filtered_and_downloaded(accounts):
-    catalogue = read(accounts)
-    found = {row["rep"]: row["account"] for row in catalogue.every({"model": "o3"})}
+    trial_index = read(accounts)
+    found = {row["rep"]: row["account"] for row in trial_index.every({"model": "o3"})}
     assert found == {drive(account).rep: account for account in EXAMPLES}
-    (near,) = catalogue.every({"model": "o5"})  # its follower closes in, whatever the gap
+    (near,) = trial_index.every({"model": "o5"})  # its follower closes in, whatever the gap
     measured = pytest.approx((1.99, 0.95), abs=0.01)
     assert ((near["gap_m"], near["min_ttc_s"]), near["account"]) == (measured, "near miss")
     counts = {
         (row["model"], row["variant"], row["account"]): row["trials"]
-        for row in catalogue.counts({}, "model", "variant", "account")
+        for row in trial_index.counts({}, "model", "variant", "account")
         if row["account"]
     }
     assert counts == {
@@ -95,7 +95,7 @@ def test_each_trial_has_its_account_by_which_it_is_counted_filtered_and_download
         ("o4", "baseline", "both insisted"): 1,
         ("human", None, "no action"): 1,
     }
-    assert ("both insisted", 2) in catalogue.facets({})["account"]
+    assert ("both insisted", 2) in trial_index.facets({})["account"]
     client = client_of(accounts)
     page = Page(client.get("/trials?account=near+miss&model=o3").text)
     assert ("near miss (1)" in page.text, len(page.to("/trials/o3/"))) == (True, 1)
@@ -107,18 +107,18 @@ def test_the_list_follows_the_database_beside_which_it_leaves_nothing_and_a_long
     accounts, tmp_path, monkeypatch
 ):
     path = shutil.copy(accounts, tmp_path / "t.duckdb")
-    stored, catalogue = path.read_bytes(), read(path)
-    assert (catalogue.refresh(), path.read_bytes(), [*tmp_path.iterdir()]) == (
+    stored, trial_index = path.read_bytes(), read(path)
+    assert (trial_index.refresh(), path.read_bytes(), [*tmp_path.iterdir()]) == (
         False,
         stored,
         [path],
     )
-    before = catalogue.state
-    monkeypatch.setattr(catalogue_module, "MANY", 0)
+    before = trial_index.state
+    monkeypatch.setattr(trial_index_module, "MANY", 0)
     damage(path, "UPDATE decisions SET fallback = true WHERE trial_id LIKE 'o4/%'")
-    assert (catalogue.refresh(), catalogue.state) == (False, before)
-    assert (catalogue.refresh(at_once=True), catalogue.state == before) == (True, False)
-    assert {row["validity"] for row in catalogue.every({"model": "o4"})} == {"fallbacks"}
+    assert (trial_index.refresh(), trial_index.state) == (False, before)
+    assert (trial_index.refresh(at_once=True), trial_index.state == before) == (True, False)
+    assert {row["validity"] for row in trial_index.every({"model": "o4"})} == {"fallbacks"}
 
 
 @pytest.mark.parametrize(
@@ -134,12 +134,12 @@ def test_a_collision_that_cannot_be_judged_is_listed_without_an_account_until_an
 ):
     path = write_study(tmp_path / "t.duckdb", [drive("no action")])
     damage(path, lacking)
-    catalogue = read(path)
-    (row,) = catalogue.every({})
+    trial_index = read(path)
+    (row,) = trial_index.every({})
     assert (row["outcome"], row["account"]) == ("collided", None)
     Store(path).write("sweep-1", [played(drive("invalid plan", "o4"))], patience_s=5)
-    catalogue.refresh()
-    assert {row["account"] for row in catalogue.counts({}, "account")} == {"invalid plan", None}
+    trial_index.refresh()
+    assert {row["account"] for row in trial_index.counts({}, "account")} == {"invalid plan", None}
 
 
 def test_people_and_each_driver_are_summed_up_apart(listing):
@@ -244,19 +244,19 @@ def test_trials_of_two_endpoints_are_listed_named_and_linked_apart_with_who_answ
         run = prepare(tmp_path, "sweep", "baseline", *part, "--model", *options, **at)
         assert run.code == 0, run.err
     client, words = client_of(tmp_path / "t.duckdb"), "mock model, not o3"
-    catalogue = read(client.site.db)
+    trial_index = read(client.site.db)
     drivers = [f"o3 at {host}", f"o3 at {other}+constant/set1"]
-    assert sorted(catalogue.facets({})["model"]) == [(name, 2) for name in sorted(drivers)]
+    assert sorted(trial_index.facets({})["model"]) == [(name, 2) for name in sorted(drivers)]
     for driver in drivers:
-        row = catalogue.every({"model": driver})[0]
+        row = trial_index.every({"model": driver})[0]
         assert row["stand_in"] == words
         trial = Page(client.get(f"/trials/{row['trial_id']}?spec={row['spec_hash']}").text)
         (link,) = (to for to, text in trial.links if text.startswith("Trials like"))
         asked = {name: value for name, [value] in parse_qs(urlsplit(link).query).items()}
-        assert [one["model"] for one in catalogue.every(filter_of(asked))] == [driver]
+        assert [one["model"] for one in trial_index.every(filter_of(asked))] == [driver]
         listed = Page(client.get(link).text).text
         assert (driver in listed, words in trial.text) == (True, True)
-    sweeps, runs = Page(client.get("/sweeps").text).text, list_runs(catalogue)
+    sweeps, runs = Page(client.get("/sweeps").text).text, list_runs(trial_index)
     for entry, driver in zip(runs, reversed(drivers), strict=True):
         name = driver.removesuffix("/set1")
         assert (entry["driver"], f"{name} mock model" in sweeps) == (name, True)

@@ -71,18 +71,18 @@ HAVING 2 * count(*) >= (SELECT count(*) FROM nearest WHERE is_near AND place = 0
 """  # noqa: S608 # constants
 
 
-def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
+def condition_page(site: Site, name: str, params: Mapping[str, str]) -> str:
     """Return the traces of a condition, within the scope of the address.
 
     Raises NotThere, and NothingNew as they were ``seen``.
     """
-    state = news_of(site.catalogue.state, asked.get("seen", ""))
+    state = news_of(site.trial_index.state, params.get("seen", ""))
     if not site.in_words(name):
         raise NotThere(f"there is no condition {name!r} here")
-    bar = scope_of(site, asked, any_prompt=True)
+    bar = scope_of(site, params, any_prompt=True)
     filters = {**bar.scope.filters, "condition": name, "who": ["drivers", "mocks"]}
-    rows = site.catalogue.every(filters)
-    humans = site.catalogue.every({"condition": name, "who": "humans"})
+    rows = site.trial_index.every(filters)
+    humans = site.trial_index.every({"condition": name, "who": "humans"})
     chosen = [rows[i * len(rows) // MOST] for i in range(MOST)] if len(rows) > MOST else rows
     traces = {(row["trial_id"], row["spec_hash"]): row for row in _read(site, TRACES, chosen)}
     drawn = [
@@ -94,10 +94,10 @@ def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         view="",
         name=name,
         bar=bar,
-        carried={key: kept for key, kept in carried(asked).items() if key != "condition"},
+        carried={key: kept for key, kept in carried(params).items() if key != "condition"},
         sweep=bar.scope.sweep,
         state=state,
-        groups=site.catalogue.counts(filters, "model", "variant"),
+        groups=site.trial_index.counts(filters, "model", "variant"),
         trials=len(rows),
         drawn=len(drawn),
         sampled=len(rows) > MOST,
@@ -169,4 +169,4 @@ def _path(row: Row, time: Scale, scales: Mapping[str, Scale]) -> str:
 
 
 def _read(site: Site, sql: str, trials: Sequence[Row]) -> list[Row]:
-    return site.catalogue.ask(sql, *([row[name] for row in trials] for name in KEY))
+    return site.trial_index.ask(sql, *([row[name] for row in trials] for name in KEY))

@@ -29,11 +29,11 @@ GROUP BY ALL ORDER BY ALL
 """
 
 
-def drivers_page(site: Site, asked: Mapping[str, str]) -> str:
+def drivers_page(site: Site, params: Mapping[str, str]) -> str:
     """Return all drivers with their prompts; raises NotThere."""
-    bar = scope_of(site, asked)
+    bar = scope_of(site, params)
     chosen = bar.scope.drivers or bar.drivers
-    drivers, values = judged(site, bar, asked)
+    drivers, values = judged(site, bar, params)
     kinds = by_kind([driver for driver in drivers if unmarked(driver.name) in chosen])
     trials_counted = partial(counted, conditions=by_condition(site, bar.scope, drivers))
     return site.render(
@@ -41,11 +41,11 @@ def drivers_page(site: Site, asked: Mapping[str, str]) -> str:
     )
 
 
-def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
+def driver_page(site: Site, name: str, params: Mapping[str, str]) -> str:
     """Return the page of a driver with one prompt, or of ``human``; raises NotThere."""
-    bar = scope_of(site, asked, "" if name == HUMAN else name)
+    bar = scope_of(site, params, "" if name == HUMAN else name)
     scope = bar.scope
-    drivers, values = judged(site, bar, asked)
+    drivers, values = judged(site, bar, params)
     by_name = {driver.name: driver for driver in drivers if driver.prompt == scope.prompt}
     driver = by_name.get(name)
     if driver is None and name != HUMAN and values["table"] is not None:
@@ -54,7 +54,7 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
             f"{', '.join(by_name) or 'none'}"
         )
     trials = scope.trials(name, scope.prompt)
-    other_driver = by_name.get(asked.get("with", ""))
+    other_driver = by_name.get(params.get("with", ""))
     was_asked = driver and driver.facts and driver.facts["asked"] and not other_driver
     awaited, first = _first(site, name, scope) if was_asked else (None, "")
     job, is_awaited, apart = None, False, None
@@ -80,12 +80,12 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         **values | {"human": humans_of(values["table"], driver)},
         awaited=awaited,
         first=first,
-        result=search(site.catalogue, trials) if was_asked else None,
+        result=search(site.trial_index, trials) if was_asked else None,
         kept=trials,
-        attempts=site.catalogue.ask(ATTEMPTS, unmarked(name), scope.prompt),
+        attempts=site.trial_index.ask(ATTEMPTS, unmarked(name), scope.prompt),
         accounts=[
             row
-            for row in site.catalogue.counts({**trials, "outcome": "collided"}, "account")
+            for row in site.trial_index.counts({**trials, "outcome": "collided"}, "account")
             if row["account"]
         ],
         conditions=conditions,

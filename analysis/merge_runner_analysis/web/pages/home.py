@@ -42,7 +42,7 @@ Jobs = list[Job]
 
 def _question(site: Site, bar: Bar) -> tuple[Jobs, Jobs, Answer | None]:
     """Return the jobs of the factor tables, those that had no table yet, and the answer."""
-    if len(bar.prompts) < 2 and not site.catalogue.factors():
+    if len(bar.prompts) < 2 and not site.trial_index.factors():
         return [], [], None
     part = bar.scope.sweep, bar.scope.condition
     computed = [site.table(name, *part) for name in FACTOR_TABLES]
@@ -112,12 +112,12 @@ def _beside_people(
     }
 
 
-def home_page(site: Site, asked: Mapping[str, str]) -> str:
+def home_page(site: Site, params: Mapping[str, str]) -> str:
     """Return the study's page; raises NotThere, or NothingNew if it is as it was ``seen``."""
-    standing = standing_of(site.catalogue)
-    bar = scope_of(site, asked)
+    standing = standing_of(site.trial_index)
+    bar = scope_of(site, params)
     scope = bar.scope
-    drivers, values = judged(site, bar, asked)
+    drivers, values = judged(site, bar, params)
     shown = [
         driver
         for driver in drivers
@@ -129,8 +129,8 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
     if not jobs:
         jobs, asking, apart = _rivals(site, shown, scope)
     older = [job.older for job in (values["computed"], *jobs)]
-    now = standing, site.catalogue.state, site.catalogue.copies.is_locked, older
-    seen = news_of(now, asked.get("seen", ""))
+    now = standing, site.trial_index.state, site.trial_index.copies.is_locked, older
+    seen = news_of(now, params.get("seen", ""))
     conditions = by_condition(site, scope, shown)
     names = [driver.name for driver in shown]
     short = short_names(names)
@@ -145,7 +145,7 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         **values,
         **_beside_people(shown, short, human, conditions),
         short=short,
-        names_mean=names_mean(site.catalogue.ask(PLAYED), names),
+        names_mean=names_mean(site.trial_index.ask(PLAYED), names),
         opponents=opponents_text(names),
         part=scope.part,
         standing=standing,

@@ -65,15 +65,15 @@ _UNPLANTED = {"body": dict.fromkeys(PLANTED)}
 WITHOUT_PROMPT = json.dumps({"prompt_blocks": None, **dict.fromkeys(SIDES, _UNPLANTED)})
 
 
-def prompts_page(site: Site, asked: Mapping[str, str]) -> str:
+def prompts_page(site: Site, params: Mapping[str, str]) -> str:
     """Return all prompts side by side, and the differences that they make."""
-    bar = scope_of(site, asked)
+    bar = scope_of(site, params)
     chosen = bar.scope.drivers or bar.drivers
     job, contrasts = site.table("contrasts", bar.scope.sweep, bar.scope.condition)
     drivers, ends = differences(contrasts, chosen) if contrasts else ({}, {})
     filters = {**bar.scope.filters, "variant": "", "who": ["drivers", "mocks"]}
     played: dict[str, list[str]] = {}
-    for row in site.catalogue.counts(filters, "model", "variant"):
+    for row in site.trial_index.counts(filters, "model", "variant"):
         played.setdefault(row["model"], []).append(row["variant"])
     several = {name: prompts for name, prompts in played.items() if len(prompts) > 1}
     otherwise = []  # k of n trials that ended otherwise than with the baseline
@@ -86,7 +86,7 @@ def prompts_page(site: Site, asked: Mapping[str, str]) -> str:
         "prompts.html",
         view="prompts",
         bar=bar,
-        carried=carried(asked),
+        carried=carried(params),
         job=job,
         contrasts=contrasts,
         prompts=_first_prompts(site),
@@ -104,7 +104,7 @@ def _first_prompts(site: Site) -> dict[str, dict[str, list[Part]]]:
     """Return the first prompt's parts, by variant and reader: two readers where theirs differ."""
     by_variant: dict[str, dict[str, list[Part]]] = {}
     seen: dict[str, list[list[Part]]] = {}
-    for row in site.catalogue.ask(FIRST, BASELINE):
+    for row in site.trial_index.ask(FIRST, BASELINE):
         variant, digests = row["variant"], digests_of(json.loads(row["blocks"]), row["side"])
         parts = parts_of(row["prompt"], row["baseline"], digests)
         changes = [part for part in parts if part.changed or row["baseline"] is None]
@@ -144,7 +144,7 @@ def differences(
 
 def left_out(site: Site, variant: str) -> str:
     """Describe the blocks that a variant's prompt leaves out and adds, by name and meaning."""
-    ((names,),) = map(dict.values, site.catalogue.ask(STORED, variant))
+    ((names,),) = map(dict.values, site.trial_index.ask(STORED, variant))
     if names is None:
         return f"of which {UNKNOWN}"
     baseline = frozenset(blocks_of(BASELINE))
@@ -166,13 +166,13 @@ def _named(block: str) -> str:
 
 def pairs_of(site: Site, driver: str, variant: str) -> tuple[list[Row], list[Row]]:
     """Return a variant's pairs of trials with the baseline, and those that ended otherwise."""
-    pairs = site.catalogue.ask(PAIRS, WITHOUT_PROMPT, unmarked(driver), variant, BASELINE)
+    pairs = site.trial_index.ask(PAIRS, WITHOUT_PROMPT, unmarked(driver), variant, BASELINE)
     return pairs, [pair for pair in pairs if pair["outcome"] != pair["base_outcome"]]
 
 
-def discordant_page(site: Site, asked: Mapping[str, str]) -> str:
+def discordant_page(site: Site, params: Mapping[str, str]) -> str:
     """Return the pairs of trials that ended otherwise with a variant than with the baseline."""
-    driver, variant = asked.get("model", ""), asked.get("variant", "")
+    driver, variant = params.get("model", ""), params.get("variant", "")
     if not driver or not variant:
         raise NotThere("/discordant needs model=MODEL and variant=VARIANT")
     pairs, differing = pairs_of(site, driver, variant)

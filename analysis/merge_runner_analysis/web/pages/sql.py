@@ -52,9 +52,9 @@ limit 20""",
 }
 
 
-def sql_page(site: Site, asked: Mapping[str, str]) -> str:
+def sql_page(site: Site, params: Mapping[str, str]) -> str:
     """Return the page of a query, with its result."""
-    query = query_in(asked)
+    query = query_in(params)
     is_asked, result, problem = bool(query.strip()), None, None
     if is_asked:
         try:
@@ -67,9 +67,9 @@ def sql_page(site: Site, asked: Mapping[str, str]) -> str:
     return site.render(
         "sql.html",
         view="sql",
-        bar=scope_of(site, asked, any_prompt=True),
-        carried=carried(asked),
-        query=query if is_asked else scoped_query(carried(asked)),
+        bar=scope_of(site, params, any_prompt=True),
+        carried=carried(params),
+        query=query if is_asked else scoped_query(carried(params)),
         asked=is_asked,
         longest=LONGEST,
         examples=EXAMPLES,
@@ -83,9 +83,9 @@ def sql_page(site: Site, asked: Mapping[str, str]) -> str:
     )
 
 
-def sql_csv(site: Site, asked: Mapping[str, str]) -> Response:
+def sql_csv(site: Site, params: Mapping[str, str]) -> Response:
     """Return the whole result of a query as a file; raises UsageError."""
-    return download(site.queries.csv(query_in(asked)), "query.csv")
+    return download(site.queries.csv(query_in(params)), "query.csv")
 
 
 def scoped_query(chosen: Mapping[str, Sequence[str]]) -> str:
@@ -100,6 +100,6 @@ def scoped_query(chosen: Mapping[str, Sequence[str]]) -> str:
     )
 
 
-def query_in(asked: Mapping[str, str]) -> str:
+def query_in(params: Mapping[str, str]) -> str:
     """Return the query in an address; a form ends its lines with CR LF."""
-    return asked.get("q", "").replace("\r\n", "\n")
+    return params.get("q", "").replace("\r\n", "\n")

@@ -49,11 +49,11 @@ TRUST = [
 ALWAYS = ("collided", "failed", "invalid", "faults")
 
 
-def sweeps_page(site: Site, asked: Mapping[str, str]) -> str:
+def sweeps_page(site: Site, params: Mapping[str, str]) -> str:
     """Return the runs of a scope; raises NotThere, and NothingNew where they are as ``seen``."""
-    bar, part = scope_of(site, asked, any_prompt=True), carried(asked)
-    runs = list_runs(site.catalogue)
-    counted = numbers_of(site.catalogue, bar.scope.filters)
+    bar, part = scope_of(site, params, any_prompt=True), carried(params)
+    runs = list_runs(site.trial_index)
+    counted = numbers_of(site.trial_index, bar.scope.filters)
     rare = counted[""] | {"fallbacks": 0}  # each follows an invalid reply
     return site.render(
         "sweeps.html",
@@ -64,26 +64,26 @@ def sweeps_page(site: Site, asked: Mapping[str, str]) -> str:
         counted=counted,
         audit=audit_of(site, runs),
         shown=[rate for rate in TRUST if str(rate["count"]) in ALWAYS or rare[str(rate["count"])]],
-        seen=news_of((runs, site.catalogue.state), asked.get("seen", "")),
+        seen=news_of((runs, site.trial_index.state), params.get("seen", "")),
     )
 
 
-def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
+def sweep_page(site: Site, sweep_id: str, params: Mapping[str, str]) -> str:
     """Return the page of a run; raises NotThere, and NothingNew where it is as ``seen``."""
-    seen = asked.get("seen", "")
-    matching = [run for run in list_runs(site.catalogue) if run["sweep_id"] == sweep_id]
+    seen = params.get("seen", "")
+    matching = [run for run in list_runs(site.trial_index) if run["sweep_id"] == sweep_id]
     if not matching:
         raise NotThere(f"the database holds no run {sweep_id}")
     (run,) = matching
     state = run["state"]
-    if seen and state == "lost" and site.catalogue.copies.is_locked:
+    if seen and state == "lost" and site.trial_index.copies.is_locked:
         raise NothingNew  # how it ended cannot be read yet
     return site.render(
         "sweep.html",
         view="sweeps",
         entry=run,
         audit=audit_of(site, [run]),
-        arms=site.catalogue.counts({"sweep": sweep_id}, "model", "variant"),
+        arms=site.trial_index.counts({"sweep": sweep_id}, "model", "variant"),
         trust=TRUST,
         task=", ".join(
             dict.fromkeys(
@@ -92,8 +92,8 @@ def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
                 for setting in task_settings(arm.get("scenario") or {})
             )
         ),
-        causes=site.catalogue.ask(CAUSES, sweep_id),
-        seen=news_of((run, site.catalogue.state), seen, state),
+        causes=site.trial_index.ask(CAUSES, sweep_id),
+        seen=news_of((run, site.trial_index.state), seen, state),
         # A screen reader says the sentence once a state, and not every time that a number changes.
         quiet=seen.startswith(f"{state}-"),
         heard=bool(seen),

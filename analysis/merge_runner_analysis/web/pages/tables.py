@@ -80,10 +80,10 @@ def _cited(site: Site) -> dict[str, Any]:
     return {"descriptions": descriptions_of(site), "version": version}
 
 
-def table_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
+def table_page(site: Site, name: str, params: Mapping[str, str]) -> str:
     """Return the page of a table; raises NotThere."""
     job, table = site.table(_known(name, TABLES, "table"))
-    without = every(asked, "without")
+    without = every(params, "without")
     columns = shown_columns(table) if table else []
     return site.render(
         "table.html",

@@ -67,10 +67,10 @@ ORDER BY avg((told.headway_m - mine.headway_m) ** 2), told.trial_id, told.spec_h
 
 
 def trial_page(
-    site: Site, trial_id: str, asked: Mapping[str, str], template: str = "trial.html"
+    site: Site, trial_id: str, params: Mapping[str, str], template: str = "trial.html"
 ) -> str:
     """Return a trial with all of its decisions, as a page or by another template."""
-    (page,) = trial_pages(site, [site.trial(trial_id, asked.get("spec", ""))], template)
+    (page,) = trial_pages(site, [site.trial(trial_id, params.get("spec", ""))], template)
     return page
 
 
@@ -102,13 +102,13 @@ def _page(site: Site, row: Row, trial: Trial, template: str) -> str:
         trial_decisions=trial.by_side,
         offers=OFFERS,
         human_offer=HUMAN,
-        has_humans=site.at.served and site.catalogue.has_humans,
+        has_humans=site.at.served and site.trial_index.has_humans,
     )
 
 
 def read(site: Site, rows: Sequence[Row]) -> list[Trial]:
     """Read the stored trials of these rows."""
-    with site.catalogue.cursor() as connection:
+    with site.trial_index.cursor() as connection:
         return read_trials(connection, [(row["trial_id"], row["spec_hash"]) for row in rows])
 
 
@@ -137,7 +137,7 @@ def _panel(site: Site, row: Row, trial: Trial, decision: Row) -> Markup:
             before["prompt"] if before else None,
             trial.blocks[decision["side"]],
         ),
-        others=site.catalogue.listing.others,
+        others=site.trial_index.listing.others,
         reply=shortened(decision["reply"]) if decision["reply"] else None,
         reasoning=shortened(thoughts) if thoughts else None,
         raw=site.at.to("sql.csv", q=query) if site.at.served else "",
@@ -158,27 +158,27 @@ def _older_s(decision: Row, trial: Trial) -> float | None:
     return before["time_s"] if is_left or trial.scenario.fallback == "restart" else None
 
 
-def others(site: Site, trial_id: str, asked: Mapping[str, str]) -> dict[str, Any] | str | None:
+def others(site: Site, trial_id: str, params: Mapping[str, str]) -> dict[str, Any] | str | None:
     """Return other trials for a trial's page: one to compare, one on offer, or several.
 
     ``compare=KEY`` gives that trial's drawing, ``offer=KIND`` a key or None.
     ``q=WORDS`` gives the first trials that have the words, in the same condition before
     others. Raises NotThere.
     """
-    row = site.trial(trial_id, asked.get("spec", ""))
-    if "compare" in asked:
-        other = named(site, asked["compare"])
+    row = site.trial(trial_id, params.get("spec", ""))
+    if "compare" in params:
+        other = named(site, params["compare"])
         return None if other is None else _laid(site, other)
-    if "offer" in asked:
+    if "offer" in params:
         offers = {HUMAN: _nearest_human, REPETITION: _next_repetition}
-        if asked["offer"] not in offers:
+        if params["offer"] not in offers:
             raise NotThere(f"there are no other offers than {', '.join(OFFERS)}")
-        offered = offers[asked["offer"]](site, row)
+        offered = offers[params["offer"]](site, row)
         sql = f"SELECT key FROM ({NAMED}) WHERE trial_id = ? AND spec_hash = ?"  # noqa: S608 # constants
-        return site.catalogue.ask(sql, *offered)[0]["key"] if offered else None
-    words = asked.get("q", "").lower().split()
+        return site.trial_index.ask(sql, *offered)[0]["key"] if offered else None
+    words = params.get("q", "").lower().split()
     fits = " AND contains(words, ?)" * len(words)
-    rows = site.catalogue.ask(
+    rows = site.trial_index.ask(
         f"SELECT key, outcome, note FROM ({NAMED}) WHERE (trial_id, spec_hash) <> (?, ?){fits} "  # noqa: S608 # constants
         f"ORDER BY condition <> ?, trial_id, spec_hash LIMIT {FOUND}",
         *(row["trial_id"], row["spec_hash"], *words, row["condition"]),
@@ -189,7 +189,7 @@ def others(site: Site, trial_id: str, asked: Mapping[str, str]) -> dict[str, Any
 def named(site: Site, key: str) -> Row | None:
     """Return the trial of a key; a name with several specs stands for the first of them."""
     name, _, spec = key.rpartition("@")
-    return site.catalogue.find(key) or (site.catalogue.find(name, spec) if name else None)
+    return site.trial_index.find(key) or (site.trial_index.find(name, spec) if name else None)
 
 
 def _laid(site: Site, row: Row) -> dict[str, Any] | None:
@@ -206,13 +206,13 @@ def _laid(site: Site, row: Row) -> dict[str, Any] | None:
 
 def _nearest_human(site: Site, row: Row) -> tuple[str, str] | None:
     given = {"trial": row["trial_id"], "spec": row["spec_hash"], "condition": row["condition"]}
-    with site.catalogue.cursor() as connection:
+    with site.trial_index.cursor() as connection:
         return connection.execute(NEAREST, given).fetchone()
 
 
 def _next_repetition(site: Site, row: Row) -> tuple[str, str] | None:
     same = {name: row[name] for name in ("condition", "model", "variant", "pair", "spec_hash")}
-    rows = sorted(site.catalogue.every(same), key=itemgetter("rep", "trial_id"))
+    rows = sorted(site.trial_index.every(same), key=itemgetter("rep", "trial_id"))
     alike = [(other["trial_id"], other["spec_hash"]) for other in rows]
     place = alike.index((row["trial_id"], row["spec_hash"]))
     return (alike * 2)[place + 1] if len(alike) > 1 else None
@@ -225,7 +225,7 @@ def notes_page(site: Site, _: Mapping[str, str]) -> str:
     """
     stored, shown = site.notes.read(), []
     for note in reversed(stored.notes):
-        row = site.catalogue.find(note.trial_id, note.spec_hash)
+        row = site.trial_index.find(note.trial_id, note.spec_hash)
         at = {"side": note.side, "decision": note.decision}
         shown.append((note, row and site.at.trial(row, **at)))
     return site.render("notes.html", view="notes", stored=stored, shown=shown)

@@ -10,7 +10,6 @@ from starlette.responses import Response
 from merge_runner.prompts.blocks import decomposed
 from merge_runner.study.arms import OPPONENT
 from merge_runner_analysis.tables import TABLES
-from merge_runner_analysis.web.catalogue import PAGE, SORTS, TrialFilter
 from merge_runner_analysis.web.listing import FACTOR
 from merge_runner_analysis.web.phrases import causes_text, plain
 from merge_runner_analysis.web.pictures import speed_range
@@ -18,6 +17,7 @@ from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.scope import HEADINGS, carried, facets_shown, filter_of, sort_of
 from merge_runner_analysis.web.search import FACETS, LIMITS, search, terms_of
 from merge_runner_analysis.web.site import NotThere, Site, download, news_of
+from merge_runner_analysis.web.trial_index import PAGE, SORTS, TrialFilter
 from merge_runner_analysis.web.urls import CELL, whole
 
 MOST = 4  # drivers whose sums stand above a list
@@ -26,28 +26,28 @@ OF_WORDS = HEADINGS | {"tactical": "said", "switch": "change of mind", "failure"
 LIMIT = re.compile(r"-?(0?\.\d{1,6}|[01](\.0{1,6})?)")
 
 
-def trials_page(site: Site, asked: Mapping[str, str]) -> str:
+def trials_page(site: Site, params: Mapping[str, str]) -> str:
     """Return a page of the trials in an address; raises NothingNew where it is as ``seen``."""
-    state = site.catalogue.state
-    seen = news_of(state, asked.get("seen", ""))
-    news = site.at.to("trials", **{**asked, "seen": seen})
-    if "seen" in asked:  # that the trials are no longer those that were seen
-        address = site.at.to("trials", **{**asked, "seen": ""})
+    state = site.trial_index.state
+    seen = news_of(state, params.get("seen", ""))
+    news = site.at.to("trials", **{**params, "seen": seen})
+    if "seen" in params:  # that the trials are no longer those that were seen
+        address = site.at.to("trials", **{**params, "seen": ""})
         return site.render("_news.html", trials=state["trials"], address=address, news=news)
-    chosen, sort, cell = filter_of(asked), sort_of(asked), cell_of(asked)
+    chosen, sort, cell = filter_of(params), sort_of(params), cell_of(params)
     filters, named = chosen, None
     if cell:
         named = site.computed(cell_request(cell))
         if named.content is None:
             return site.render("behind.html", view="trials", cell=cell["cell"], computed=named)
         filters = {**chosen, "trials": named.content["trials"]}
-    totals = site.catalogue.totals(filters)
+    totals = site.trial_index.totals(filters)
     trials = sum(part["trials"] for part in totals)
     last = max(1, -(-trials // PAGE))
-    page = min(whole(asked.get("page", "")) or 1, last)
-    rows = site.catalogue.page(filters, sort, page)
+    page = min(whole(params.get("page", "")) or 1, last)
+    rows = site.trial_index.page(filters, sort, page)
     # An export has no filters. Why replies were invalid says whether they were, too.
-    facets = {} if site.is_still else facets_shown(site, site.catalogue.facets(filters))
+    facets = {} if site.is_still else facets_shown(site, site.trial_index.facets(filters))
     if not chosen.get("validity"):
         facets.pop("validity", None)
     return site.render(
@@ -56,7 +56,7 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
         facets=facets,
         chosen=chosen,
         headings=HEADINGS,
-        carried=carried(asked),
+        carried=carried(params),
         kept={**chosen, **cell},
         cell=cell,
         computed=named,
@@ -89,7 +89,7 @@ def _factors(row: Row) -> str:
 
 def _unknown(site: Site, chosen: TrialFilter) -> list[tuple[str, str, list[str]]]:
     """Return facets, by heading, with a chosen value that no trial has, and the known values."""
-    known = site.catalogue.facets({})
+    known = site.trial_index.facets({})
     return [
         (HEADINGS.get(name, name.removeprefix(FACTOR)), value, [text for text, _ in values])
         for name, value in chosen.items()
@@ -97,17 +97,17 @@ def _unknown(site: Site, chosen: TrialFilter) -> list[tuple[str, str, list[str]]
     ]
 
 
-def trials_csv(site: Site, asked: Mapping[str, str]) -> Response:
+def trials_csv(site: Site, params: Mapping[str, str]) -> Response:
     """Return the trials in an address as a file; raises NotThere, StoreError and TooMuch."""
-    filters: TrialFilter = filter_of(asked)
-    if cell := cell_of(asked):
+    filters: TrialFilter = filter_of(params)
+    if cell := cell_of(params):
         filters = {**filters, "trials": site.awaited(cell_request(cell))["trials"]}
-    return download(site.catalogue.export(filters, sort_of(asked)), "trials.csv")
+    return download(site.trial_index.export(filters, sort_of(params)), "trials.csv")
 
 
-def cell_of(asked: Mapping[str, str]) -> dict[str, str]:
+def cell_of(params: Mapping[str, str]) -> dict[str, str]:
     """Return the cell in an address, with its part of the trials; empty for none."""
-    return {name: asked[name] for name in CELL if asked.get(name)} if asked.get("cell") else {}
+    return {name: params[name] for name in CELL if params.get(name)} if params.get("cell") else {}
 
 
 def cell_request(cell: Mapping[str, str]) -> tuple[str, ...]:
@@ -120,20 +120,20 @@ def cell_request(cell: Mapping[str, str]) -> tuple[str, ...]:
     return "cell", table, row, column, *(cell.get(name, "") for name in part)
 
 
-def words_page(site: Site, asked: Mapping[str, str]) -> str:
+def words_page(site: Site, params: Mapping[str, str]) -> str:
     """Return a page of the decisions that match an address."""
-    query = asked.get("q", "")
-    filters = filter_of(asked) | {name: asked.get(name, "") for name in FACETS}
+    query = params.get("q", "")
+    filters = filter_of(params) | {name: params.get(name, "") for name in FACETS}
     filters = {name: value for name, value in filters.items() if value and name != "q"}
-    limits = {name: text for name in LIMITS if LIMIT.fullmatch(text := asked.get(name, ""))}
+    limits = {name: text for name in LIMITS if LIMIT.fullmatch(text := params.get(name, ""))}
     chosen = {**filters, **limits, "q": query}
-    page = whole(asked.get("page", "")) or 1
-    result = search(site.catalogue, filters, terms_of(query), limits, page)
+    page = whole(params.get("page", "")) or 1
+    result = search(site.trial_index, filters, terms_of(query), limits, page)
     return site.render(
         "words.html",
         view="words",
         headings=OF_WORDS,
-        carried=carried(asked),
+        carried=carried(params),
         limits=LIMITS,
         result=result,
         facets=facets_shown(site, result["facets"]),

@@ -14,7 +14,7 @@ from merge_runner_analysis.figures.first_action import first_action
 from merge_runner_analysis.frames import load
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import StudyResults
-from merge_runner_analysis.web.catalogue import Catalogue
+from merge_runner_analysis.web.trial_index import TrialIndex
 from tests.support.studies import Drive, changed, write_study
 from tests.support.tables import by_id, made, values_of
 
@@ -194,11 +194,11 @@ def test_the_planted_exchange_rate_of_who_was_only_asked_is_found_beside_the_hum
 
 
 def test_the_explorer_and_the_figure_tell_who_was_only_asked(asked):
-    catalogue = Catalogue(asked / "t.duckdb")
-    catalogue.refresh()
-    listed = catalogue.ask("SELECT DISTINCT source FROM listed")
+    trial_index = TrialIndex(asked / "t.duckdb")
+    trial_index.refresh()
+    listed = trial_index.ask("SELECT DISTINCT source FROM listed")
     assert [row["source"] for row in listed] == ["llm"]
-    configs = catalogue.ask("SELECT config::VARCHAR AS config FROM sweeps")
+    configs = trial_index.ask("SELECT config::VARCHAR AS config FROM sweeps")
     assert [bool(json.loads(sweep["config"])["seat"]) for sweep in configs] == [False]
     figure = first_action(StudyResults(asked / "t.duckdb"))
     (axis,), (legend,) = figure.axes, figure.legends

@@ -127,7 +127,7 @@ def _order_of(sort: str) -> str:
 
 
 @dataclass(slots=True)
-class Catalogue:
+class TrialIndex:
     """All trials of a database, as it was when it was last copied."""
 
     db: Path
@@ -208,11 +208,11 @@ class Catalogue:
     def facets(self, filters: TrialFilter) -> Facets:
         """Return each facet's values with the number of trials left under the other filters."""
 
-        def count() -> Facets:
+        def compute() -> Facets:
             names = (*FACETS, *(f"{FACTOR}{name}" for name in self.factors()))
             return facets_of(self.listing.connection, "listed", names, filters)
 
-        return self._once(("facets", filters), count)
+        return self._once(("facets", filters), compute)
 
     def counts(self, filters: TrialFilter, *columns: str) -> list[Row]:
         """Return a filter's trials grouped by columns: counts of all, means of those with a value.
@@ -234,14 +234,14 @@ class Catalogue:
         sql = f"SELECT model, {TOTALS} FROM listed WHERE {where} GROUP BY ALL ORDER BY model"  # noqa: S608 # constants
         return self._once(("totals", filters), lambda: self.ask(sql, *values))
 
-    def _once(self, of: object, count: Callable[[], Counted]) -> Counted:
+    def _once(self, of: object, compute: Callable[[], Counted]) -> Counted:
         """Return a count of the present list, from memory after the first call."""
         with self._lock:
             if len(self._counted) > MOST_COUNTED:
                 self._counted.clear()
             name = repr(of)
             if name not in self._counted:
-                self._counted[name] = count()
+                self._counted[name] = compute()
             counted: Counted = self._counted[name]
             return counted
 
