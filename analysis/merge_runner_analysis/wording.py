@@ -69,7 +69,7 @@ FITTED_RULE = (
     "Same tendency as people in the gap by headway: more headway, more gap, with p below .05 in a "
     "linear regression. Like people in the gap by relative velocity: it moves the gap by less than "
     "1 m; in accelerations held: within half a standard deviation of people. Unlike people's in "
-    "either: a difference is shown"
+    "these two: a difference is shown"
 )
 VERDICT_RULE = ". ".join((*VERDICT_RULES, FITTED_RULE)).format(tests="")
 # Measures that the first page shows, with its headings.
@@ -127,8 +127,8 @@ EGO = (
     "goes first is counted for the driver under study",
 )
 HALVES = (
-    "Where two equal drivers get the same, a trial counts half for each, so that their share is "
-    "50 % by construction"
+    "Where two equal drivers get the same, a trial counts half for each: these trials alone have a "
+    "share of 50 % by construction"
 )
 UNREADABLE = "the stored study cannot be read by this version"
 # Note on levels that no driver reads.

@@ -67,7 +67,7 @@ def _of_trials(table: Table, study: StudyResults) -> Iterator[str]:
         )
     if counts := [f"{g.id}: {g.equal} of {len(g.trials)}" for g in groups if g.equal]:
         yield (
-            f"{', '.join(counts)} trials of language models are as an earlier one to the last "
+            f"{', '.join(counts)} trials are as an earlier one to the last "
             "state: each is a sample, and counts"
         )
     if pairs := [f"{group.id}: {_ego_sides(group)}" for group in groups if len(group.models) > 1]:

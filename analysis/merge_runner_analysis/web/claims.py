@@ -133,12 +133,14 @@ def _not_shown(rows: Sequence[Row]) -> Iterator[str]:
     """Yield sentences on primary tests without an effect; of more than FEW the first alone."""
     if len(rows) > FEW:
         yield (
-            f"{len(rows)} levels are not shown to change it; {level_text(rows[0])} comes nearest: "
+            f"{len(rows)} levels are not shown to change {changed(rows[0])}; "
+            f"{level_text(rows[0])} comes nearest: "
             f"{test_text(rows[0])}."
         )
         return
     for row in rows:
-        yield f"{capital(level_text(row))} is not shown to change it: {test_text(row)}."
+        level, what = capital(level_text(row)), changed(row)
+        yield f"{level} is not shown to change {what}: {test_text(row)}."
 
 
 def _seen(rows: Sequence[Row]) -> str:

@@ -113,8 +113,8 @@ def gap_weights(drivers: Sequence[Driver], short: Mapping[str, str]) -> str:
     if len(ends) < 2:
         return ""
     return unbroken(
-        "Each driver is compared with people's gap in the situations as it drove them, "
-        f"{' to '.join(ends)} m; the row of people has that of {short[drivers[0].name]}"
+        "People's mean gap depends on the situations, so it is computed for those of each driver: "
+        f"{' to '.join(ends)} m. The row of people has that beside {short[drivers[0].name]}"
     )
 
 

@@ -153,8 +153,8 @@ def test_people_s_gap_is_given_as_each_driver_is_compared_with_it():
     of = [driver(name, gap={"state": OPEN, "n": 30, "human": gap}) for name, gap in
           (("a", 3.851), ("b", 3.869))]  # fmt: skip
     assert gap_weights(of, NAMES).replace("\xa0", " ") == (
-        "Each driver is compared with people's gap in the situations as it drove them, 3.85 to "
-        "3.87 m; the row of people has that of a"
+        "People's mean gap depends on the situations, so it is computed for those of each driver: "
+        "3.85 to 3.87 m. The row of people has that beside a"
     )
     assert gap_weights(of[:1], NAMES) == ""
 

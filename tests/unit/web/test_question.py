@@ -58,13 +58,14 @@ SEEN = "The study had 80 % power for an effect of 10.00 points."
         (
             [effect("persona", 0.5, difference=1.0), effect()],
             HURRY,
-            f"{SAME}p = 0.001. Persona=yes is not shown to change it: +1.00 points [−6.00, 8.00], "
+            f"{SAME}p = 0.001. Persona=yes is not shown to change who goes first: "
+            "+1.00 points [−6.00, 8.00], "
             "corrected p = 0.500.",
         ),
         (
             [effect(p=0.2), effect(measure=GAP, p=0.0001, estimate=3.8, estimate_reference=4.3)],
             "No change of who goes first is shown by hurry.",
-            "Hurry=yes is not shown to change it: +13.00 points [6.00, 20.00], "
+            "Hurry=yes is not shown to change who goes first: +13.00 points [6.00, 20.00], "
             f"corrected p = 0.200. {SEEN} Hurry changes the gap at the merge point: "
             "3.80 m with hurry=yes, 4.30 m with hurry=no.",
         ),
@@ -82,7 +83,8 @@ SEEN = "The study had 80 % power for an effect of 10.00 points."
         (
             [effect(f"words{n}", 0.9 - n / 10, difference=1.0) for n in range(4)],
             "No change of who goes first is shown by words3, words2, words1 and words0.",
-            "4 levels are not shown to change it; words3=yes comes nearest: +1.00 points "
+            "4 levels are not shown to change who goes first; words3=yes comes nearest: "
+            "+1.00 points "
             f"[−6.00, 8.00], corrected p = 0.600. {SEEN}",
         ),
         (
@@ -97,14 +99,16 @@ SEEN = "The study had 80 % power for an effect of 10.00 points."
                 effect("persona × hurry", 0.01, difference=-8.0, drivers="scripted"),
             ],
             "No change of who goes first is shown by hurry.",
-            "Hurry=yes is not shown to change it: +2.00 points [−5.00, 9.00], "
+            "Hurry=yes is not shown to change who goes first: +2.00 points [−5.00, 9.00], "
             f"corrected p = 0.400. {SEEN}",
         ),
         (
             [effect(p=0.2), effect("persona", 0.3, difference=1.0)],
             "No change of who goes first is shown by hurry and persona.",
-            "Hurry=yes is not shown to change it: +13.00 points [6.00, 20.00], corrected p = "
-            "0.200. Persona=yes is not shown to change it: +1.00 points [−6.00, 8.00], corrected p "
+            "Hurry=yes is not shown to change who goes first: +13.00 points [6.00, 20.00], "
+            "corrected p = "
+            "0.200. Persona=yes is not shown to change who goes first: "
+            "+1.00 points [−6.00, 8.00], corrected p "
             f"= 0.300. {SEEN.rstrip('.')} (hurry), 10.00 (persona).",
         ),
         (
