@@ -141,7 +141,7 @@ def _compared_row(study: StudyResults, effect: Effect) -> Row:
 
 
 def _is_shown(effect: Effect) -> bool:
-    """Return whether an effect has a row; a level without a test has one that says why."""
+    """Return whether an effect has a row: no median, and no interaction without a test."""
     is_tested = not effect.across or effect.difference.p is not None
     return effect.metric.estimator != "median" and is_tested
 

@@ -41,7 +41,7 @@ Jobs = list[Job]
 
 
 def _question(site: Site, bar: Bar) -> tuple[Jobs, Jobs, Answer | None]:
-    """Return the jobs of the factor tables, those that had no table yet, and the answer."""
+    """Return the jobs of the factor tables, those still without a table, and the answer."""
     if len(bar.prompts) < 2 and not site.trial_index.factors():
         return [], [], None
     part = bar.scope.sweep, bar.scope.condition
