@@ -12,8 +12,8 @@ for its reply.
 
 The worst case of an attempt is reserved in this process while it waits for its turn, and in the
 ledger right before it is sent. A server may ignore the output cap. So several attempts are in
-flight only while twice their worst cases fit. Then only the last reply can exceed the cap, unless
-one costs more than twice the largest worst case that was reserved before or for it.
+flight only if twice the largest worst case fits for each. If no reply costs more than that, only
+the last one can exceed the cap.
 """
 
 from __future__ import annotations
@@ -144,7 +144,10 @@ class MoneyQueue:
             self.waiters[0].changed.set()
 
     def reorder(self, trial: int | None = None) -> None:
-        """Sort the queue after a trial has begun or ended; None: one has joined or left a call."""
+        """Sort the queue, and wake its first.
+
+        ``trial`` has begun or ended; None: the trials that share a call have changed.
+        """
         if trial is None or any(trial in waiter.trials for waiter in self.waiters):
             self.waiters.sort(key=self._place)
         self.wake()
@@ -168,8 +171,8 @@ class MoneyQueue:
 class Budget:
     """Spending under a ledger's cap; without a cap it is only recorded.
 
-    The models of a run with a price share one, and its free models another one without a cap.
-    A trial is named by its order in the sweep; ``trial_usd`` returns its expected cost.
+    All models of a run that have a price share a budget. Its free models share another, without a
+    cap. A trial is named by its order in the sweep; ``trial_usd`` returns its expected cost.
     ``open_reservations`` counts reservations, ``queued_usd`` is reserved in this process alone.
     ``expected_usd`` has, by running trial, the rest of its expected cost, below 0 where it has cost
     more.
@@ -189,7 +192,8 @@ class Budget:
     async def admit(self, trials: Sequence[int]) -> None:
         """Wait until one of the trials that share a call runs, or the oldest of them may begin.
 
-        ``trials`` may change meanwhile. Raises TrialSuspended if no other trial can free money.
+        ``trials`` may change meanwhile. Raises TrialSuspended if there is too little money and no
+        other trial can free any.
         """
         if self.ledger.cap is not None and self.expected_usd.keys().isdisjoint(trials):
             may_begin = partial(self._may_begin, trials)
@@ -197,7 +201,7 @@ class Budget:
             self.queue.reorder(min(trials))
 
     def readmit(self, trial: int) -> None:
-        """Admit a trial at once whose call an earlier run has sent."""
+        """Admit at once a trial whose call an earlier run has sent."""
         if self.ledger.cap is not None and trial not in self._ended:
             self.expected_usd.setdefault(trial, self.trial_usd(trial))
             self.queue.reorder(trial)
@@ -213,8 +217,9 @@ class Budget:
     ) -> Reservation:
         """Reserve an attempt's worst case for the oldest running trial of those that share a call.
 
-        It is scaled where the server ignores the output cap. Waits while other attempts or older
-        trials may free money, then raises TrialSuspended. The caller closes the reservation.
+        It is scaled where the server ignores the output cap. Waits until there is money for it;
+        raises TrialSuspended if there is too little and no open attempt can free any. The caller
+        closes the reservation.
         """
         may_reserve = partial(self._may_reserve, trials, label, is_probe)
         if self.ledger.cap is not None and (self.queue.waiters or not may_reserve()):
@@ -226,7 +231,7 @@ class Budget:
     def _may_begin(self, trials: Sequence[int]) -> bool:
         """Return whether one of the trials runs; if none does, admit the oldest if its cost fits.
 
-        Raises TrialSuspended if no other trial can free money.
+        Raises TrialSuspended if there is too little money and no other trial can free any.
         """
         if not self.expected_usd.keys().isdisjoint(trials):
             return True
@@ -252,8 +257,8 @@ class Budget:
         if left_usd < worst_usd and not self.open_reservations:
             raise self._suspended(f"the next call may cost {worst_usd:.4f} USD")
         older_usd = 0.0 if is_probe else self._still_expected_usd(before=self._payer(trials))
-        # Only the first expensive reply shows that a server ignores the output cap, when the others
-        # are sent already: all in flight may cost twice as much.
+        # A server that ignores the output cap shows it in its first expensive reply, when others
+        # are in flight already: each may cost twice as much.
         twice_usd = (self.open_reservations + 1) * max(worst_usd, self._largest_usd)
         return left_usd - worst_usd >= max(older_usd, twice_usd if self.open_reservations else 0.0)
 

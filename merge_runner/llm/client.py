@@ -41,8 +41,8 @@ class LlmClient:
     """Client of one model: returns its replies to prompts.
 
     ``direct`` sends normal requests, ``batch`` sends them in batches. ``calls`` are the run's
-    calls. If all trials of a call are cancelled, it goes on while it may be billed, to store its
-    reply, and is cancelled while it waits. ``strict``: a reply of another model stops the sweep.
+    calls. A call whose trials are all cancelled goes on if it may be billed, so that its reply is
+    stored. Any other is cancelled. ``strict``: a reply of another model stops the sweep.
     """
 
     endpoint: EndpointState
@@ -152,7 +152,7 @@ class LlmClient:
             await self._quarantine(call)
         if self.batch is not None and call.pending_batch:
             self.batch.resume(call)
-        elif not self.endpoint.verified:  # never in a run of batches, or calls would wait for hours
+        elif not self.endpoint.verified:
             async with self.probe.turn(call):
                 return await self._attempts(call)
         return await self._attempts(call)
@@ -174,7 +174,7 @@ class LlmClient:
             return await self._attempt(call)
         except TryAgain as exc:
             failures = [exc]
-        # Only here, since it costs time and memory that most calls need not spend.
+        # Imported here, since most calls need no second attempt.
         from tenacity import AsyncRetrying, retry_if_exception_type
 
         async def next_attempt() -> ChatReply:

@@ -40,7 +40,7 @@ ATTEMPTS = TypeAdapter(Attempts)
 UNANSWERED, _DAMAGED = "attempts ", "damaged "
 UNSEEN = "the run ended before a reply was seen; it may have been charged"
 _GET = "SELECT mode, filename, value FROM Cache WHERE key = ? AND raw = 1"
-# The rows of a call, and of its attempts in flight when their process ended.
+# The rows of a call, and of its attempts in flight.
 _LOOK_UP = """
 SELECT key, mode, filename, value FROM Cache WHERE raw = 1 AND key IN (?1, ?2)
 UNION ALL SELECT NULL, attempt, NULL, since FROM open WHERE call = ?1 AND outcome = 'in flight'
@@ -220,7 +220,7 @@ class CallStore(CacheFile):
     def look_up(
         self, key: str, request: ChatRequest | None = None
     ) -> tuple[CachedCall | None, Attempts]:
-        """Return the entry of a call, or the attempts of earlier runs, unseen ones included.
+        """Return the entry of a call, or its attempts without an answer, also those in flight.
 
         Raises RecordingError where the folder's are damaged, or do not match the ``request``.
         """
@@ -246,7 +246,7 @@ class CallStore(CacheFile):
         return text_of(*rows[0]) if rows else None
 
     def replace(self, name: str, text: str, _: Execute) -> None:
-        """Store a text after a checksum, not under a call key. Runs in a transaction."""
+        """Store a text with its checksum; its name is no call key. Runs in a transaction."""
         self.texts.set(name, _checksum(text) + text)
 
     def remove(self, name: str, _: Execute) -> None:

@@ -62,7 +62,7 @@ DIGEST_COLUMNS = {
 
 
 class Store:
-    """Writer of sweeps and whole trials; every method is one short transaction."""
+    """Database of sweeps and whole trials, open only during short transactions."""
 
     def __init__(self, path: Path) -> None:
         """Open or create the database; raises UsageError for a foreign file or another schema."""
@@ -108,8 +108,8 @@ class Store:
     def ended_trials(self, specs: Mapping[TrialKey, TrialSpec]) -> set[TrialKey]:
         """Return the keys of the trials that are stored and did not fail.
 
-        Raises UsageError if a condition is stored with other numbers, which spec hashes do not
-        cover.
+        Raises UsageError if a condition is stored with another headway or relative velocity: spec
+        hashes do not cover them.
         """
         keys = list(specs)
         kinematics = {spec.condition: spec.kinematics for spec in specs.values()}
@@ -153,7 +153,7 @@ class Store:
         They are linked to a sweep unless ``sweep_id`` is None. Returns the keys of trials that are
         stored with other values, with the differing columns.
         """
-        # Made before the database is locked, although trials that are stored need no rows.
+        # Made before the database is locked, so that the lock is short.
         played = [(record.spec.key, record.status, rows_of(record)) for record in records]
         calls = [call for record in records for call in record.calls]
         texts = [call.request.body for call in calls]

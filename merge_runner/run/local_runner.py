@@ -44,7 +44,7 @@ class LocalRunner:
     # Numbers of open questions, by trial.
     _open_questions: Counter[int] = field(default_factory=Counter)
     _gate: asyncio.Semaphore = field(default_factory=partial(asyncio.Semaphore, A_FEW))
-    # Keys of failed calls by model and its number of answered calls: an answer starts a new set.
+    # Keys of calls that failed since a model's last answer, by model and number of its answers.
     _failed: dict[tuple[str, int], set[str]] = field(default_factory=partial(defaultdict, set))
 
     def __post_init__(self) -> None:
@@ -74,7 +74,10 @@ class LocalRunner:
     async def play(
         self, specs: Sequence[TrialSpec], ended: Ended, capacity: Capacity | None = None
     ) -> None:
-        """Play trials in order; any error but TrialSuspended, also of ``ended``, ends the run."""
+        """Play trials in order; pass each record, or TrialSuspended, to ``ended``.
+
+        Any other error, also one that ``ended`` raises, ends the run.
+        """
         waiting = iter(specs)
 
         async def work() -> None:
@@ -136,7 +139,7 @@ class LocalRunner:
     async def _next_round(self) -> None:
         """Wait for a round of the event loop with room for a trial.
 
-        Thousands of recorded replies would all be ready at once.
+        Trials with recorded replies never wait for a call: thousands would fill one round.
         """
         async with self._gate:
             await asyncio.sleep(0)

@@ -66,9 +66,9 @@ def load_study(
 ) -> tuple[StudySource, Catalogue]:
     """Read a study, and return it with its catalogue after the user's consent to its code.
 
-    ``registered`` are parts that were registered for it. ``models`` replace the file's models;
-    None: no model is called. Consent also covers the servers that get keys. ``trust`` gives
-    consent. Raises UsageError.
+    ``registered`` are parts that were registered for it. ``models`` are called in place of the
+    file's; if empty, the file's are; if None, no model is. Consent also covers the servers that get
+    keys. ``trust`` gives consent. Raises UsageError.
     """
     study = read_study(name) if isinstance(name, str) else name
     file = study.file
@@ -209,8 +209,8 @@ def catalogue_of(
 def declared_catalogue(file: StudyFile) -> Catalogue:
     """Return the catalogue of a study file's declarations, without its plug-ins.
 
-    It has no text: it is not the loaded study, and another study may replace it. Drivers of
-    unregistered programs are left out. Raises UsageError.
+    Its text is empty, so that it does not count as a loaded study. Drivers of unregistered programs
+    are left out. Raises UsageError.
     """
     known = {name: driver for name, driver in file.drivers.items() if driver.program in PROGRAMS}
     return catalogue_of(file.model_copy(update={"drivers": known}), "", {})

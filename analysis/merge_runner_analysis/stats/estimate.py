@@ -13,13 +13,13 @@ from merge_runner_analysis.wording import Fact
 class Estimate:
     """A number with its interval, counts and test; None: unknown.
 
-    ``ends_at`` finds the interval's ends at another ``level``, if it is not Student's t. A rate
-    counts ``k`` of ``n`` trials, or replies of ``n`` trials; one of humans is as precise as one of
-    ``effective_n`` independent trials. With ``undecided`` trials a rate has no value,
-    and its interval holds both worst cases (Manski 1989). ``freedom`` is infinite where the test is
-    not Student's t. ``p`` is two-sided, against 0, ``p_holm`` corrected over a family,
-    ``detectable`` the minimum detectable effect at 80 % power. ``problem`` says why something is
-    missing, ``source`` where a published one is from.
+    ``ends_at`` finds the interval's ends at another ``level``, if it is not Student's t. A rate has
+    ``k`` hits in ``n`` trials; a rate of replies has ``k`` replies from ``n`` trials. A weighted
+    rate of humans is as precise as that of ``effective_n`` independent trials. With ``undecided``
+    trials a rate has no value, and its interval holds both worst cases (Manski 1989). ``freedom``
+    is infinite where the test is not Student's t. ``p`` is two-sided, against 0, ``p_holm``
+    corrected over a family, ``detectable`` the minimum detectable effect at 80 % power.
+    ``problem`` says why something is missing, ``source`` where a published one is from.
     """
 
     value: float | None = None
@@ -46,7 +46,7 @@ class Estimate:
         return self.low, self.high
 
     def in_percent(self) -> Estimate:
-        """Return the same share in percent; its trials stay as they are."""
+        """Return the share in percent, with the same counts."""
         ends = (self.value, self.low, self.high, self.se, self.detectable)
         value, low, high, se, least = (None if end is None else 100 * end for end in ends)
         scaled = replace(self, value=value, low=low, high=high, se=se, detectable=least)

@@ -1,4 +1,4 @@
-"""Effects of factors in every measure; prompts and single factors are selections of it."""
+"""Tables of effects: of all factors, of prompts, and between two drivers."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ from merge_runner_analysis.wording import (
 
 TEST = "of the test of Mantel and Haenszel, or of Welch's"
 UNTESTED = (
-    "no test: it needs cells that all levels have, spread within cells, and trials of one study, "
-    "none of them undecided or at two levels"
+    "no test: it needs several trials of each level in shared cells, all of one study, none "
+    "undecided or at two levels"
 )
 
 DIFFERENCE = (
@@ -141,7 +141,7 @@ def _compared_row(study: StudyResults, effect: Effect) -> Row:
 
 
 def _is_shown(effect: Effect) -> bool:
-    """Return whether an effect has a row; a level without a test has one that says why."""
+    """Return whether an effect has a row: no median, and no interaction without a test."""
     is_tested = not effect.across or effect.difference.p is not None
     return effect.metric.estimator != "median" and is_tested
 
@@ -245,11 +245,11 @@ def _notes(study: StudyResults, by: str) -> Iterator[str]:
         yield "the trials of judged drivers differ in no factor"
         return
     yield (
-        "levels are compared within the cells that both have, a condition with one level of each "
-        "other factor: shares by the test of Mantel and Haenszel with the score interval that "
-        "agrees with it, means by Welch's test in a model with a level for each cell. An "
-        "interaction (×) is the difference of a level minus that at the reference of the other "
-        "factor, in the cells that all four have"
+        "levels are compared within the cells that both have; a cell is a condition with one level "
+        "of each other factor. Shares are compared by the test of Mantel and Haenszel, with its "
+        "score interval; means by Welch's test, in a model with an intercept for each cell. An "
+        "interaction (×) is a level's difference from its reference, minus the same difference at "
+        "the reference of the other factor, in the cells that all four have"
     )
     if tested:
         corrected = [effect for effect in tested if not (by and effect.across)]
@@ -261,7 +261,7 @@ def _notes(study: StudyResults, by: str) -> Iterator[str]:
         rest = f"the {len(others)} other tests of the table effects"
         rest += f", {crossed} of them of interactions" * bool(crossed) + _uncounted(corrected)
         names = f" by {joined([*dict.fromkeys(of_primary)])}" if of_primary else ""
-        yield f"{CORRECTED} {first}{names}, and apart from them for {rest}"
+        yield f"{CORRECTED} {first}{names}, and separately for {rest}"
         yield "detectable: found at p < .05, before correction, with power .8"
     counts = [
         f"{level.id}: {level.pooled.repeated} of {len(level.pooled.stored.trials)}"
@@ -270,8 +270,8 @@ def _notes(study: StudyResults, by: str) -> Iterator[str]:
     ]
     if counts:
         yield (
-            f"{', '.join(counts)} trials went as others of the level to the last state, at another "
-            "level of a factor that their drivers do not read: each counts once, in one cell"
+            f"{', '.join(counts)} trials went exactly as others of the level, which differ only "
+            "in a factor that their drivers do not read. Such trials count once, in one cell"
         )
     yield from (f"{levels[0].factor}{levels[0].mark}: {balance(study, levels)}" for levels in every)
     yield RULES_NOTE
@@ -433,7 +433,7 @@ def _same_as_reference(study: StudyResults) -> Iterator[str]:
 def balance(study: StudyResults, levels: list[Level]) -> str:
     """Return a sentence on whether all levels of a factor have the same cells.
 
-    Some may have a mirrored cell only where who goes first is read from both sides.
+    For who goes first, the mirrored cells of equal drivers count too.
     """
     cells_of = {level.name: cells_seen(study, level) for level in levels}
     every = set().union(*cells_of.values())
@@ -449,6 +449,6 @@ def balance(study: StudyResults, levels: list[Level]) -> str:
     if played == every:
         return same
     return (
-        f"{same} for who goes first, which is read from both sides of equal drivers, and "
-        f"{len(played)} for other measures"
+        f"{same} for who goes first, which is read from both sides of equal drivers; for "
+        f"other measures they share {len(played)}"
     )

@@ -50,7 +50,7 @@ def test_a_level_counts_each_trial_of_a_program_once(db, factors):
         # Each prompt is a cell of its own only to the model, but where all are compared.
         sources = explain(StudyResults(db), factors, f"model={model}/left_first_percent:n").sources
         assert sum(len(source.trials) for source in sources) == n
-    (note,) = notes_with(factors, "went as others of the level to the last state")
+    (note,) = notes_with(factors, "went exactly as others of the level")
     assert "model=one: 44 of 88, model=two: 44 of 88" in note
     assert "model: every level has the same 11 cells" in factors.notes
 

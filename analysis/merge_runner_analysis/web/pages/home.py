@@ -30,7 +30,7 @@ from merge_runner_analysis.web.scope import Bar, Scope, descriptions_of, scope_o
 from merge_runner_analysis.web.site import Site, news_of
 from merge_runner_analysis.wording import HEADINGS, LANGUAGE_MODEL, MOCK, PROGRAM
 
-FACTOR_TABLES = ("effects", "levels")  # of what a study's factors change
+FACTOR_TABLES = ("effects", "levels")  # of a study's factors
 # Kinds of drivers whose identical trials count once.
 ONCE = {
     PROGRAM: "Identical trials of a program count once.",
@@ -41,7 +41,7 @@ Jobs = list[Job]
 
 
 def _question(site: Site, bar: Bar) -> tuple[Jobs, Jobs, Answer | None]:
-    """Return the jobs of the factor tables, those that had no table yet, and the answer."""
+    """Return the jobs of the factor tables, those still without a table, and the answer."""
     if len(bar.prompts) < 2 and not site.trial_index.factors():
         return [], [], None
     part = bar.scope.sweep, bar.scope.condition
@@ -80,7 +80,7 @@ def _beside_people(
     unposed = {name: note for name, note in UNPOSED.items() if name not in people}
     gap = human["cells"].get("gap")
     is_undecided = any(of.cells["collisions"].values.get("undecided") for of in drivers if of.cells)
-    # The table has the bounds of undecided crashes.
+    # The table of likeness has the bounds of undecided crashes, and the page explains them.
     headings = {n: text for n, text in HEADINGS.items() if n != "collisions" or not is_undecided}
     return {
         "headline": headline(verdicts),
