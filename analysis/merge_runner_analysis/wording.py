@@ -46,8 +46,8 @@ VERDICTS = {
 TENDENCY = "same tendency as people"  # its sign alone, and no difference in size is shown
 OF_TRAIT = {
     SHOWN: TENDENCY,
-    WEAKER: "weaker tendency than people's",
-    STRONGER: "stronger tendency than people's",
+    WEAKER: "weaker than people's",
+    STRONGER: "stronger than people's",
 }
 DIRECTIONS = {
     **dict.fromkeys(("headway", "velocity", "gap-headway"), OF_TRAIT),

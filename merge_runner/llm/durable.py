@@ -72,8 +72,9 @@ class GroupWriter:
         self._waiting: list[tuple[Operation, asyncio.Future[Any]]] = []
         self._writing: asyncio.Task[None] | None = None
 
-    def close(self) -> None:
-        """Wait for the group that is being written, and end the thread."""
+    def close(self, at_end: Callable[[], None]) -> None:
+        """Wait for the group that is being written, call ``at_end`` in the thread, and end it."""
+        self._thread.submit(at_end).result()
         self._thread.shutdown()
 
     def write(self, operation: Callable[[Execute], ResultT]) -> asyncio.Future[ResultT]:

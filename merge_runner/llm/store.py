@@ -158,11 +158,16 @@ class CacheFile:
     def close(self) -> None:
         """Close the folder and its recording, and free its locks."""
         self.closing.close()
-        self._writer.close()
+        self._writer.close(self._close_connection)
         self.locks.close()
         self.reading.close()  # before the writer: the last to close ends the journal
         if self.texts is not None:
             close_texts(self.texts)
+
+    def _close_connection(self) -> None:
+        """Close the connection of this thread, which SQLite's statements would else keep open."""
+        if self.texts is not None:
+            self.texts.close()
 
     def failure(self, done: str, why: BaseException) -> CacheFailed | RecordingError:
         """Return the error for a folder that cannot be read or written, or for invalid text."""

@@ -225,8 +225,8 @@ def test_the_first_screen_answers_a_study_of_two_factors(page, db, outcomes):
     first = outcomes[outcomes["hurry"] == "no"]
     halves = first["first"].mask(first["both"], 0.5).sum()
     assert f"no: {halves:g} of {len(first)}, where some count half" in beside
-    assert "persona=taxi turns a 50 % chance of going first into 55 %, and 95 % into 96 %" in beside
-    assert "chance of going first into 82 %, and 95 % into 99 %" in beside
+    assert "log-odds of going first by +0.2 (+5 points where it is even without, else" in beside
+    assert "log-odds of going first by +1.5 (+36 points where it is even without, else" in beside
     (shown,) = re.findall(r"(\d+) trials without a crash, (\d+) with one", beside)
     assert sum(map(int, shown)) == query(db, "SELECT count(*) FROM trials")[1][0][0]
     shares = [float(share) for share in re.findall(r"(\d+\.\d\d) %", said)]

@@ -50,5 +50,5 @@ def test_a_verdict_is_said_in_the_words_of_the_pages():
         (Optional("state", "verdict"),),
         [Row("a/headway", ("a",), {"measure": "headway", "state": "weaker", "n": 40})],
     )
-    assert "weaker tendency than people's" in render([verdict], TableFormat.TEXT)
+    assert "weaker than people's" in render([verdict], TableFormat.TEXT)
     assert "weaker" in render([verdict], TableFormat.CSV)

@@ -375,8 +375,8 @@ def test_no_sentence_claims_a_direction_that_the_corrected_p_does_not_carry(of):
         ("collisions", (-9.0, -5.1), "fewer than people's"),
         ("gap", (-1.0, -0.5), "like people"),
         ("gap", (-1.1, -0.5), "smaller than people's"),
-        ("headway", (-0.1, -0.01), "weaker tendency than people's"),
-        ("velocity", (0.01, 0.1), "weaker tendency than people's"),
+        ("headway", (-0.1, -0.01), "weaker than people's"),
+        ("velocity", (0.01, 0.1), "weaker than people's"),
         ("held", (0.1, 0.2), "unlike people's"),
     ],
 )
@@ -399,6 +399,6 @@ def test_a_measure_of_a_sign_alone_has_another_word_than_one_with_a_margin():
     for name in ("headway", "velocity", "gap-headway"):
         assert verdict_word(row(name, SHOWN)) == "same tendency as people"
     # Nor can a slope that is smaller be read as a smaller count.
-    assert verdict_word(row("velocity", WEAKER)) == "weaker tendency than people's"
-    assert verdict_word(row("headway", STRONGER)) == "stronger tendency than people's"
+    assert verdict_word(row("velocity", WEAKER)) == "weaker than people's"
+    assert verdict_word(row("headway", STRONGER)) == "stronger than people's"
     assert verdict_word(row("gap-velocity", SHOWN)) == "like people"
