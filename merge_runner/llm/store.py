@@ -102,6 +102,7 @@ class CacheFile:
         self.locks = ModelLocks(folder)
         self.closing = ExitStack()
         self._writer = GroupWriter(self._run_each)
+        self.closing.callback(self._writer.close, self._close_connection)
         self.write = self._writer.write
         self.summed: object = None  # ledger whose sums hold in the transaction under way
         try:
@@ -158,7 +159,6 @@ class CacheFile:
     def close(self) -> None:
         """Close the folder and its recording, and free its locks."""
         self.closing.close()
-        self._writer.close(self._close_connection)
         self.locks.close()
         self.reading.close()  # before the writer: the last to close ends the journal
         if self.texts is not None:

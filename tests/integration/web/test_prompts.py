@@ -102,7 +102,7 @@ def test_pairs_are_found_although_an_effect_is_planted_with_the_prompt(db):
         links = page.to("/discordant")
         (to,) = [to for to, name in links if "variant=hurry%3Dyes" in to]
         text = Page(client.get(to).text).text
-    assert f"emulator: hurry=yes, {differing} of {pairs} pairs" in page.text
+    assert f"emulator: hurry=yes, {differing} of {pairs} trials" in page.text
     assert "emulator: persona=taxi, " not in page.text  # these ended as with the baseline
     assert "No driver was run with another prompt" not in page.text
     assert f"{differing} of {pairs} ended differently" in text
