@@ -127,8 +127,8 @@ EGO = (
     "goes first is counted for the driver under study",
 )
 HALVES = (
-    "Where two equal drivers get the same, a trial counts half for each: these trials alone have a "
-    "share of 50 % by construction"
+    "Where two equal drivers get the same, a trial counts half for each, so that the share in "
+    "these trials is 50 % by construction"
 )
 UNREADABLE = "the stored study cannot be read by this version"
 # Note on levels that no driver reads.

@@ -305,7 +305,7 @@ def _planted(study: StudyResults) -> list[str]:
         for level, text in levels.items():
             if more := text.emulator.own_first:
                 # The logistic function is steepest about 0.
-                most = f"{100 * tanh(more / 4):+.0f} points where it is even without, else less"
+                most = f"at most {100 * tanh(more / 4):+.0f} points in a situation"
                 changes = f"changes the log-odds of going first by {more:+g} ({most})"
                 planted.append(f"{factor}={level} {changes}")
             if gap_m := text.emulator.gap_m:

@@ -114,7 +114,7 @@ def gap_weights(drivers: Sequence[Driver], short: Mapping[str, str]) -> str:
         return ""
     return unbroken(
         "People's mean gap depends on the situations, so it is computed for those of each driver: "
-        f"{' to '.join(ends)} m. The row of people has that beside {short[drivers[0].name]}"
+        f"{' to '.join(ends)} m. The row of people has the one for {short[drivers[0].name]}"
     )
 
 
@@ -153,8 +153,8 @@ def verdict_rules(drivers: Sequence[Driver], gap: Mapping[str, Any]) -> list[str
     low, high = gap.get("ci") or (0.0, 0.0)
     if (half := (high - low) / 2) > MARGINS["gap"] / 2:
         likeness += (
-            ". In the gap hardly any driver can be shown to be so, however many trials it has: "
-            f"people's is known only to ± {number(half)} m, by nine pairs"
+            ". Hardly any driver can be shown to be like people in the gap, however many trials it "
+            f"has: people's mean gap is known only to ± {number(half)} m, from nine pairs"
         )
     return [likeness, *others]
 

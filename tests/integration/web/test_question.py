@@ -155,7 +155,7 @@ def test_likeness_to_people_is_said_in_counts_that_lead_to_their_trials(db):
         assert [int(count) for pair in pairs for count in pair] == [*counts]
         assert "cannot tell" in row.text
         assert "draws who goes first as people do" in row.text
-        assert "people's is known only to ± 0.9" in Page(text).text
+        assert "people's mean gap is known only to ± 0.9" in Page(text).text
         links = [(to, int(count)) for to, count in row.to("/trials") if count.isdigit()]
         assert len(links) >= 4
         for to, count in links:
@@ -225,8 +225,8 @@ def test_the_first_screen_answers_a_study_of_two_factors(page, db, outcomes):
     first = outcomes[outcomes["hurry"] == "no"]
     halves = first["first"].mask(first["both"], 0.5).sum()
     assert f"no: {halves:g} of {len(first)}, where some count half" in beside
-    assert "log-odds of going first by +0.2 (+5 points where it is even without, else" in beside
-    assert "log-odds of going first by +1.5 (+36 points where it is even without, else" in beside
+    assert "log-odds of going first by +0.2 (at most +5 points in a situation)" in beside
+    assert "log-odds of going first by +1.5 (at most +36 points in a situation)" in beside
     (shown,) = re.findall(r"(\d+) trials without a crash, (\d+) with one", beside)
     assert sum(map(int, shown)) == query(db, "SELECT count(*) FROM trials")[1][0][0]
     shares = [float(share) for share in re.findall(r"(\d+\.\d\d) %", said)]

@@ -132,7 +132,7 @@ def test_beside_humans_who_say_nothing_stands_what_was_measured_from_control_on(
     own = [a for t, a in zip(times, accelerations, strict=True) if t > 0]
     client = client_of(humans)
     text = Page(client.get(f"/trials/{name}").text).text
-    said = re.findall(r"hardest acceleration was ([+-][\d.]+) m/s²", text.replace("−", "-"))
+    said = re.findall(r"or braking was ([+-][\d.]+) m/s²", text.replace("−", "-"))
     assert said[0] == f"{max(own, key=abs):+z.1f}"
     assert max(abs(float(value)) for value in said) == pytest.approx(hardest, abs=0.051)
     assert "A human pair" in text
@@ -167,7 +167,7 @@ def test_odd_rows_cost_no_other_row_its_page_and_levels_of_a_study_filter_the_li
     trial = client.get("/trials/cheap+sleepy/baseline/N_0_0/rep01/temperature=0.2").text
     assert "opponent=sleepy, temperature=0.2." in Page(trial).text
     listed = Page(client.get("/trials?factor.temperature=0.2&factor.opponent=sleepy").text).text
-    assert "of drivers A+B, A is the ego, on either side" in listed
+    assert "of drivers A+B, A is the ego, on the left or on the right" in listed
     assert "A+B" not in Page(client.get("/trials?model=idm").text).text
     assert ("6 trials" in listed, "1.0 (6)" in listed) == (True, True)
     assert "0 trials" in Page(client.get("/trials?factor.mood=good").text).text

@@ -154,7 +154,7 @@ def test_people_s_gap_is_given_as_each_driver_is_compared_with_it():
           (("a", 3.851), ("b", 3.869))]  # fmt: skip
     assert gap_weights(of, NAMES).replace("\xa0", " ") == (
         "People's mean gap depends on the situations, so it is computed for those of each driver: "
-        "3.85 to 3.87 m. The row of people has that beside a"
+        "3.85 to 3.87 m. The row of people has the one for a"
     )
     assert gap_weights(of[:1], NAMES) == ""
 
@@ -162,7 +162,7 @@ def test_people_s_gap_is_given_as_each_driver_is_compared_with_it():
 def test_every_verdict_has_its_rule():
     rules = verdict_rules([driver("a", **JUDGED)], {"ci": (2.0, 4.0)})
     assert [rule.split()[0] for rule in rules] == ["Like", "Same", "More,", "Cannot", "No"]
-    assert rules[0].endswith("people's is known only to ± 1.00 m, by nine pairs")
+    assert rules[0].endswith("people's mean gap is known only to ± 1.00 m, from nine pairs")
 
 
 TYPED = ["sweep", "s.toml", "--model", "emulator", "--yes"]

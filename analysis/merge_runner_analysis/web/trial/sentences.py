@@ -86,6 +86,6 @@ def summary(trial: Trial) -> list[str]:
             lines.append(
                 f"The {side} vehicle began at {speeds[0]:.1f} m/s, drove between "
                 f"{min(speeds):.1f} and {max(speeds):.1f} m/s, and ended at {speeds[-1]:.1f} m/s; "
-                f"its hardest acceleration was {hardest:+z.1f} m/s²."
+                f"its hardest acceleration or braking was {hardest:+z.1f} m/s²."
             )
     return lines
