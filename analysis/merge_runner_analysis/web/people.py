@@ -16,6 +16,7 @@ from merge_runner_analysis.wording import (
     DIFFERS,
     HEADINGS,
     MARGINS,
+    MEASURES,
     OPEN,
     PLAYED_RULES,
     RULES_MEAN,
@@ -148,7 +149,14 @@ def verdict_rules(drivers: Sequence[Driver], gap: Mapping[str, Any]) -> list[str
         if any(has_verdict(cell.values) for cell in of.cells.values())
     }
     ends = " to ".join(map(str, dict.fromkeys((min(tests), max(tests))))) if any(tests) else ""
-    numbers = f" ({ends})" if ends else ""
+    labels = dict.fromkeys(
+        MEASURES[name].label
+        for of in drivers
+        for name, cell in of.cells.items()
+        if name not in HEADINGS and cell.values.get("p_holm") is not None
+    )
+    besides = f": those of this table, and {'; '.join(labels)}" if labels else ""
+    numbers = f" ({ends}{besides})" if ends else ""
     likeness, *others = (rule.format(tests=numbers) for rule in VERDICT_RULES)
     low, high = gap.get("ci") or (0.0, 0.0)
     if (half := (high - low) / 2) > MARGINS["gap"] / 2:
