@@ -70,6 +70,18 @@ async def test_it_announces_its_url_serves_and_closes_its_port_when_cancelled():
             await client.post(CHAT, json=BODY)
 
 
+async def test_the_command_prints_its_url_and_that_of_a_local_model(merge_runner):
+    process = await merge_runner.start("emulate", "--port", 0)
+    try:
+        url, local = [(await process.stdout.readline()).decode().split()[0] for _ in range(2)]
+        async with httpx.AsyncClient() as client:
+            models = await client.get(f"{local.removeprefix('LOCAL_BASE_URL=')}/models")
+    finally:
+        process.kill()
+        await process.communicate()
+    assert (local, models.status_code) == (f"LOCAL_BASE_URL={url}/v1", 200)
+
+
 async def test_it_answers_within_a_process_as_the_server_does(served):
     async def post(**where):
         async with httpx.AsyncClient(**where) as client:
