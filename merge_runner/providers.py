@@ -236,6 +236,8 @@ def endpoint_url(entry: ModelEntry, env: Mapping[str, str] = os.environ) -> str:
     """Return the base URL of a model; raises UsageError."""
     provider = PROVIDERS.require(entry.provider)
     variable = provider.base_url_env
+    if entry.provider == "emulator" and entry.base_url:
+        raise UsageError(f"the emulator takes no `base_url`: set {variable}")
     if variable and not entry.base_url and env.get(variable):
         return normalised_url(env[variable], variable)
     return normalised_url(entry.base_url or provider.base_url)

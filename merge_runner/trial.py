@@ -22,7 +22,7 @@ from merge_runner.trial_records import DecisionRow, FailedCall, TrialRecord, Tri
 
 
 class Trial:
-    """Trial under way: it ends with its world, or at the first decision step with a failed call."""
+    """Trial under way, which ends when its world ends or a call has failed."""
 
     def __init__(
         self,

@@ -25,7 +25,7 @@ UNION ALL SELECT 'unplanned', trial_id, format('the sweep lists it {} times', su
 FROM linked GROUP BY trial_id HAVING sum(links) > 1
 UNION ALL SELECT 'orphan', trial_id, 'the sweep lists it, and it is not among the trials'
 FROM linked ANTI JOIN trials USING (trial_id, spec_hash)
-UNION ALL SELECT 'config', NULL, 'its id is not made of its name, its drivers and its start'
+UNION ALL SELECT 'config', NULL, 'its id does not match its name, drivers and start'
 FROM sweeps SEMI JOIN subject USING (sweep_id)
 WHERE json_valid(config) AND sweep_id <> concat_ws(
     '-', name, config->>'$.model', strftime(started_at, '%Y%m%dT%H%M%S%f'));

@@ -61,10 +61,16 @@ def emulate(
 ) -> None:
     """Serve the emulator on 127.0.0.1, and print its base URL.
 
+    It plays the emulator for any model id, and `random` for the id random-driver. A base URL of a
+    `local` model ends in /v1. Such a model gets the same reply in every repetition.
+
     Example: merge-runner emulate --port 8765
     """
     import asyncio
 
     from merge_runner.emulator.server import run
 
-    asyncio.run(run(port, announce=print_out))
+    def announce(url: str) -> None:
+        print_out(f"{url}\nLOCAL_BASE_URL={url}/v1 for a local model")
+
+    asyncio.run(run(port, announce=announce))

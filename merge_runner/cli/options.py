@@ -50,8 +50,8 @@ def beside_study(ctx: typer.Context, param: typer.CallbackParam, path: Path) -> 
     return homes.pop() / path
 
 
-DB = "The results database; for a study's file it is in the file's folder."
-CACHE = "The folder of stored replies; for a study's file it is in the file's folder."
+DB = "The results database; for a study's file the default is below the file's folder."
+CACHE = "The folder of stored replies; for a study's file the default is below the file's folder."
 DbOption = Annotated[Path, option("FILE", DB, "--db", callback=beside_study, **FILES)]
 CacheOption = Annotated[Path, option("DIR", CACHE, "--cache", callback=beside_study, **FILES)]
 MODEL = (

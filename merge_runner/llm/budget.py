@@ -11,9 +11,9 @@ admission of another. A probe comes first and may use all that is left, since ol
 for its reply.
 
 The worst case of an attempt is reserved in this process while it waits for its turn, and in the
-ledger right before it is sent. A server may ignore the output cap. So several attempts are in
-flight only if twice the largest worst case fits for each. If no reply costs more than that, only
-the last one can exceed the cap.
+ledger right before it is sent. A server may ignore the output cap. So an attempt joins others in
+flight only if the money left covers twice the largest worst case for it and for each of them. If
+no reply costs more than that, only an attempt that is alone in flight can exceed the cap.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ class Reservation:
     """Worst case of one attempt, ``usd``, from its reservation to its end, ``close``.
 
     While ``queued`` it is reserved in this process, and after ``begin`` in the ledger. ``close``
-    returns to the trial what the attempt did not spend: all if it ends before ``begin``, the
-    difference to the cost after ``book``. If the cost is unknown, the attempt may have been
-    charged: all stays in the ledger until a user releases it.
+    returns money to the trial: ``usd`` if the attempt has not begun, ``usd`` less the cost if the
+    cost is booked. If the cost is unknown, the attempt may have been charged: ``usd`` stays in the
+    ledger until a user releases it.
     """
 
     budget: Budget

@@ -71,7 +71,7 @@ class LlmClient:
     async def ask(self, prompt: str, slot: Slot, *, order: int = 0) -> ChatReply:
         """Return the model's reply for a slot; lower ``order`` is served first.
 
-        Raises CallFailed, TrialSuspended or SweepStopped.
+        Raises CallFailed, TrialSuspended, SweepStopped or UsageError.
         """
         request = self.replies.request(prompt, slot)
         reply, attempts = None, None

@@ -104,7 +104,7 @@ class CacheFile:
         self._writer = GroupWriter(self._run_each)
         self.closing.callback(self._writer.close, self._close_connection)
         self.write = self._writer.write
-        self.summed: object = None  # ledger whose sums hold in the transaction under way
+        self.summed: object = None  # ledger that has summed in this transaction
         try:
             prepare(folder, read_only=read_only, allow_previous=allow_previous)
             self._opened = self._file
@@ -139,7 +139,7 @@ class CacheFile:
                     raise FileNotFoundError("it is no longer there")
                 return results
         except (diskcache.Timeout, *FAILURES) as exc:
-            # On a full disk SQLite rolls back itself, and diskcache's own attempt hides the reason.
+            # On a full disk SQLite rolls back: diskcache's ROLLBACK then fails, and hides why.
             hidden = exc.__context__ if isinstance(exc, sqlite3.Error) else None
             raise self.failure("written", hidden or exc) from exc
 

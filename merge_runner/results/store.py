@@ -43,15 +43,15 @@ from merge_runner.results.rows import (
 from merge_runner.scenarios.merge.measures import measures_sql
 from merge_runner.trial_records import TrialRecord, TrialSpec
 
-# Whether a file may have tables: to list those of a new file is slow, as DuckDB loads its views.
+# Whether a file may have tables. Listing them in a new file is slow: DuckDB loads its system views.
 IS_WRITTEN = """
 SELECT total_blocks > 0 OR wal_size <> '0 bytes' FROM pragma_database_size()
 WHERE database_name = current_database()
 """
 # Columns that depend on the run: whether it made an attempt itself, and when.
 RUN_COLUMNS = frozenset({"cached", "started_at", "latency_s"})
-# The first and the third column order the rows of a trial. The source of a first decision was
-# 'seat' in schema 9: with another value its digests would change.
+# The first and the third column order the rows of a trial. Digests call the source of a first
+# decision 'seat', as schema 9 did, so that they stay the same.
 DIGEST_COLUMNS = {
     "trials": "pair, if(source = 'first_decision', 'seat', source), model_left, model_right, "
     "variant, condition, rep, sample_set, status, merged_first, end_time_s, error",

@@ -139,7 +139,7 @@ class LocalRunner:
     async def _next_round(self) -> None:
         """Wait for a round of the event loop with room for a trial.
 
-        Trials with recorded replies never wait for a call: thousands would fill one round.
+        Trials whose replies are stored wait for no call: all of them would go on in one round.
         """
         async with self._gate:
             await asyncio.sleep(0)

@@ -66,9 +66,9 @@ def load_study(
 ) -> tuple[StudySource, Catalogue]:
     """Read a study, and return it with its catalogue after the user's consent to its code.
 
-    ``registered`` are parts that were registered for it. ``models`` are called in place of the
-    file's; if empty, the file's are; if None, no model is. Consent also covers the servers that get
-    keys. ``trust`` gives consent. Raises UsageError.
+    ``registered`` are parts that were registered for it. ``models`` replace the file's models; an
+    empty sequence replaces none, and None means that no model is called. Consent also covers the
+    servers that get keys. ``trust`` gives consent. Raises UsageError.
     """
     study = read_study(name) if isinstance(name, str) else name
     file = study.file
@@ -84,8 +84,8 @@ def load_study(
 def _require_consent(study: StudySource, models: Iterable[str], *, trust: bool) -> None:
     """Ask for consent to the study's code and to the servers that get keys, once for each content.
 
-    Consent is stored in the user's state folder, where no study can write. ``trust`` gives it, and
-    goes on where it cannot be stored. Raises UsageError without consent, and without a terminal.
+    Consent is stored in the user's state folder. ``trust`` gives it, and goes on where it cannot be
+    stored. Raises UsageError without consent, and without a terminal.
     """
     risks, code = [*_endpoints(study.path.parent, models)], study.plugins
     # The unedited plug-in of ``init`` is our own code.
@@ -138,8 +138,8 @@ def _endpoints(folder: Path, models: Iterable[str]) -> Iterator[tuple[Path, str,
     """Yield the models whose endpoints need consent: (file, description, content to consent to).
 
     They are entries of a user's models.toml that replace a shipped model, take a key from a
-    variable that is not the provider's, or send to another URL than the provider's. This machine
-    is exempt for a provider without a key.
+    variable that is not the provider's, or have a ``base_url`` with another scheme, host or port
+    than the provider's. Such a URL on loopback needs no consent if the provider needs no key.
     """
     shipped_file = SHIPPED_EXPERIMENTS / REGISTRY
     files = [path for path in registry_files(folder) if not path.samefile(shipped_file)]

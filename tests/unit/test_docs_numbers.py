@@ -28,7 +28,7 @@ PASSES = 100 * published("human_ceiling").set_index(["n", "indicator", "rule"])[
 CLAIMS = f"""
 batches: at most {rounds.MAX_CALLS:,} requests. At most {players.MOST_IN_ROUNDS:,} trials
 batches: no batch can be created for {lifecycle.OUTAGE_S / 60:g} minutes
-batches: by its name within {sum(lifecycle.ARRIVAL_S):g} s
+batches: by its name for {sum(lifecycle.ARRIVAL_S):g} s
 explorer: pages of up to {export.MOST:,} trials
 explorer: traces of up to {conditions.MOST} trials
 explorer: beyond {search.HOLDS * 100:g} % of the maximum

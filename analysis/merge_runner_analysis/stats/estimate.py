@@ -13,13 +13,13 @@ from merge_runner_analysis.wording import Fact
 class Estimate:
     """A number with its interval, counts and test; None: unknown.
 
-    ``ends_at`` finds the interval's ends at another ``level``, if it is not Student's t. A rate has
-    ``k`` hits in ``n`` trials; a rate of replies has ``k`` replies from ``n`` trials. A weighted
-    rate of humans is as precise as that of ``effective_n`` independent trials. With ``undecided``
-    trials a rate has no value, and its interval holds both worst cases (Manski 1989). ``freedom``
-    is infinite where the test is not Student's t. ``p`` is two-sided, against 0, ``p_holm``
-    corrected over a family, ``detectable`` the minimum detectable effect at 80 % power.
-    ``problem`` says why something is missing, ``source`` where a published one is from.
+    ``ends_at`` returns the interval at another ``level``; without it, Student's t gives that. A
+    rate has ``k`` hits in ``n`` trials; for the share of valid replies, ``k`` counts replies and
+    ``n`` trials. A weighted rate of humans is as precise as that of ``effective_n`` independent
+    trials. With ``undecided`` trials a rate has no value, and its interval holds both worst cases
+    (Manski 1989). ``freedom`` is infinite where the test is not Student's t. ``p`` is two-sided,
+    against 0, ``p_holm`` corrected over a family, ``detectable`` the minimum detectable effect at
+    80 % power. ``problem`` says why a number is missing, ``source`` names its publication.
     """
 
     value: float | None = None

@@ -44,8 +44,8 @@ from merge_runner_analysis.wording import (
 
 TEST = "of the test of Mantel and Haenszel, or of Welch's"
 UNTESTED = (
-    "no test: it needs several trials of each level in shared cells, all of one study, none "
-    "undecided or at two levels"
+    "no test: it needs several trials of each level in shared cells, all of one study, all "
+    "decided, and none that counts at both levels"
 )
 
 DIFFERENCE = (
@@ -135,7 +135,8 @@ def _compared_row(study: StudyResults, effect: Effect) -> Row:
     sides = (effect.level, effect.at_level), (effect.reference, effect.at_reference)
     for end, (level, estimate) in zip(SUFFIXES, sides, strict=True):
         shown = level_estimate(study, level, effect.metric) if estimate.value is None else estimate
-        k = shown.k if effect.metric.rate else None  # k of valid replies counts replies
+        # For the share of valid replies k counts replies, not trials: it is left out.
+        k = shown.k if effect.metric.rate else None
         values |= {f"k{end}": k, f"n{end}": shown.n, f"value{end}": shown.value}
     return _row(study, effect, values)
 
@@ -191,7 +192,7 @@ def _is_copied(study: StudyResults, effect: Effect) -> bool:
 
 
 def _place(level: Level, across: tuple[Level, Level] | None) -> str:
-    """Return the other factor's level of a simple effect, and both of an interaction."""
+    """Return the level of the other factor; for an interaction, its two levels."""
     at = level.at.partition("=")[2]
     return f"{at} - {across[0].at.partition('=')[2]}" if across else at
 

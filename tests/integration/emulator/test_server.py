@@ -9,6 +9,7 @@ import httpx
 import pytest
 
 from merge_runner import Study
+from merge_runner.cli.models import emulate
 from merge_runner.emulator.handler import Emulator
 from merge_runner.emulator.server import run, serve
 from merge_runner.errors import UsageError
@@ -68,6 +69,17 @@ async def test_it_announces_its_url_serves_and_closes_its_port_when_cancelled():
             await serving
         with pytest.raises(httpx.ConnectError):
             await client.post(CHAT, json=BODY)
+
+
+def test_the_command_prints_its_url_and_that_of_a_local_model(monkeypatch, capsys):
+    async def announce_alone(port, *, announce):
+        announce(f"http://127.0.0.1:{port}")
+
+    monkeypatch.setattr("merge_runner.emulator.server.run", announce_alone)
+    emulate(8765)
+    url, local = capsys.readouterr().out.splitlines()
+    assert url == "http://127.0.0.1:8765"
+    assert local.startswith(f"LOCAL_BASE_URL={url}/v1 ")
 
 
 async def test_it_answers_within_a_process_as_the_server_does(served):

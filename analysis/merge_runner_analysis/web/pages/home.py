@@ -134,7 +134,7 @@ def home_page(site: Site, params: Mapping[str, str]) -> str:
     conditions = by_condition(site, scope, shown)
     names = [driver.name for driver in shown]
     short = short_names(names)
-    # People's gap covers the situations in which the first driver finished.
+    # The people's values are those in the first driver's conditions.
     human = humans_of(values["table"], next(iter(shown), None))
     typed = standing[0]["config"].get("typed") if standing else None
     # The database may have been moved since.
