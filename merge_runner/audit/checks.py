@@ -74,10 +74,14 @@ class Finding:
     side: str | None = None
     decision: int | None = None
 
-    def __str__(self) -> str:
+    @property
+    def where(self) -> str:
+        """Its place, such as ``SWEEP, TRIAL, left, decision 3``; empty for none."""
         number = None if self.decision is None else f"decision {self.decision}"
-        where = ", ".join(filter(None, (self.sweep, self.trial, self.side, number)))
-        return f"{self.kind}: {where}: {self.text}" if where else f"{self.kind}: {self.text}"
+        return ", ".join(filter(None, (self.sweep, self.trial, self.side, number)))
+
+    def __str__(self) -> str:
+        return ": ".join(filter(None, (self.kind, self.where, self.text)))
 
 
 @dataclass(slots=True)

@@ -146,8 +146,11 @@ class Numbers:
         with audited_database(self.db) as connection:
             for run, ended in connection.execute(RUNS).fetchall():
                 audit = check_sweep(connection, run, (), finished=ended)
-                findings = [f"found: {finding}" for finding in audit.findings[:FOUND]]
-                notes[run] = findings + audit.notes
+                findings = [
+                    f"The audit found “{finding.kind}” in {finding.where or run}: {finding.text}"
+                    for finding in audit.findings[:FOUND]
+                ]
+                notes[run] = [*findings, *(f"The audit: {note}" for note in audit.notes)]
         return json.dumps(notes)
 
     def _cell(self, name: str, row: str, column: str, *part: str) -> dict[str, Any]:

@@ -216,8 +216,8 @@ def test_runs_show_how_they_ended_and_what_the_audit_finds_and_a_scope_changes_n
         text_of(client, f"/sweeps{of}") for of in ("/sweep-1", "", "?condition=N_0_0")
     )
     assert ("lasted 2.0 h" in text, " 2.0 h " in whole) == (True, True)
-    assert "found: attempt: sweep-1" in text
-    assert "found: attempt: sweep-1" in whole
+    assert "The audit found “attempt” in sweep-1" in text
+    assert "The audit found “attempt” in sweep-1" in whole
     [run] = audit_database(study, ["sweep-1"])
     assert all(" ".join(note.split()) in text for note in run.notes)
     said = re.search(r"How each ended .*", whole)[0]
