@@ -71,6 +71,7 @@ def emulate(
     from merge_runner.emulator.server import run
 
     def announce(url: str) -> None:
-        print_out(f"{url}\nLOCAL_BASE_URL={url}/v1 for a local model")
+        print_out(url)
+        say(f"for a local model: LOCAL_BASE_URL={url}/v1")
 
     asyncio.run(run(port, announce=announce))

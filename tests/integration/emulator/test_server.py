@@ -77,9 +77,9 @@ def test_the_command_prints_its_url_and_that_of_a_local_model(monkeypatch, capsy
 
     monkeypatch.setattr("merge_runner.emulator.server.run", announce_alone)
     emulate(8765)
-    url, local = capsys.readouterr().out.splitlines()
-    assert url == "http://127.0.0.1:8765"
-    assert local.startswith(f"LOCAL_BASE_URL={url}/v1 ")
+    out, err = capsys.readouterr()
+    assert out == "http://127.0.0.1:8765\n"
+    assert err.endswith(f"LOCAL_BASE_URL={out.strip()}/v1\n")
 
 
 async def test_it_answers_within_a_process_as_the_server_does(served):
