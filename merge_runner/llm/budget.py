@@ -5,15 +5,16 @@ fit under the cap. So money finishes trials instead of beginning more. The first
 admitted if nothing was spent or reserved before it.
 
 The oldest running trial may use all that is left. A younger one leaves what older ones are still
-expected to cost. So, if expectations were too low, the youngest are suspended first. A call that
-several trials share is paid by the oldest running one, so that a running trial never waits for the
+expected to cost. So, if expectations were too low, the youngest are suspended first. If several
+trials share a call, the oldest running trial pays, so that a running trial never waits for the
 admission of another. A probe comes first and may use all that is left, since older trials may wait
 for its reply.
 
 The worst case of an attempt is reserved in this process while it waits for its turn, and in the
 ledger right before it is sent. A server may ignore the output cap. So an attempt joins others in
-flight only if the money left covers twice the largest worst case for it and for each of them. If
-no reply costs more than that, only an attempt that is alone in flight can exceed the cap.
+flight only if the cap, less what is spent, covers twice the largest worst case for it and for each
+of them. If no reply costs more than that, only an attempt that is alone in flight can exceed the
+cap.
 """
 
 from __future__ import annotations
@@ -171,8 +172,8 @@ class MoneyQueue:
 class Budget:
     """Spending under a ledger's cap; without a cap it is only recorded.
 
-    All models of a run that have a price share a budget. Its free models share another, without a
-    cap. A trial is named by its order in the sweep; ``trial_usd`` returns its expected cost.
+    All models of a run that have a price share a budget. Models without a price share another,
+    without a cap. A trial is named by its order in the sweep; ``trial_usd`` returns its expected cost.
     ``open_reservations`` counts reservations, ``queued_usd`` is reserved in this process alone.
     ``expected_usd`` has, by running trial, the rest of its expected cost, below 0 where it has cost
     more.
@@ -273,7 +274,8 @@ class Budget:
     def _left_usd(self, needed_usd: float) -> float:
         """Return the USD left under the cap.
 
-        They are summed anew before a trial is suspended: other processes may have freed some.
+        What is spent and reserved is summed anew before a trial is suspended, as other processes
+        may have freed money.
         """
         cap, ledger = self.ledger.cap, self.ledger
         assert cap is not None

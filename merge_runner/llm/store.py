@@ -165,7 +165,7 @@ class CacheFile:
             close_texts(self.texts)
 
     def _close_connection(self) -> None:
-        """Close the connection of this thread, which SQLite's statements would else keep open."""
+        """Close the writing thread's connection: a finished thread does not close it."""
         if self.texts is not None:
             self.texts.close()
 

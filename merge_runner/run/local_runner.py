@@ -20,7 +20,7 @@ from merge_runner.run.trials import Capacity, Ended, TrialMaker
 from merge_runner.trial import Trial
 from merge_runner.trial_records import TrialRecord, TrialSpec
 
-# Too many for chance, as no call is answered in between; few enough to stop early.
+# Without an answer in between, so many failures are hardly chance.
 FAILURES_IN_A_ROW = 10
 # Trials that begin or go on in one round of the event loop, so that each round stays short.
 A_FEW = 16
@@ -139,7 +139,7 @@ class LocalRunner:
     async def _next_round(self) -> None:
         """Wait for a round of the event loop with room for a trial.
 
-        Trials whose replies are stored wait for no call: all of them would go on in one round.
+        Without the gate, all trials whose replies are stored would go on in one round.
         """
         async with self._gate:
             await asyncio.sleep(0)

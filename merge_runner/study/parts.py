@@ -50,7 +50,7 @@ from merge_runner.study.file import (
 )
 from merge_runner.text_safety import one_line, printable, say
 
-# Fields that identify the model, its server, key and price; the others are request parameters.
+# Fields that identify the model, its server, key and price.
 IDENTITY = {"provider", "format", "id", "base_url", "path", "key_env", "auth", "price"}
 _importing = threading.RLock()
 STUDY_PLUGINS = "study_plugins"

@@ -113,7 +113,7 @@ def _beside_people(
 
 
 def home_page(site: Site, params: Mapping[str, str]) -> str:
-    """Return the study's page; raises NotThere, or NothingNew if it is as it was ``seen``."""
+    """Return the study's page; raises NotThere, or NothingNew if it is still as ``seen`` says."""
     standing = standing_of(site.trial_index)
     bar = scope_of(site, params)
     scope = bar.scope
