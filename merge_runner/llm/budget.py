@@ -173,10 +173,10 @@ class Budget:
     """Spending under a ledger's cap; without a cap it is only recorded.
 
     All models of a run that have a price share a budget. Models without a price share another,
-    without a cap. A trial is named by its order in the sweep; ``trial_usd`` returns its expected cost.
-    ``open_reservations`` counts reservations, ``queued_usd`` is reserved in this process alone.
-    ``expected_usd`` has, by running trial, the rest of its expected cost, below 0 where it has cost
-    more.
+    without a cap. A trial is named by its order in the sweep; ``trial_usd`` returns its expected
+    cost. ``open_reservations`` counts reservations, ``queued_usd`` is reserved in this process
+    alone. ``expected_usd`` has, by running trial, the rest of its expected cost, below 0 where it
+    has cost more.
     """
 
     def __init__(self, ledger: Ledger, trial_usd: Callable[[int], float] = lambda _: 0.0) -> None:

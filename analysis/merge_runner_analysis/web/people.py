@@ -155,7 +155,7 @@ def verdict_rules(drivers: Sequence[Driver], gap: Mapping[str, Any]) -> list[str
         for name, cell in of.cells.items()
         if name not in HEADINGS and cell.values.get("p_holm") is not None
     )
-    besides = f": those of this table, and {'; '.join(labels)}" if labels else ""
+    besides = f", also {'; '.join(labels)}" if labels else ""
     numbers = f" ({ends}{besides})" if ends else ""
     likeness, *others = (rule.format(tests=numbers) for rule in VERDICT_RULES)
     low, high = gap.get("ci") or (0.0, 0.0)

@@ -154,7 +154,7 @@ def test_likeness_to_people_is_said_in_counts_that_lead_to_their_trials(db):
         pairs = re.findall(r"(\d+) of (\d+)", row.text.replace(bounds, ""))
         assert [int(count) for pair in pairs for count in pair] == [*counts]
         assert "cannot tell" in row.text
-        assert "draws who goes first as people do" in row.text
+        assert "who goes first is drawn by lot, with people's odds" in row.text
         assert "people's mean gap is known only to ± 0.9" in Page(text).text
         links = [(to, int(count)) for to, count in row.to("/trials") if count.isdigit()]
         assert len(links) >= 4

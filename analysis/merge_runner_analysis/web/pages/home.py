@@ -36,7 +36,7 @@ ONCE = {
     PROGRAM: "Identical trials of a program count once.",
     MOCK: "Trials of a mock model that differ only in words it does not read count once.",
 }
-DRAWN = "draws who goes first as people do"  # the emulator
+DRAWN = "who goes first is drawn by lot, with people's odds"  # the emulator
 Jobs = list[Job]
 
 

@@ -51,7 +51,7 @@ def facts(row: Row) -> list[str]:
         row["variant"] and f"{row['variant']}: {prompt}",
         ", ".join(row["levels"] or ()),
         row["rmse_mps"] is not None and f"RMSE of the speed {number(row['rmse_mps'])} m/s",
-        row["asked"] and f"{row['invalid']} of {row['asked']} decisions of language models invalid",
+        row["asked"] and f"{row['invalid']} of {row['asked']} decisions of models invalid",
         row["cost_usd"] is not None and money(row["cost_usd"], " USD"),
         row["caution"] and f"Note: {row['caution']}",
     )
