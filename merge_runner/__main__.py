@@ -12,7 +12,7 @@ def main() -> None:
     """Run the command line, which is imported only after the path is set."""
     codes: list[int] = []
     atexit.register(_end, codes)  # before all others, and so called after them
-    # Trials and reports leave no reference cycles, and to search those in memory takes long.
+    # Few objects are in reference cycles; commands that make most objects search even less often.
     gc.set_threshold(100_000, 10, 1_000)
     from merge_runner.cli import main as run
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import re
 import sys
@@ -278,6 +279,7 @@ def report(
     Example: merge-runner report --study my-study/study.toml
     """
     check_kind(out, HTML, "page of HTML")
+    gc.set_threshold(0)  # what a report makes lasts until it ends: there is no garbage to look for
     study = _study(db, _selection(models, where, study_file, run=run), trust=trust)
     from merge_runner_analysis.web.report import write_report
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import inspect
 import json
 import shlex
@@ -157,6 +158,8 @@ def sweep(
         whole = any(size is not None for size in sizes.values())
         play = partial(_play, whole=whole, yes=yes, as_json=as_json)
     plans = partial(_plans, selection=selection, options=options, trust=trust)
+    # Trials leave no reference cycles, and to search those in memory would hold up the others.
+    gc.set_threshold(1_000_000)
     sys.exit(_play_all(studies or ["baseline"], plans, play, options))
 
 
