@@ -113,7 +113,7 @@ def is_copied(row: Row) -> bool:
     return bool(row.values.get("primary")) and row.untested
 
 
-def is_constant(row: Row) -> bool:
+def is_none_or_all(row: Row) -> bool:
     """Return whether a share is 0 % at both levels, or 100 % at both."""
     values = {row.values.get(name) for name in ("estimate", "estimate_reference")}
     return unit_of(row) == "points" and values in ({0.0}, {100.0})

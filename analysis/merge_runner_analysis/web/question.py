@@ -24,9 +24,9 @@ from merge_runner_analysis.web.effect_rows import (
     factors_of,
     interval_of,
     interval_text,
-    is_constant,
     is_copied,
     is_interaction,
+    is_none_or_all,
     is_shown,
     is_tested,
     level_text,
@@ -186,7 +186,7 @@ def _is_other(row: Row, metric: str) -> bool:
         metric_of(row) in {LEFT_FIRST.name, *SEEN} - {metric}
         and not is_interaction(row)
         and is_tested(row)
-        and not is_constant(row)
+        and not is_none_or_all(row)
         and row.values["factor"] != MODEL
     )
 

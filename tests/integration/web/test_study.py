@@ -20,6 +20,7 @@ from merge_runner_analysis.tables import formats, make_tables
 from merge_runner_analysis.tables.model import from_text
 from merge_runner_analysis.web.answers import answer
 from merge_runner_analysis.wording import MEASURES, by_group, verdict_word
+from tests.support import program
 from tests.support.serving import Page, client_of, in_process, listed, never
 from tests.support.studies import Said, changed, write_study, yielding
 
@@ -214,6 +215,16 @@ def test_every_page_with_a_drivers_verdicts_says_which_of_its_trials_are_not_cou
     for address in ("/", "/drivers", "/drivers/o3?variant=baseline"):
         text = Page(client.get(address).text).text
         assert text.count("33 counted; not counted: 1 did not end") == 1, address
+
+
+def test_counts_by_situation_say_whether_they_include_trials_that_repeat_another_one(tmp_path):
+    pages = []
+    for reps in "12":
+        words = ("sweep", "baseline", "--model", "constant", "--conditions", "N_0_0")
+        done = program.invoke((*words, "--reps", reps, "--db", reps), cwd=tmp_path, env={})
+        assert done.code == 0, done.err
+        pages.append(Page(client_of(tmp_path / reps).get("/").text).text)
+    assert ["also of trials that repeat another one" in text for text in pages] == [False, True]
 
 
 def test_the_study_begins_with_its_description_and_says_what_to_type_and_counts_at_once(

@@ -22,6 +22,7 @@ from merge_runner_analysis.web.people import (
     likeness_of,
     other_differences,
     people_of,
+    repeated,
     verdict_rules,
 )
 from merge_runner_analysis.web.question import Answer, answer_of
@@ -102,6 +103,7 @@ def _beside_people(
         ],
         "verdict_rules": verdict_rules(drivers, gap.values if gap else {}),
         "gap_weights": gap_weights(drivers, short),
+        "repeats": any(repeated(of, conditions)[0] for of in drivers if of.cells),
         "count_once": [text for kind, text in ONCE.items() if by_kind(drivers)[kind]],
         "equal_trials": equal_trials(drivers, short),
         "is_undecided": is_undecided,
