@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import scipy
 from numpy.typing import NDArray
-from scipy import optimize, special
+from scipy import special
 
 from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.intervals import LEVEL, POWER, ROUNDING, tested, two_sided_p
@@ -85,7 +86,7 @@ class Cells:
         # The test of no difference says on which side of 0 the end lies.
         if sign * value < 0 and sign * near < 0:
             far, near = (0.0, near) if beyond(0.0) > 0 else (far, 0.0)
-        return near if beyond(near) >= 0 else float(optimize.brentq(beyond, near, far))
+        return near if beyond(near) >= 0 else float(scipy.optimize.brentq(beyond, near, far))
 
     @property
     def p(self) -> float:
@@ -152,7 +153,7 @@ def _detectable(cells: Cells, sign: int) -> float | None:
     def missing(size: float) -> float:
         return Z_WITH_POWER * sqrt(cells.variance(sign * size)) - size
 
-    return None if missing(NEAREST) <= 0 else float(optimize.brentq(missing, NEAREST, 1.0))
+    return None if missing(NEAREST) <= 0 else float(scipy.optimize.brentq(missing, NEAREST, 1.0))
 
 
 def difference_of_contrasts(cells: Cells, others: Cells) -> Estimate:
@@ -172,7 +173,7 @@ def difference_of_contrasts(cells: Cells, others: Cells) -> Estimate:
 
     z = LARGEST_Z if abs(value) > ROUNDING else 0.0
     if z and left_out(z) <= 0:
-        z = float(optimize.brentq(left_out, 0.0, z))
+        z = float(scipy.optimize.brentq(left_out, 0.0, z))
     below, above = half(-1, Z), half(1, Z)
     least = Z_WITH_POWER / Z * min(below, above)
     se = least / Z_WITH_POWER if cells.variance(0) or others.variance(0) else 0.0
@@ -192,7 +193,7 @@ def detectable_rate(n: int, m: int, rate: float) -> float | None:
         return float(binom.pmf(np.arange(n + 1), n, other) @ chances) - POWER
 
     ends = [end for end in (0.0, 1.0) if enough(end) >= 0]
-    return min((abs(optimize.brentq(enough, rate, end) - rate) for end in ends), default=None)
+    return min((abs(scipy.optimize.brentq(enough, rate, end) - rate) for end in ends), default=None)
 
 
 @cache

@@ -10,8 +10,9 @@ from dataclasses import replace
 from math import hypot, inf, sqrt
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import optimize, special
+from scipy import special
 
 from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.score_interval import wilson
@@ -57,7 +58,7 @@ def _lower(at_most: Callable[[float], float], part: float) -> float:
     """Return the lower end of the melded interval of a difference, which leaves this part out."""
     if at_most(-1.0) >= part:
         return -1.0
-    return float(optimize.brentq(lambda at: at_most(at) - part, -1.0, 1.0))
+    return float(scipy.optimize.brentq(lambda at: at_most(at) - part, -1.0, 1.0))
 
 
 def _at_most(first: tuple[float, float], second: tuple[float, float]) -> Callable[[float], float]:

@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+import scipy
 from numpy.typing import NDArray
 from scipy import special
-from scipy.optimize import brentq, linprog
 
 from merge_runner_analysis.stats import intervals
 from merge_runner_analysis.wording import Fact, Why
@@ -95,7 +95,7 @@ class Counts:
     def infinite(self) -> NDArray[np.bool_]:
         """Return which coefficients have no finite estimate (Konis 2007)."""
         signed = np.vstack([self.design[self.chosen > 0], -self.design[self.chosen < self.n]])
-        solution = linprog(
+        solution = scipy.optimize.linprog(
             -signed.sum(axis=0), A_ub=-signed, b_ub=np.zeros(len(signed)), bounds=(-1, 1)
         )
         return np.asarray(np.abs(solution.x) > 1e-4)
@@ -205,7 +205,7 @@ class Fit:
             while excess(outside) < 0 and abs(step) < farthest:
                 step *= WIDER
                 inside, outside = outside, outside + step
-            bound = float(brentq(excess, inside, outside, xtol=1e-9))
+            bound = float(scipy.optimize.brentq(excess, inside, outside, xtol=1e-9))
             highest = self.profile(term, bound)
             if highest is None or self.best - highest.best - lost > -SAME:
                 return bound
