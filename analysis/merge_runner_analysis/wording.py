@@ -333,7 +333,7 @@ MEASURES = {
             "m at most",
             GAP.column,
             "HC3 errors: largest difference of predicted gaps within 1 m, two one-sided tests at "
-            "5 %; not as with people: corrected p of being within below .05",
+            '5 %; not as with people: "within 1 m" is rejected, corrected p below .05',
             "with {it} who is faster moves the gap by up to {driver} m, with people by {people} m",
             (0.0, 3.0),
             {UNLIKE: "who is faster moves its gap by {of} m"},
@@ -345,8 +345,8 @@ MEASURES = {
             "accelerations held",
             "SD from humans",
             "finished",
-            "within 0.5 SD, two one-sided tests at 5 %; not as with people: corrected p of being "
-            "within below .05",
+            "within 0.5 SD, two one-sided tests at 5 %; not as with people: "
+            '"within 0.5 SD" is rejected, corrected p below .05',
             "{it} holds its accelerations otherwise than people do, by {driver} of their SD",
             (-2.0, 3.0),
             {UNLIKE: "holds accelerations {more} than people"},

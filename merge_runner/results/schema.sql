@@ -319,8 +319,9 @@ FROM (
 ) USING (trial_id, spec_hash)
 WHERE source <> 'human';
 COMMENT ON VIEW trial_levels IS 'One row per driven trial and factor: factors of trial_factors '
-    'without text factors, and model and prompt. A driver that meets an opponent is the model; a '
-    'pair without an opponent is one model, the ego first.';
+    'without text factors, and model and prompt. The level of the factor model is the driver that '
+    'meets an opponent; without an opponent it is the pair, A+B, the ego first.';
+COMMENT ON COLUMN trial_levels.factor IS 'name in the study''s file, or model, or prompt';
 
 CREATE VIEW attempts AS
 SELECT calls.*, source, variant, condition, sample_set,
@@ -336,6 +337,9 @@ LEFT JOIN (SELECT trial_id, spec_hash, side, decision, valid, failure, fallback 
     USING (trial_id, spec_hash, side, decision)
 WINDOW call AS (PARTITION BY calls.trial_id, calls.spec_hash, calls.side, calls.decision);
 COMMENT ON VIEW attempts IS 'One row per attempt, with its trial and its fate.';
+COMMENT ON COLUMN attempts.call_key IS 'key in calls';
+COMMENT ON COLUMN attempts.started_at IS 'see calls';
+COMMENT ON COLUMN attempts.scripted IS 'see calls';
 COMMENT ON COLUMN attempts.model IS 'requested model of the registry';
 COMMENT ON COLUMN attempts.fate IS 'retried: another attempt followed; driven: its plan was '
     'driven; fallback: no valid plan (see failure), an older one or 0 was driven; lost: the call '
@@ -357,7 +361,8 @@ GROUP BY ALL;
 COMMENT ON VIEW trial_costs IS 'One row per trial: the cost of its replies.';
 COMMENT ON COLUMN trial_costs.attempts IS 'number of attempts';
 COMMENT ON COLUMN trial_costs.calls IS 'number of calls';
-COMMENT ON COLUMN trial_costs.cost_usd IS 'cost of the replies when they were made, whoever paid';
+COMMENT ON COLUMN trial_costs.cost_usd IS 'sum of the known costs of its replies when they were made, whoever '
+    'paid';
 COMMENT ON COLUMN trial_costs.paid_usd IS 'part that the run of the trial paid';
 COMMENT ON COLUMN trial_costs.attempts_of_unknown_cost IS 'number of attempts without a known cost';
 
@@ -369,4 +374,5 @@ SELECT sweep_id,
 FROM (SELECT DISTINCT * FROM sweep_trials) JOIN trial_costs USING (trial_id, spec_hash)
 GROUP BY ALL;
 COMMENT ON VIEW sweep_costs IS 'One row per sweep: sums of trial_costs over its trials.';
+COMMENT ON COLUMN sweep_costs.cost_usd IS 'sum of the known costs of replies when they were made';
 COMMENT ON COLUMN sweep_costs.trials IS 'number of trials';

@@ -57,8 +57,8 @@ def _of_trials(table: Table, study: StudyResults) -> Iterator[str]:
         for group in groups:
             if unknown := _without_humans(group):
                 yield (
-                    f"{group.id}: no human drove {', '.join(unknown)} ({unknown.total()} trials), "
-                    "which rates and regressions rest on too, but no difference from the humans"
+                    f"{group.id}: no human drove {', '.join(unknown)}: differences from the "
+                    f"humans leave out these {unknown.total()} trials"
                 )
     if counts := [f"{g.id}: {g.repeated} of {len(g.stored.trials)}" for g in groups if g.repeated]:
         yield (
@@ -72,8 +72,8 @@ def _of_trials(table: Table, study: StudyResults) -> Iterator[str]:
         )
     if pairs := [f"{group.id}: {_ego_sides(group)}" for group in groups if len(group.models) > 1]:
         yield (
-            "of two different drivers left stands for the one that is named first, wherever it "
-            f"sat: odds that it goes first. {'; '.join(pairs)}"
+            'where two different drivers meet, "left first" means that the driver named first '
+            f"goes first, wherever it sat. {'; '.join(pairs)}"
         )
 
 

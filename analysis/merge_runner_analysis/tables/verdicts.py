@@ -91,17 +91,18 @@ def verdicts(study: StudyResults) -> Table:
                 f"{measure.name}: {measure.trait}, {measure.unit}; verdict: {measure.rule}"
                 for measure in MEASURES.values()
             ),
-            f"{VERDICT_RULE}. The interval of the difference has the level at which Holm tests it, "
-            "so that it leaves 0 out where the verdict says so",
+            f"{VERDICT_RULE}. The interval of a difference has the level of the test that "
+            "decides its verdict: column level",
             "collisions: by the rule of the human experiment, outlines that overlap, checked at "
             "20 Hz; Fisher's exact test within conditions, and the melded interval that agrees "
-            "with it; without p where trials are undecided. The humans' share weighs conditions as "
-            "the driver's trials do, and so does their mean gap as its trials with a gap do",
+            "with it; without p where trials are undecided. Conditions weigh in the "
+            "humans' share as in the driver's trials, and in their mean gap as in its trials with "
+            "a gap",
             f"intervals take trials as independent. The {HUMAN_TRIALS} human trials are of nine "
             "pairs who differ, which only the mean gap and imported gaps allow for",
             *(
-                f"{group.id}: {len(copies)} of {len(group.trials)} trials went as another one to "
-                "the last state, with words that its drivers do not read: each counts once"
+                f"{group.id}: {len(copies)} of {len(group.trials)} trials equal another one to "
+                "the last state, as no driver reads the words that differ: equal trials count once"
                 for group in study.models
                 if (copies := _copies(study, group))
             ),

@@ -54,8 +54,9 @@ COMMENT ON COLUMN geometry.merge_point_m IS 'distance at which the branches meet
 COMMENT ON COLUMN geometry.end_m IS 'end of the track';
 COMMENT ON COLUMN geometry.front_m IS 'centre of a vehicle whose front is at the merge point';
 COMMENT ON COLUMN geometry.rear_m IS 'centre of a vehicle whose rear has left the merge point';
-COMMENT ON COLUMN geometry.contact_m IS 'first point of overlap: a vehicle there overlaps the '
-    'other from there to contact_high_m, one at the merge point from merge_low_m to merge_high_m';
+COMMENT ON COLUMN geometry.contact_m IS 'first position at which two vehicles can overlap: if '
+    'one is there, the other overlaps it from contact_m to contact_high_m; if one is at the merge '
+    'point, the other overlaps it from merge_low_m to merge_high_m';
 COMMENT ON COLUMN geometry.contact_high_m IS 'see contact_m';
 COMMENT ON COLUMN geometry.merge_low_m IS 'see contact_m';
 COMMENT ON COLUMN geometry.merge_high_m IS 'see contact_m';

@@ -155,8 +155,8 @@ def test_verdicts_count_a_trial_once_whichever_side_has_words_that_nobody_reads(
         if own.values.get("counted"):
             (source,) = explain(study, table, f"{own.id}:counted").sources
             assert f"{len(source.numerator)} of {len(source.trials)}" == own.values["counted"]
-    (note,) = notes_with(table, "each counts once")
-    assert note.startswith("emulator/persona=taxi: 6 of 12 trials went as another one")
+    (note,) = notes_with(table, "equal trials count once")
+    assert note.startswith("emulator/persona=taxi: 6 of 12 trials equal another one")
     # The first page counts them so, too.
     levels = values_of(study, "levels")
     assert levels["persona=none"]["ended"] == 6

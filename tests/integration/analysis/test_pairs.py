@@ -130,7 +130,7 @@ def test_who_goes_first_is_told_of_the_ego_on_either_side(both):
     assert set(finished["model_left"]) == {"goes"}
     (group,) = (group for group in both.models if group.driver == "goes+brakes")
     assert str(fits(group).logit.problem).startswith("who merged first is the same in all")
-    (note,) = notes_with(made(both, "who-first"), "of two different drivers left")
+    (note,) = notes_with(made(both, "who-first"), "where two different drivers meet")
     says = f"{group.id}: goes drove on the left in 11 trials, and on the right in 11, mirrored"
     assert says in note
 
