@@ -70,7 +70,7 @@ class Trial:
         self._advance()
 
     def fail(self, side: Side, error: CallFailed) -> None:
-        """Note that a side's question has no answer; the trial ends before the next step."""
+        """Note that a side's question gets no answer; the trial then ends before the next step."""
         self._failures[side] = error
 
     def record(self) -> TrialRecord:
@@ -153,11 +153,11 @@ class _DriverState:
 
     @property
     def steps_left(self) -> int:
-        """Number of the world's steps until its next decision step."""
+        """Number of the world's steps until the driver's next decision step."""
         return self._interval - self._world.step % self._interval
 
     def decides_now(self) -> bool:
-        """Return whether it decides at this step. Once in control, it stays in control."""
+        """Return whether the driver decides at this step. Once in control, it stays in control."""
         self._in_control = self._in_control or self._world.in_control(self.side)
         return self._in_control and self._world.step % self._interval == 0
 
@@ -171,7 +171,7 @@ class _DriverState:
         return _result_of(self.driver.decide(observation, self.number), self.side)
 
     def take(self, decision: Decision) -> None:
-        """Execute a decision from now on; raises UsageError for one that cannot be executed."""
+        """Drive by a decision from now on; raises UsageError if it cannot be executed."""
         applied, expected = decision.applied, self._pace.executed_actions
         driven: list[float] = []
         for action in applied:

@@ -51,9 +51,9 @@ NAMES = (
 app.add_typer(human_app, name="human", rich_help_panel=KEEP)
 
 MODELS = "Only these drivers, separated by commas; human is one."
-WHERE = "Only trials at this level of a factor, model or prompt, and humans; may be repeated."
-RUN = "Only trials of runs with this --name or sweep_id, and humans."
-BY = "With the table effects: effects at each level of this factor, and interactions."
+WHERE = "Only humans, and trials at this level of a factor, such as prompt=A1; may be repeated."
+RUN = "Only humans, and trials of runs with this --name or sweep_id."
+BY = "With the table effects: effects at each level of this factor, and its interactions."
 NAME, ROW = "A table's name.", "ROW, or ROW:COLUMN; without it rows are listed."
 ALL = "All trials, also those that the value does not count."
 OUT, HTML_FILE = "The folder to write to.", "The HTML file to write."

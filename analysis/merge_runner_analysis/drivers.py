@@ -11,7 +11,7 @@ from merge_runner.records import SIDES, Side
 
 
 def language_models(names: Mapping[Side, str], spec: Mapping[str, Any]) -> dict[Side, str]:
-    """Return the language models by a spec: its programs may not be registered here."""
+    """Return the language models among these names, by the spec: programs may be unknown here."""
     return {side: name for side, name in names.items() if "program" not in (spec.get(side) or {})}
 
 

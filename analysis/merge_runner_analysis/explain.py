@@ -164,7 +164,7 @@ def _source(
 
 @remembered
 def _rows(group: Group, rests_on: str) -> list[tuple[Any, str, str, str]]:
-    """Return label, trial, spec and condition of the trials that rows of a table may rest on."""
+    """Return (label, trial, spec, condition) of each trial that rows of a table may rest on."""
     known = {STORED: group.trials, ENDED: group.ended, FINISHED: group.finished}
     rows = known.get(rests_on, group.trials)
     counted = slice(None) if rests_on in known else rows[rests_on].notna()

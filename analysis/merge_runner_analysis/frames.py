@@ -22,10 +22,10 @@ from merge_runner.text_safety import quoted
 from merge_runner_analysis.calls import COUNTED
 from merge_runner_analysis.trials import judged, with_metrics
 
-# One row a trial, as its ego sees it (see ``trial_drivers``): one whose ego sat
-# on the right is mirrored, so that "left" is the ego everywhere, headway and relative velocity are
-# the ego's minus the other's, and the condition is the one with such numbers. Where only an ego on
-# the right has driven that, it is called after the one that was driven.
+# One row per trial, as its ego sees it (see ``trial_drivers``). A trial whose ego sat on the right
+# is mirrored: "left" is the ego everywhere, headway and relative velocity are the ego's minus the
+# other's, and the condition is the one with these numbers. If no condition has them, its name is
+# that of the driven one and the word mirrored.
 _PUBLISHED = ", ".join(
     f"({quoted(name)}, {at.projected_headway_m!r}::DOUBLE, {at.relative_velocity_mps!r}::DOUBLE)"
     for name, at in HUMAN_CONDITIONS.items()
@@ -154,7 +154,7 @@ def _limit(connection: duckdb.DuckDBPyConnection) -> None:
 
 
 def load_trials(db: Path | str = DEFAULT_DB) -> pd.DataFrame:
-    """Return one row a trial as its ``ego`` sees it, in SI units; see docs/tables.md.
+    """Return one row per trial as its ``ego`` sees it, in SI units; see docs/tables.md.
 
     A trial whose ego sat on the right is mirrored; first-decision probes are left out.
     """
@@ -167,11 +167,11 @@ class Studies(NamedTuple):
     trials: pd.DataFrame
     """A row for each trial and each run that it was played for: its key, sweep_id, study."""
     orders: Mapping[str, Order]
-    """By study the levels of each factor, in the order of the study."""
+    """The levels of each factor, in the order of the study, by study."""
     called: Mapping[str, str]
-    """By the id of each run what its user calls it; empty without a name."""
+    """The user's name for each run, by its id; empty without a name."""
     texts: Mapping[str, str]
-    """By study the text of its file in the newest run."""
+    """The text of a study's file in its newest run, by study."""
 
     def holds(self, study: str, frame: pd.DataFrame) -> pd.Series:
         """Return which rows of a frame are of trials that were played for a study."""
@@ -184,9 +184,9 @@ class Frames(NamedTuple):
     """Rows that a study reads of its database, while nobody writes there."""
 
     trials: pd.DataFrame
-    """TRIALS and TRACES with a column for each metric, and whether they collided."""
+    """TRIALS and TRACES, with a column for each metric and for each collision rule."""
     probes: pd.DataFrame
-    """First situations that were only asked: of equal columns, of trials that end there."""
+    """First-decision probes: TRIALS and TRACES, with a column for each metric."""
     specs: Mapping[str, dict[str, Any]]
     """By their hashes, those of the newest run first."""
     studies: Studies

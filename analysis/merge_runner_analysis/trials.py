@@ -1,7 +1,6 @@
 """The trials of a database with their metrics, and with whether they collided, by two rules.
 
-A trial that ended by one rule of collisions, before the other rule saw one, is undecided by the
-other.
+A trial that one rule ended, before the other rule saw a collision, is undecided by the other.
 """
 
 from __future__ import annotations
@@ -86,7 +85,7 @@ def judged(
     trials: pd.DataFrame,
     specs: Mapping[str, Mapping[str, Any]],
 ) -> pd.DataFrame:
-    """Return the trials with whether they collided by either rule; NA if undecided."""
+    """Return the trials with a column for each collision rule: collided or not; NA if unknown."""
     ended, human = trials["status"] != "failed", trials["source"] == "human"
     recorded = trials["status"].eq("collided").astype("boolean").where(ended)
     tasks = {

@@ -192,7 +192,7 @@ def check_sweep(
     *,
     finished: bool,
 ) -> Audit:
-    """Audit the trials of a sweep that were not audited with an earlier one.
+    """Audit the trials of a sweep that were not audited with another sweep before.
 
     ``planned`` is empty if the sweep's trials are not known. Missing and failed trials are findings
     in a ``finished`` sweep, and a note in an unfinished one.

@@ -50,24 +50,32 @@ def beside_study(ctx: typer.Context, param: typer.CallbackParam, path: Path) -> 
     return homes.pop() / path
 
 
-DB = "The results database; for a study's file the default is below the file's folder."
-CACHE = "The folder of stored replies; for a study's file the default is below the file's folder."
+DB = "The results database. With a study's file, the default is below the file's folder."
+CACHE = "The folder of stored replies. With a study's file, the default is below the file's folder."
 DbOption = Annotated[Path, option("FILE", DB, "--db", callback=beside_study, **FILES)]
 CacheOption = Annotated[Path, option("DIR", CACHE, "--cache", callback=beside_study, **FILES)]
 MODEL = (
     "A model or program of `merge-runner models`, or a pair LEFT+RIGHT; may be repeated. Default: "
     "the models of the study's file, or the emulator."
 )
-ONLY = "Only trials at this level of a factor, model or prompt; may be repeated."
-CONDITIONS, PROMPTS = "Conditions, separated by commas.", "Prompts, separated by commas."
-REPS = "Repetitions per condition and prompt."
+ONLY = (
+    "Only trials at this level of a factor, such as hurry=yes, model=o3 or prompt=A1; may be "
+    "repeated."
+)
+CONDITIONS = "Conditions, separated by commas, such as N_0_0,L_4_8."
+PROMPTS = "Prompts, separated by commas, such as baseline,A1."
+REPS = "Trials of each combination of levels in each condition. Default: the study's number."
 ModelOption = Annotated[list[str] | None, option("NAME", MODEL, "--model", **PLAYED)]
 OnlyOption = Annotated[list[str] | None, option("FACTOR=LEVEL", ONLY, "--only", **PLAYED)]
 RepsOption = Annotated[int | None, option("N", REPS, "--reps", **PLAYED)]
 ConditionsOption = Annotated[str | None, option("A,B", CONDITIONS, "--conditions", **PLAYED)]
 VariantsOption = Annotated[str | None, option("A,B", PROMPTS, "--variants", **PLAYED)]
-YES = "Do not ask before something is spent or removed."
-TRUST = "Without asking, run the study's code, and send keys where its models.toml says."
+YES = "Do not ask before money is spent or something is removed."
+TRUST = (
+    "Agree to the study's code, and to the servers in its models.toml that get keys or prompts. "
+    "Default: the command shows them and asks. A script, which cannot answer, needs this option: "
+    "merge-runner sweep study.toml --trust."
+)
 STUDY = "Only trials of this study. A command that needs the study's plug-ins runs them."
 JsonOption = Annotated[bool, flag("--json", "Print the result as JSON.", **ASKED)]
 YesOption = Annotated[bool, flag("--yes", YES, **ASKED)]

@@ -32,37 +32,45 @@ if TYPE_CHECKING:
     from merge_runner.run.plan import Plan
 
 STUDIES = (
-    "A study: experiments/NAME.toml, or a path; default: baseline. To replay, also a recording, "
+    "A study: experiments/NAME.toml, or a path; default: baseline. In a replay, also a recording, "
     "FILE.parquet. Several are played one after the other."
 )
 MIRROR = "Play pairs of different drivers in both positions."
 GRID = (
-    "With --first, in place of the study's conditions: projected headways in m and relative "
-    "velocities in m/s, h=FROM:TO:STEP,dv=FROM:TO:STEP; usual: h=-6:6:2,dv=-1.6:1.6:0.4."
+    "With --first: ask in each combination of projected headways h, in m, and relative velocities "
+    "dv, in m/s, each as FROM:TO:STEP or one number, such as h=-6:6:2,dv=0. `--grid usual` is "
+    "h=-6:6:2,dv=-1.6:1.6:0.4; a part that you leave out is taken from it. Default: no grid, but "
+    "the study's conditions."
 )
 RUN_NAME = "Your name for this run, in lists of runs and in its summary."
-SAMPLES = "Another number draws a fresh set of samples."
-ORDER = "Another number draws another order of the trials."
+SAMPLES = "Another number asks for a new, independent set of replies."
+ORDER = "Another number plays the trials in another order."
 FIRST = "Ask both drivers for their first decision only."
 DRY_RUN = "Only estimate: trials, calls, tokens, cost, time. Nothing is sent."
 SHOW_PROMPTS = "With --dry-run: print each prompt as its drivers read it."
-IN_FLIGHT = "Trials played at once, over all workers."
-KEEP_GOING = "Go on with a model that gives no valid decision."
-REPLAY = "From recorded replies alone: no key, no network."
+IN_FLIGHT = "Trials played at once; with --dask, over all workers."
+KEEP_GOING = "Go on although a model gives no valid decision."
+REPLAY = "Play from recorded replies alone: no key, no network."
+RPM, TPM = (
+    f"Limit of {what} a minute. Default: that of the model's entry."
+    for what in ("requests", "tokens")
+)
 MAX_COST = "Send no request that could bring the cost of all runs of the sweep above this."
-STRICT = "Stop when another model answers."
+STRICT = "Stop when another model answers than was requested."
 DASK = "Play on a Dask cluster: local:N, a scheduler's address, or its file."
 BATCH = "Send requests in the provider's batches: cheaper, but it takes hours."
 # Parameters of sweep that replay accepts and does not list.
 NO_EFFECT = {"max_cost_usd", "batch", "in_flight", "rpm", "tpm", "dask", "strict_model"}
 NO_EFFECT |= {"keep_going", "replay", "yes"}
-RECORDING = "Also replay from this file, without importing it; may be repeated."
+RECORDING = (
+    "In a replay, also use the replies of this file, without importing them; may be repeated."
+)
 
 
 def init(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="A new folder, or an empty one.")],
 ) -> None:
-    """Write a folder with a study that runs, to change into your own.
+    """Write a folder with an example study, to adapt.
 
     Example: merge-runner init my-study
     """
@@ -93,8 +101,8 @@ def sweep(
     ] = None,
     batch: Annotated[bool, cli.flag("--batch", BATCH, **cli.PACE)] = False,
     in_flight: Annotated[int, cli.option("N", IN_FLIGHT, min=1, **cli.PACE)] = 200,
-    rpm: Annotated[int | None, cli.option("N", "Requests a minute.", min=1, **cli.PACE)] = None,
-    tpm: Annotated[int | None, cli.option("N", "Tokens a minute.", min=1, **cli.PACE)] = None,
+    rpm: Annotated[int | None, cli.option("N", RPM, min=1, **cli.PACE)] = None,
+    tpm: Annotated[int | None, cli.option("N", TPM, min=1, **cli.PACE)] = None,
     dask: Annotated[str | None, cli.option("CLUSTER", DASK, **cli.PACE)] = None,
     strict_model: Annotated[bool, cli.flag("--strict-model", STRICT, **cli.FAULTS)] = False,
     keep_going: Annotated[bool, cli.flag("--keep-going", KEEP_GOING, **cli.FAULTS)] = False,

@@ -218,9 +218,9 @@ class Budget:
     ) -> Reservation:
         """Reserve an attempt's worst case for the oldest running trial of those that share a call.
 
-        It is scaled where the server ignores the output cap. Waits until there is money for it;
-        raises TrialSuspended if there is too little and no open attempt can free any. The caller
-        closes the reservation.
+        The worst case is scaled if the server ignores the output cap. Waits until there is money
+        for it; raises TrialSuspended if there is too little, and no open attempt can free any. The
+        caller closes the reservation.
         """
         may_reserve = partial(self._may_reserve, trials, label, is_probe)
         if self.ledger.cap is not None and (self.queue.waiters or not may_reserve()):

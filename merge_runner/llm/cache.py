@@ -56,7 +56,8 @@ class ResponseCache(CallStore):
     ) -> list[CachedCall]:
         """Store entries, and attempts of calls without an answer, in one transaction here.
 
-        The operations ``money`` book their costs in it, too. Returns the entries that are stored.
+        The operations ``money`` book costs in the same transaction. Returns the stored entries,
+        which may be earlier ones.
         """
         entries = list(entries)
         damaged = [partial(self.quarantine, entry.request.key) for entry in entries]
@@ -118,12 +119,12 @@ class ResponseCache(CallStore):
                 yield call
 
     def has_all(self, keys: Sequence[str]) -> bool:
-        """Return whether the folder has the calls with these keys, with damaged ones."""
+        """Return whether the folder has the calls with these keys; damaged ones count."""
         return not self.rows(_MISSING, json.dumps(keys))
 
     @property
     def number(self) -> int:
-        """Number of calls in the folder, with damaged ones."""
+        """Number of calls in the folder, including damaged ones."""
         return int(self.rows(_NUMBER)[0][0])
 
     def quarantine(self, key: str, execute: Execute) -> list[str]:

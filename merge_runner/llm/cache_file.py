@@ -94,7 +94,7 @@ def open_texts(folder: Path) -> diskcache.Cache:
 
 
 def close_texts(texts: diskcache.Cache) -> None:
-    """Count the rows and close; where the count cannot be written, it stays as it was opened."""
+    """Store the number of rows, and close; if it cannot be stored, the old number stays."""
     with contextlib.suppress(*FAILURES):
         ((rows,),) = texts._sql("SELECT count(*) FROM Cache").fetchall()
         if len(texts) != rows:
@@ -106,7 +106,7 @@ def checked_format(folder: Path) -> bytes:
     """Return the format that a folder's file names.
 
     Raises UsageError for unknown settings, which diskcache would apply, and for the file of another
-    version; the first version left no mark.
+    version. A file of the first version names no format.
     """
     sql = "SELECT CAST(value AS BLOB) FROM Cache WHERE key = ? AND raw = 1"
     with closing(connect(folder / FILE)) as connection:

@@ -35,10 +35,10 @@ class Call:
     ``label`` names it and bounds the cost of an attempt, ``worst`` bounds its tokens. ``left_s``
     remains for its attempts and the waits between them; waits for the rate limiter do not count.
     ``attempts`` has all attempts, the first ``earlier_attempts`` by earlier runs. ``wait`` is None
-    while it is in flight or being saved. ``task`` makes the call, ``trials`` wait for it, by their
-    order; ``order`` is the lowest. Other calls wait for a probe. ``bypass_batch`` is set after a
-    batch without a result for it; ``pending_batch`` is the batch of an earlier run in which it
-    waits. Its recorded reply may be ``damaged``.
+    while it is in flight or being saved. ``task`` makes the call. ``trials`` has the orders of the
+    trials that wait for it, ``order`` is the lowest of them. While ``is_probe``, other calls wait
+    for it. ``bypass_batch`` is set after a batch without a result for it; ``pending_batch`` is the
+    batch of an earlier run in which it waits. ``damaged``: so is its recorded reply.
     """
 
     request: ChatRequest
@@ -117,7 +117,7 @@ class Calls:
         call.wait = wait
 
     def given_up(self, call: Call) -> CallFailed:
-        """Return the error of a call that no running trial waits for, or that the run stops."""
+        """Return the error of a call that no running trial needs, or that a stopped run drops."""
         why = "the sweep was stopped" if self.stopping else "its trial has ended"
         return CallFailed(why, call.request)
 

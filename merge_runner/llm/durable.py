@@ -35,7 +35,7 @@ Operation = Callable[[Execute], Any]
 
 @contextlib.contextmanager
 def folder_lock(folder: Path) -> Iterator[None]:
-    """Lock a folder against other processes that create a file; its name is durable afterwards."""
+    """Lock a folder while a file is created in it; afterwards the file's name is durable."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)

@@ -136,7 +136,7 @@ class RawReply:
 class TransportFailure(MergeRunnerError):
     """An attempt without a reply; ``outcome`` names the failure in the table of calls.
 
-    ``sent`` is False where the request was certainly not sent, so that it cannot be billed.
+    ``sent`` is False if the request was certainly not sent, and so cannot be billed.
     AttemptOutcome explains ``action`` and ``reason``.
     """
 
@@ -160,10 +160,10 @@ class TransportFailure(MergeRunnerError):
 class AttemptOutcome:
     """Outcome of an attempt, by its ``name`` in the table of calls, and the action that follows.
 
-    ``accept`` it as the answer, ``retry`` after ``delay_s`` (``pause``: all calls of the key wait),
-    ``fail`` this call, or stop the sweep because the ``quota`` is exhausted or the endpoint has
-    ``rejected`` the key or the model. Without a ``raw`` reply the attempt may have been ``charged``
-    all the same; ``rejections.reason_of`` then gives the ``reason``, if it is known.
+    ``accept`` it as the answer, ``retry`` after ``delay_s`` (``pause``: all calls to the endpoint
+    wait), ``fail`` this call, or stop the sweep because the ``quota`` is exhausted or the endpoint
+    has ``rejected`` the key or the model. Without a ``raw`` reply, ``charged`` says whether the
+    attempt may have been billed, and ``reason`` why there is none, for ``rejections.reason_of``.
     """
 
     action: Action
@@ -180,9 +180,9 @@ class AttemptOutcome:
 def may_be_charged(raw: RawReply, endpoint: str) -> bool:
     """Return whether a reply without usage may have been billed.
 
-    Refusals before any work are not billed, nor errors in the documented form of a provider from
-    its own host (``endpoint`` identifies the host). An error of a gateway, or a timeout, may follow
-    a generated answer.
+    Not billed are refusals before any work, and errors that a provider's own host sends in the
+    documented form (``endpoint`` identifies the host). An error of a gateway, or a timeout, may
+    follow a generated answer.
     """
     provider = PROVIDERS.get(endpoint)
     if raw.status < 300 or raw.status in TOO_LATE or '"usage' in raw.body:

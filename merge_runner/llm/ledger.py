@@ -141,7 +141,7 @@ class Coordinator(Protocol):
 class Ledger:
     """Spending of one sweep, named ``scope`` in the cache, under a ``cap``; None: no limit.
 
-    ``spending`` is as last summed; ``committed_usd`` includes the other ledgers under the cap.
+    ``spending`` is the last sum; ``committed_usd`` includes the other ledgers under the cap.
     Several processes may run the sweep, so every transaction sums first. The ledger of a free model
     has no name and keeps no record.
     """
@@ -200,7 +200,7 @@ class Ledger:
         return committed_usd
 
     def refresh(self, execute: Execute) -> None:
-        """Sum beside writes, where read() could see the state before one. Runs in a transaction."""
+        """Sum after all earlier writes, some of which read() might miss. Runs in a transaction."""
         self._sum_once(execute)
         self.committed_usd = self._in_transaction_usd
 

@@ -41,7 +41,7 @@ class _Turn:
 
 @dataclass(slots=True)
 class Pause:
-    """End of a pause on the loop's clock, shared by all limiters of one key."""
+    """End of a pause on the loop's clock, shared by all limiters of one endpoint."""
 
     until: float = 0.0
 
@@ -105,7 +105,7 @@ class Limiter:
         return None if self._tpm is None else partial(self._correct, turn)
 
     def pause(self, seconds: float) -> None:
-        """Dispatch nothing for a while: the server asked all on this key to wait."""
+        """Dispatch nothing for a while: the server asked all calls to the endpoint to wait."""
         now = asyncio.get_running_loop().time()
         self._pause.until = max(self._pause.until, now + seconds)
 

@@ -26,7 +26,7 @@ DEARER_TIERS = frozenset({"priority"})
 def cost_usd(entry: ModelEntry, usage: Usage, tier: str | None = None) -> float | None:
     """Return the cost of tokens in USD, None where the price or a count is unknown.
 
-    ``tier`` is the service tier that the reply names; one without a price has the normal price.
+    ``tier`` is the service tier that the reply names; a tier without a price costs the normal one.
     """
     price, read, written = entry.price, usage.input_tokens, usage.output_tokens
     if price == "free":

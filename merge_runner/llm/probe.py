@@ -1,4 +1,4 @@
-"""Probe request: the first normal call of a run to an endpoint is made alone."""
+"""Probe request: the first normal call of a run to a model is made alone."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LONG_WAIT_S = 5.0
 
 @dataclass(slots=True)
 class Probe:
-    """Lock that serialises the calls to an endpoint until the first accepted reply.
+    """Lock that serialises the calls to a model until its first accepted reply.
 
     So a wrong key, URL or parameter costs one call.
     """
@@ -31,7 +31,7 @@ class Probe:
 
     @asynccontextmanager
     async def turn(self, call: Call) -> AsyncIterator[None]:
-        """Wait until no other call probes; a run that stops lets no further call probe."""
+        """Wait until no other call probes. If the probe stops the run, no further call probes."""
         self.calls.wait(call, Wait(f"for the first reply of {self.endpoint.driver}"))
         await self._alone.acquire()
         call.wait = None

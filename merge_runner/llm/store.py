@@ -1,7 +1,7 @@
 """Store of recorded replies and their costs: one SQLite file, from which nothing is evicted.
 
 An entry is a checksum, then the JSON of a request and all its attempts, the answering one last. It
-is durable before anyone sees it: each group of writes is one synchronous SQLite transaction. The
+is durable before a trial uses it: each group of writes is one synchronous SQLite transaction. The
 file also holds the attempts of calls without an answer, the notes of batches, and damaged entries
 in quarantine. Two of its tables are the ledgers of all sweeps: a reply and its cost are stored
 together or not at all. A third table counts calls by request template.

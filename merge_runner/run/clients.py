@@ -51,8 +51,8 @@ def live_clients(
     """Return clients with connections, closed with ``stack``, and a share of the rate limits.
 
     ``usage`` is a result of ``earlier_answers``. ``rounds`` are this run's; they get the
-    batch modes of its models. Variables in ``urls`` go before the environment. ``limiters`` by
-    registered model go on from earlier clients, and get those that are made. Raises UsageError
+    batch modes of its models. Variables in ``urls`` override the environment. ``limiters``, by
+    registered model, are reused from earlier clients; new ones are added. Raises UsageError
     where a key is missing, or a cap could not be enforced.
     """
     _check_money(plan, ledger)

@@ -61,7 +61,7 @@ MOST_LOSSES = 3
 class Assignment:
     """A chunk on a worker, and the money of its attempts.
 
-    ``usd`` is by attempt its worst case, or its cost where that is known. The rows ``booked`` are
+    ``usd`` has, by attempt, the worst case, or the cost if that is known. The rows ``booked`` are
     counted as spent already. ``unbooked`` is the error that ended the booking.
     """
 
@@ -73,7 +73,7 @@ class Assignment:
 
     @property
     def unused_usd(self) -> float:
-        """The rest of its share of the cap."""
+        """The rest of the chunk's share of the cap."""
         cap = self.chunk.cap
         return max(0.0, cap.usd - sum(self.usd.values())) if cap is not None else 0.0
 

@@ -11,8 +11,8 @@ GO_ON = "Run the same command again to go on."
 Stopping = Callable[
     [Callable[[], object] | None, Callable[[], object]], AbstractContextManager[None]
 ]
-"""A context in which a run can be stopped: the first function stops it, the second one drops what
-it then still waits for. The first is None where nothing is left to stop."""
+"""A context in which a run can be stopped: the first function stops it, the second one drops the
+calls that it still waits for. The first is None if nothing is left to stop."""
 
 
 def on_event(event: asyncio.Event | None) -> Stopping:

@@ -126,8 +126,8 @@ class Progress:
     def _left_s(self, elapsed_s: float, ended: int, shares: Mapping[str, float]) -> float | None:
         """Return the estimated time left in s; None while there is nothing to estimate it from.
 
-        The slowest model determines it. Trials that run in step all end late, so early in a run the
-        calls are a better basis.
+        The slowest model determines it. Trials that begin together end together, so early in a run
+        the calls are a better basis.
         """
         total = self.trials.todo.total()
         if ended >= total:
@@ -152,7 +152,7 @@ class Progress:
     def _shares(self) -> dict[str, float]:
         """Return the share of its decisions that each model has made, of those left to this run.
 
-        The number in a trial is known when it has ended: the share is of the usual number.
+        The number of decisions in a trial is known only at its end, so the usual number is taken.
         """
         expected, made = defaultdict[str, float](float), Counter[str]()
         for arm in self.plan.arms:

@@ -23,8 +23,8 @@ MACHINE = hashlib.sha256(platform.node().encode()).hexdigest()[:8]
 class ProgressSnapshot(BaseModel):
     """Snapshot of a sweep, for its display and for other processes.
 
-    ``ended`` trials have an outcome, those that were stored before this run among them. ``left_s``
-    is the estimated time left, None while there is no estimate. ``rows`` are the display's,
+    ``ended`` counts trials with an outcome, including those stored before this run. ``left_s`` is
+    the estimated time left, None while there is no estimate. ``rows`` are those of the display,
     each with its name: ``WARNING``, ``waiting`` (for what), ``trials``, ``cost`` and so on.
     """
 
@@ -55,7 +55,7 @@ class ProgressSnapshot(BaseModel):
 
 
 def write_snapshot(db: Path, snapshot: ProgressSnapshot) -> None:
-    """Replace a sweep's file as a whole: a reader sees the old state or the new one, never a part.
+    """Replace a sweep's file as a whole: a reader sees the old state or the new one, no mixture.
 
     If it cannot be written, the sweep continues.
     """

@@ -1,4 +1,4 @@
-"""The plans in a recording, which replay it without a file of their study."""
+"""The plans in a recording, by which it is replayed without the file of its study."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ class Replay:
         return played or play_trial(self._trials.make(spec), self._answer)
 
     async def look_ahead(self, specs: Sequence[TrialSpec]) -> list[TrialRecord]:
-        """Play trials until one has a recorded reply; return all if none has, else no trial.
+        """Play trials until one has a recorded reply. Return the trials if none has, else none.
 
         ``play`` does not repeat them. Without a language model no trial is played.
         """

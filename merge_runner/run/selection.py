@@ -31,7 +31,8 @@ _AXIS = re.compile(
 def grid_conditions(text: str) -> list[str]:
     """Return the names of the conditions of a grid such as USUAL_GRID, or ``usual``.
 
-    ``h`` or ``dv`` may be one number, or be left out: the usual grid's. Raises UsageError.
+    ``h`` or ``dv`` may be one number; one that is left out is taken from USUAL_GRID. Raises
+    UsageError.
     """
     parts = USUAL_GRID if text == "usual" else f"{USUAL_GRID},{text}"
     points = list(product(*dict(map(_axis, parts.split(","))).values()))

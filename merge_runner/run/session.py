@@ -26,8 +26,8 @@ from merge_runner.trial_records import TrialRecord, TrialSpec
 class Session:
     """An open plan; its trials are ``stored`` by earlier runs, or ``todo``.
 
-    ``say`` shows a line to the user. The first problem sets ``exit_code``, ``messages`` are
-    of all.
+    ``say`` shows a line to the user. The first problem sets ``exit_code``; all problems are in
+    ``messages``.
     """
 
     plan: Plan

@@ -33,8 +33,8 @@ def spec_text(
 ) -> str:
     """Return the canonical JSON of what determines a trial of an arm.
 
-    It leaves out its condition's headway and relative velocity. These are in its row, where a
-    change of them is refused; the mean speed is not.
+    It leaves out the condition's headway and relative velocity. These are columns of the trial's
+    row, where a change of them is refused; the mean speed is no column, and so part of the spec.
     """
     mean_speed_mps = parts.conditions[condition].mean_speed_mps
     spec: dict[str, object] = {
@@ -51,7 +51,7 @@ def spec_text(
 
 
 def _prompt_blocks(arm: Arm, parts: Parts) -> dict[str, str]:
-    """Return the digests of the prompt's blocks; one of a single driver names its side."""
+    """Return the digests of the prompt's blocks; a block of one driver alone names its side."""
     left, right = (
         parts.prompts[arm.prompt(side)].digests if arm.full_names[side] in arm.entries else None
         for side in SIDES

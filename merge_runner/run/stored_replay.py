@@ -100,7 +100,7 @@ def audit_database(
 
 
 def check_programs(path: Path, plan: Plan, stored: Sequence[TrialSpec]) -> None:
-    """Raise UsageError where a program drives otherwise than in a stored trial of its revision.
+    """Raise UsageError if a program drives differently from a stored trial of its revision.
 
     One trial of each spec with a program is played, by the stored replies.
     """

@@ -42,6 +42,8 @@ def test_what_a_person_reads_is_short_and_in_plain_words():
     assert len((PROJECT / "CONTRIBUTING.md").read_text().split()) <= 700
     for page in [*WRITTEN, PROJECT / "CONTRIBUTING.md", PROJECT / "SECURITY.md"]:
         assert not REFUSED.search(page.read_text()), (page.name, REFUSED.search(page.read_text()))
+        # A block whose lines are run together is no command that can be copied.
+        assert not re.search(r"```\w+ \S", page.read_text()), page.name
 
 
 def test_plug_ins_and_notebooks_of_the_docs_import_stable_names_of_the_runner_alone():

@@ -31,8 +31,8 @@ Trials = Mapping[str, Any]  # columns, also of a data frame: condition, a measur
 class Cells:
     """Two rates by cell: successes and trials of the first, and of the second.
 
-    ``varying`` is by cell the share of trials that vary by themselves: those that are in two cells
-    with opposite outcomes do not, as their sum is sure.
+    ``varying`` is, by cell, the share of trials that add variance. A trial that counts in two
+    cells, with opposite outcomes, adds none, as their sum is fixed.
     """
 
     a: NDArray[np.int_]
@@ -43,7 +43,7 @@ class Cells:
 
     @cached_property
     def shares(self) -> Array:
-        """Weight of each cell, of 1; a trial that stands in two cells counts half in each."""
+        """Weights of the cells, with the sum 1; a trial in two cells counts half in each."""
         n, m = (
             (1 + of) / 2 * size for of, size in zip(self.varying, (self.n, self.m), strict=True)
         )
@@ -52,7 +52,7 @@ class Cells:
 
     @property
     def rates(self) -> tuple[float, float]:
-        """Both rates, of cells that weigh as in their difference."""
+        """Both rates, as means over cells with the weights of the difference."""
         return float(self.shares @ (self.a / self.n)), float(self.shares @ (self.b / self.m))
 
     @cached_property
@@ -135,8 +135,8 @@ def shared_cells(first: Trials, second: Trials, measure: str) -> Cells | None:
 def contrast_rates(cells: Cells) -> Estimate:
     """Compare two rates within cells: Mantel and Haenszel's test (1959), with a score interval.
 
-    ``detectable`` is as many standard errors from 0 as the power takes; None where not even rates
-    of 0 and 1 would differ.
+    ``detectable`` is the difference with 80 % power; None if not even rates of 0 and 1 would differ
+    significantly.
     """
     value, se = cells.difference, sqrt(cells.variance(0))
     ends = cells.end(-1), cells.end(1)
@@ -159,7 +159,7 @@ def _detectable(cells: Cells, sign: int) -> float | None:
 def difference_of_contrasts(cells: Cells, others: Cells) -> Estimate:
     """Return an interaction, with its interval and p by MOVER (Zou and Donner 2008).
 
-    Its error is 0 where nothing varies within any cell.
+    Its standard error is 0 if nothing varies within any cell.
     """
     differences = cells.difference, others.difference
     value = differences[0] - differences[1]
@@ -217,10 +217,10 @@ def rejected(n: int, m: int) -> NDArray[np.bool_]:
 def contrast_means(first: Trials, second: Trials, measure: str) -> Estimate | None:
     """Compare two means within the conditions that both have, by Welch's test.
 
-    The difference comes from a linear model with a level for each condition. Its error (HC2;
-    MacKinnon and White 1985) and degrees of freedom (Bell and McCaffrey 2002) hold where groups
-    differ in size and variance. None where no condition is shared, or a single trial is all of one;
-    without a test where all trials of a condition are equal.
+    The difference comes from a linear model with an intercept for each condition. Its standard
+    error (HC2; MacKinnon and White 1985) and degrees of freedom (Bell and McCaffrey 2002) are valid
+    if groups differ in size and variance. None if no condition is shared, or if one trial
+    determines a coefficient; without a test if the values are equal within each condition.
     """
     cells, belongs, values, _ = _within_shared(first, second, measure)
     if not len(cells):
@@ -260,9 +260,10 @@ def means_within(first: Trials, second: Trials, measure: str) -> tuple[float, fl
 def _within_shared(
     first: Trials, second: Trials, measure: str
 ) -> tuple[NDArray[np.int_], Array, Array, Array]:
-    """Return of trials in shared conditions: a code of it, group (1 or 0), value, ``varies``.
+    """Return four columns of the trials in shared conditions.
 
-    A trial whose ``row`` stands there twice does not vary.
+    They are a code of the condition, the group (1 or 0), the value, and whether the trial adds
+    variance: one whose ``row`` occurs twice does not.
     """
     groups = (first, second)
     values = np.concatenate([_numbers(trials[measure]) for trials in groups])
@@ -279,7 +280,7 @@ def _within_shared(
 
 
 def read_once(rows: NDArray[np.int_]) -> NDArray[np.bool_]:
-    """Return by row number whether it stands there once: the trial is in a single cell."""
+    """Return, for each entry, whether its row number occurs once: the trial is in one cell."""
     return np.asarray(np.bincount(rows)[rows] == 1)
 
 
@@ -298,7 +299,8 @@ def _freedom(
 ) -> float:
     """Return the degrees of freedom of an HC2 error by Satterthwaite (1946).
 
-    The error is a quadratic form of residuals; ``variances`` are of the second and the first group.
+    The squared error is a quadratic form of residuals; ``variances`` are those of the second and
+    the first group.
     """
     both = 2 * cells + belongs.astype(int)
     _, at, size = np.unique(both, return_index=True, return_counts=True)

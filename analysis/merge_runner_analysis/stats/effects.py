@@ -73,7 +73,7 @@ class Effect:
 
     @property
     def key(self) -> tuple[frozenset[str], str, str]:
-        """Identity of the comparison, whichever of two factors it is shown by."""
+        """Identity of the comparison, the same for both orders of an interaction's factors."""
         level = self.level
         names = {f"{level.factor}={level.name}", level.at}
         return frozenset(names), level.mark, self.metric.name
@@ -162,7 +162,7 @@ def texts_of(study: StudyResults) -> dict[str, dict[str, StudyText]]:
 
 
 def unreadable(study: StudyResults) -> str:
-    """Say that the stored study that was played cannot be read, and why; empty where it can."""
+    """Return why the study that was played cannot be read; empty if it can."""
     return _file(study)[1]
 
 
@@ -203,10 +203,10 @@ def _of_levels(study: StudyResults, levels: Sequence[Level]) -> Iterator[Effect]
 
 
 def _interactions(study: StudyResults, by: str = "") -> Iterator[Effect]:
-    """Compare effects between the levels of another factor, or of ``by``, and its first.
+    """Yield effects at each level of another factor, or of ``by``, less those at its first level.
 
-    Both differences are effects of the factor that is listed first, so that either order gives one
-    number.
+    Both differences are effects of the factor that is listed first, so that both orders give the
+    same number.
     """
     factors = levels_of(study.models, study.order)
     varying = [name for name, levels in factors.items() if len(levels) > 1]
@@ -232,7 +232,7 @@ def _interactions(study: StudyResults, by: str = "") -> Iterator[Effect]:
 def _effect(
     study: StudyResults, metric: Metric, levels: Sequence[Level], *, swapped: bool = False
 ) -> Effect:
-    """Compare two levels; or, of four, the difference of the first two with the last two's."""
+    """Compare two levels; with four, compare the differences of the first and the last two."""
     frames = trials_by_cell(study, tuple(level.pooled for level in levels), metric)
     left_out = {copy for level in levels for copy in level.copies}
     for level, frame in zip(levels, frames, strict=False):
@@ -263,7 +263,7 @@ def _effect(
 
 
 def _counted(frame: Columns, metric: Metric) -> Estimate:
-    """Count the trials, and the hits of a rate unless trials count for both sides."""
+    """Count trials, and the hits of a rate, unless trials count for both sides."""
     from_both = not contrasts.read_once(frame["row"]).all()
     k = int(frame["value"].sum()) if metric.rate and not from_both else None
     return Estimate(n=len(np.unique(frame["row"])), k=k)
@@ -307,7 +307,7 @@ def _compare(level: Columns, reference: Columns, metric: Metric) -> Comparison:
 
 
 def _interaction(frames: Sequence[Columns], metric: Metric) -> Estimate | None:
-    """Return the first two's difference less the others'; None if one is not known."""
+    """Return the difference of the first two less that of the others; None if unknown."""
     level, reference, twin, base = frames
     if metric.rate:
         cells = contrasts.shared_cells(level, reference, "value")
@@ -321,7 +321,7 @@ def _interaction(frames: Sequence[Columns], metric: Metric) -> Estimate | None:
 
 
 def _with_corrected(study: StudyResults, effects: list[Effect]) -> list[Effect]:
-    """Correct p in both families; effects in which nothing varies are in neither."""
+    """Correct p within both families; an effect in which nothing varies is in neither."""
     of_model = {MODEL, DRIVER} if asks_of_models(study) else set()
     is_primary = [
         effect.metric is primary(study)
@@ -344,7 +344,7 @@ def _with_corrected(study: StudyResults, effects: list[Effect]) -> list[Effect]:
 
 
 def trials_by_cell(study: StudyResults, groups: tuple[Group, ...], metric: Metric) -> list[Columns]:
-    """Return by group the ``condition`` and ``value`` of trials in cells of all, and their ``row``.
+    """Return, by group, ``condition``, ``value`` and ``row`` of trials in cells that all share.
 
     Copied cells are left out. Empty for groups of several studies or with undecided trials.
     """
@@ -379,7 +379,7 @@ def trials_by_cell(study: StudyResults, groups: tuple[Group, ...], metric: Metri
 def _codes(
     study: StudyResults, groups: tuple[Group, ...]
 ) -> list[tuple[NDArray[np.int_], NDArray[np.int_]]]:
-    """Return by group the rows of trials outside copied cells, and codes of these cells."""
+    """Return, by group, the rows of trials outside copied cells, and codes of their cells."""
     copied = copied_cells(study, groups)
     numbers: dict[Cell, int] = {}
     parts = []

@@ -1,4 +1,4 @@
-"""The qualitative indicators I1 to I5: by the paper's rule, and by tests that hold.
+"""The qualitative indicators I1 to I5: by the paper's rule, and by robust tests.
 
 The paper (arXiv 2604.09609, Table V) judges signs and p < 0.05 of Wald tests, I4 by the main effect
 of |dv| alone. Human data are nearly separable, where Wald tests lose their power, and a large p is
@@ -77,7 +77,7 @@ def _judged(fit: Regression, name: str, *, robust: bool) -> Judgement:
 
 
 def profiles(study: StudyResults, group: Group) -> pd.DataFrame:
-    """Return a row a vehicle: whether it acted, and how far its acceleration is held."""
+    """Return one row per vehicle: whether it acted, and the gain of its speed profile."""
     return of_trials(_all_profiles(study), group.trials)
 
 
@@ -94,7 +94,7 @@ def _all_profiles(study: StudyResults) -> pd.DataFrame:
 
 @remembered
 def gains(study: StudyResults, group: Group) -> pd.DataFrame:
-    """Return a row a finished trial: condition, pair, ``steady`` (nobody acted), ``gain``."""
+    """Return one row per finished trial: condition, pair, ``steady`` (nobody acted), ``gain``."""
     by_trial = profiles(study, group).groupby(KEYS, as_index=False)
     gain = by_trial.agg(steady=("steady", "all"), gain=("gain", "mean"))
     return group.finished[[*KEYS, "condition", "pair"]].merge(gain, on=KEYS)
@@ -156,7 +156,7 @@ class Fits(NamedTuple):
 
 @remembered
 def fits(group: Group) -> Fits:
-    """Fit a group's trials; without gaps the linear fits say so."""
+    """Fit a group's trials; without known gaps the linear fits have a ``problem``."""
     logit = regressions.who_first_logit(group.outcomes)
     firth = regressions.who_first_firth(group.outcomes)
     ols = hc3 = Regression(0, {}, PUBLISHED)

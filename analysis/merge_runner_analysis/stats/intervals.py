@@ -1,4 +1,4 @@
-"""Confidence intervals of proportions, means and differences, and what could have been found.
+"""Confidence intervals of proportions, means and differences, and detectable effects.
 
 Tests are Student's t by the functions that scipy.stats.t calls, which takes 100 times as long.
 """
@@ -104,7 +104,7 @@ def interval(
 
 
 def at(result: Estimate, level: float) -> Estimate:
-    """Return the same with its interval at a level; without its ends where there are none."""
+    """Return the estimate with its interval at a level, or without ends if there are none."""
     ends = None
     if result.ends_at:
         ends = result.ends_at(level)
@@ -120,7 +120,7 @@ def two_sided_p(statistic: float, freedom: float = inf) -> float:
 
 
 def tested(value: float, se: float, freedom: float) -> Estimate:
-    """Return a difference with this standard error, against none by Student's t."""
+    """Return a difference with this standard error, tested against 0 by Student's t."""
     # Equal but for rounding is equal; where nothing varies, any other difference is sure.
     statistic = 0.0 if abs(value) < ROUNDING else value / se if se else inf
     p = two_sided_p(statistic, freedom)
@@ -131,7 +131,7 @@ def tested(value: float, se: float, freedom: float) -> Estimate:
 def difference(first: Estimate, second: Estimate) -> Estimate | None:
     """Return one independent estimate less another, by the test of Welch (1947).
 
-    None where a value or an error is missing, and where neither has an error.
+    None if a value or a standard error is missing, or if both errors are 0.
     """
     if first.value is None or second.value is None or first.se is None or second.se is None:
         return None

@@ -62,8 +62,7 @@ class Level:
 def copied_cells(study: StudyResults, groups: tuple[Group, ...]) -> set[Cell]:
     """Return the cells of programs that ignore the groups' difference, whose trials are copies.
 
-    Conditions are never left out one by one: which of them stay would depend on what happened
-    there.
+    A condition is never left out alone: the choice would depend on the outcomes there.
     """
     ways = [_ways(study, group) for group in groups]
     copied: set[Cell] = set()
@@ -76,7 +75,7 @@ def copied_cells(study: StudyResults, groups: tuple[Group, ...]) -> set[Cell]:
 
 @remembered
 def _ways(study: StudyResults, group: Group) -> dict[Cell, dict[str, set[object]]]:
-    """Return the ways in which trials went, by the levels of the other factors and by condition."""
+    """Return the distinct courses of trials, by the other factors' levels and by condition."""
     ways: dict[Cell, dict[str, set[object]]] = {}
     for (condition, *others), way in zip(group.ended["cell"], group.ended["way"], strict=True):
         ways.setdefault((*others,), {}).setdefault(condition, set()).add(way)
@@ -84,7 +83,7 @@ def _ways(study: StudyResults, group: Group) -> dict[Cell, dict[str, set[object]
 
 
 def _are_copies(ways: Mapping[str, set[object]], others: Mapping[str, set[object]]) -> bool:
-    """Return whether in each shared condition all trials of one are among the other's."""
+    """Return whether, in each shared condition, one's trials are all among the other's."""
     shared = ways.keys() & others.keys()
     return bool(shared) and all(
         ways[name] <= others[name] or others[name] <= ways[name] for name in shared
@@ -172,7 +171,7 @@ def _distinct(study: StudyResults, levels: list[Level]) -> list[Level]:
 
 
 def _with_copies(study: StudyResults, group: Group) -> Iterator[Iterable[Cell]]:
-    """Yield cells with copies of each other; single equal trials of a mock model are chance."""
+    """Yield cells that are copies of each other; a mock model's single equal trials are chance."""
     if not group.scripted:
         yield from (cells for _, cells in group.trials.groupby(["condition", "way"])["cell"])
         return
@@ -205,7 +204,7 @@ def _without_copies(level: Level, first: Callable[[tuple[str, ...]], tuple[str, 
 
 
 def _once(every: pd.DataFrame, *, scripted: bool) -> pd.DataFrame:
-    """Return the trials without copies; a mock model's are copies only at equal other levels."""
+    """Return the trials once; a mock model's are copies only if the other levels are equal."""
     others = pd.Series([" ".join(others) for _, *others in every["cell"]], every.index)
     way = every["way"] + (" " + others if scripted else "")
     for _, rows in every.groupby(others):

@@ -24,12 +24,12 @@ PAPER = "paper_ablation_quantitative"
 
 
 def trials_of(group: Group, metric: Metric) -> pd.DataFrame:
-    """Return the trials that have a metric, of humans the published outcomes if these have it."""
+    """Return the trials that have a metric; for humans, the published outcomes if they have it."""
     return group.outcomes if metric.column in group.outcomes else group.trials
 
 
 def values(group: Group, metric: Metric) -> pd.Series:
-    """Return the values of the trials that count. Everything that counts trials counts these."""
+    """Return the values of the trials that count; all counts of trials are of these."""
     return trials_of(group, metric)[metric.column].dropna()
 
 
@@ -60,7 +60,7 @@ def estimate(group: Group, metric: Metric) -> Estimate:
 
 
 def _ratio(trials: pd.DataFrame, metric: Metric) -> Estimate:
-    """Return a mean in which trials have weights, with the interval of a ratio of their sums."""
+    """Return the weighted mean of trials, with the interval of a ratio of sums."""
     known = trials[[metric.column, metric.weight_column]].dropna()
     value, weight = known[metric.column], known[metric.weight_column]
     sample = linear(value.to_numpy(), weight.to_numpy(), np.zeros(len(known), int))
@@ -77,7 +77,7 @@ def linear(value: Array, weight: Array, cells: NDArray[np.int_]) -> Array:
 
 
 def mean_of(trials: pd.DataFrame, column: str, shares: pd.Series | None = None) -> Estimate:
-    """Return the mean by ``shares`` of conditions, with a jackknife over human pairs."""
+    """Return the mean, weighted by ``shares`` of conditions; for humans a jackknife over pairs."""
     if "pair" not in trials or trials["pair"].isna().all():
         return mean(trials[column].to_numpy(float))
     trials = trials[["condition", "pair", column]].dropna()
@@ -142,7 +142,7 @@ def undecided_note(group: Group, metric: Metric) -> Fact | None:
 
 
 def known(group: Group, metric: Metric) -> bool:
-    """Return whether a group's trials have this metric: humans may have outcomes alone."""
+    """Return whether a group's trials have this metric: humans may have only outcomes."""
     trials = trials_of(group, metric)
     if group.published_outcomes is None:
         return True
@@ -166,7 +166,7 @@ def no_human_value(metric: Metric) -> Fact:
 
 
 def outcomes_note(group: Group) -> Fact | None:
-    """Return which numbers rest on published outcomes, where only some traces are imported."""
+    """Return which numbers rest on published outcomes, if only some traces are imported."""
     if not group.measured or group.traced:
         return None
     sizes = len(group.outcomes), len(group.trials), len(group.finished)

@@ -1,4 +1,4 @@
-"""The regressions of arXiv 2604.09609 (eqs. 1 and 2), and tests that hold where theirs do not.
+"""The regressions of arXiv 2604.09609 (eqs. 1 and 2), and robust tests of their coefficients.
 
 A fit that the data do not allow has a ``problem`` in place of terms; only finished trials count.
 """
@@ -63,7 +63,7 @@ class Counts:
         """Return the best fit that is reached from ``starts``, (starts, terms), if one converges.
 
         One ``term`` may be held at a value. Newton's steps have the curvature of the penalty, too,
-        go uphill where the likelihood bends upwards (Nocedal and Wright 2006), and are halved until
+        go uphill where the likelihood is convex (Nocedal and Wright 2006), and are halved until
         they gain.
         """
         b = starts.copy()
@@ -214,11 +214,11 @@ class Fit:
 
     @np.errstate(divide="ignore")
     def starts(self, term: int | None = None, value: float = 0.0) -> Array:
-        """Return from where all maxima are reached, perhaps with a term held: (starts, terms).
+        """Return starts that lead to all maxima, perhaps with a term held: (starts, terms).
 
-        Of few trials there are several. Far out they lie where two conditions have even chances:
-        nearest to the fit by its information, and scaled down to 0, where the likelihood is always
-        known.
+        With few trials there are several maxima. The starts far out give two conditions even
+        chances, nearest to the fit by its information. Others are scaled down to 0, where the
+        likelihood is always known.
         """
         fixed = np.eye(len(self.b))[[] if term is None else [term]]
         pairs = self.counts.design[[*combinations(range(len(self.counts.design)), 2)]]
@@ -256,9 +256,9 @@ class Term:
 class Regression:
     """A fit to ``n`` trials; ``problem`` says why there are no terms, ``remark`` is a caution.
 
-    ``freedom`` is infinite where tests are normal. Of gaps ``equivalence_p`` is that relative
-    velocity alone moves them by less than GAP_MARGIN_M, and ``velocity_p`` that it has no effect;
-    None without two played conditions that differ in it alone, or without residuals.
+    ``freedom`` is infinite where tests are normal. For gaps, ``equivalence_p`` tests that relative
+    velocity alone moves them by less than GAP_MARGIN_M, and ``velocity_p`` that it has no effect.
+    None without two played conditions that differ only in it, or without residuals.
     """
 
     n: int
@@ -278,7 +278,7 @@ class Regression:
         return self.profile.interval([*self.terms].index(term), level)
 
     def moved(self, conditions: pd.DataFrame) -> Moved | None:
-        """Return how far relative velocity alone moves the gap, if two conditions tell."""
+        """Return how far relative velocity alone moves the gap; None without such conditions."""
         headway, velocity = conditions[CONDITION].drop_duplicates().to_numpy(float).T
         design = gap_design(headway, velocity)
         more, less = np.nonzero((headway[:, None] == headway) & (velocity[:, None] > velocity))
@@ -357,7 +357,7 @@ def gap_design(headway_m: Array, velocity_mps: Array) -> Array:
 def equivalence_p(b: float, se: float, freedom: float) -> float:
     """Return the p of |difference| < GAP_MARGIN_M by two one-sided t tests (Schuirmann 1987).
 
-    Without an error it is sure.
+    With a standard error of 0 it is 0 or 1.
     """
     inside = GAP_MARGIN_M - abs(b)
     return float(special.stdtr(freedom, -inside / se)) if se else float(inside <= 0)
@@ -380,8 +380,8 @@ def who_first_logit(trials: pd.DataFrame) -> Regression:
 def who_first_firth(trials: pd.DataFrame, less: pd.DataFrame | None = None) -> Regression:
     """Return the same by Firth's penalised likelihood (1993) and its ratio tests.
 
-    With ``less`` its terms are those less theirs, of one model of both in which every term may
-    differ.
+    With ``less``, one model with all interactions fits both samples, and the terms are the
+    differences of its coefficients.
     """
     design, left = who_first_data(trials)
     n, problem = len(left), _unidentified(design, left)

@@ -1,6 +1,6 @@
-"""First merger read from both sides, where one of two equal drivers is given something.
+"""Share of going first, counted for both sides, where one of two equal drivers is given something.
 
-Trials in which both are given the same are read from left and right, and count half for either.
+A trial in which both get the same counts half for the left driver and half for the right one.
 """
 
 from __future__ import annotations

@@ -136,7 +136,7 @@ def compared(study: StudyResults, group: Group) -> tuple[Comparison, ...]:
 
 @remembered
 def of_humans(study: StudyResults) -> dict[str, Estimate]:
-    """Return the humans by measure, over all conditions; a few imported trials change none."""
+    """Return the humans by measure, over all conditions; a few imported trials change nothing."""
     human = study.human
     both = Both(human if _imported(human) else replace(human, trials=human.outcomes), human)
     return {name: statistic.human(both) for name, statistic in STATISTICS.items()}
@@ -296,7 +296,7 @@ def _likeness(study: StudyResults, group: Group) -> Estimate:
 
 
 def _of_fit(human: Group, estimate: Estimate) -> Estimate:
-    """Return what follows from the humans' regression of the gap, with its source."""
+    """Return an estimate of the humans' regression of the gap, with its source or problem."""
     if estimate.problem:
         return replace(estimate, problem=Fact(Why.OF_HUMANS, (estimate.problem,)))
     return estimate if _imported(human) else replace(estimate, source=PUBLISHED)
@@ -408,7 +408,7 @@ def _collided(group: Group) -> Estimate:
 
 
 def _standardised(both: Both) -> Estimate:
-    """Return the humans' collisions in the conditions of a group, which weigh as they do there."""
+    """Return the humans' collisions, with conditions weighted as in a group's trials."""
     played = both.group.ended_outcomes["condition"].value_counts()  # with those undecided
     outcomes = both.human.outcomes
     shared = outcomes[outcomes["condition"].isin(played.index)]

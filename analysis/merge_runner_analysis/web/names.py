@@ -22,7 +22,7 @@ WHERE program IS NOT NULL ORDER BY ALL
 """
 PARTS = (
     (re.compile(r" (at [^\s+]+?)(?=/set\d+(?: |$)|[\s+]|$)"), "the server that the model ran on"),
-    (re.compile(r"(/set\d+)"), "another series of samples of the same driver"),
+    (re.compile(r"(/set\d+)"), "another sample set: independent replies of the same driver"),
     (re.compile(r" (\[[0-9a-f]{8}\])"), "with other settings of the task than its other trials"),
     (
         re.compile(rf"\b({EMULATOR})\b"),

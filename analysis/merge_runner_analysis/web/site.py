@@ -38,7 +38,7 @@ PAGES = {"Study": HOME, "Drivers": "drivers", "Trials": "trials", "Words": "word
 # The parts of a scope in an address; the list of trials filters by the same names.
 SCOPE = ("sweep", "model", "variant", "condition")
 # Pages with one list of all their entries.
-LISTS = {"Tables and figures": "tables", "Notes": "notes", "What words mean": "glossary"}
+LISTS = {"Tables and figures": "tables", "Notes": "notes", "Glossary": "glossary"}
 # Cached answers come within the first time; a page asks again for others, a file waits.
 AT_ONCE_S, FILE_WAIT_S = 0.3, 300.0
 

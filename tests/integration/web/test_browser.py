@@ -355,7 +355,7 @@ def test_a_phone_shows_a_decision_that_is_tapped_and_leads_back_by_day_and_by_ni
     expect(page.locator("#help")).to_contain_text("play and pause")
     assert serious(page) == []
     page.get_by_role("button", name="Close").click()
-    page.get_by_role("link", name="What words mean").click()
+    page.get_by_role("link", name="Glossary").click()
     expect(page.locator("#main dt", has_text="gap")).to_be_visible()
     paper = "getComputedStyle(document.body).backgroundColor"
     night = page.evaluate(paper)

@@ -21,7 +21,11 @@ from merge_runner_analysis.web.trial_index import PAGE, SORTS, TrialFilter
 from merge_runner_analysis.web.urls import CELL, whole
 
 MOST = 4  # drivers whose sums stand above a list
-OF_WORDS = HEADINGS | {"tactical": "said", "switch": "change of mind", "failure": "invalid"}
+OF_WORDS = HEADINGS | {
+    "tactical": "tactical decision",
+    "switch": "change of decision",
+    "failure": "invalid",
+}
 # A number from -1 to 1.
 LIMIT = re.compile(r"-?(0?\.\d{1,6}|[01](\.0{1,6})?)")
 
