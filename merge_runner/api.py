@@ -203,7 +203,7 @@ class Study:
         )
 
     async def areplay(self, *recordings: Path | str) -> StudyOutcome:
-        """Play all trials from recorded replies alone, first from the files; send nothing."""
+        """Play trials from recorded replies alone, those that files hold, if any; send nothing."""
         return await self.arun(replay=True, recordings=tuple(map(Path, recordings)))
 
     dry_run, run, replay = sync(adry_run), sync(arun), sync(areplay)

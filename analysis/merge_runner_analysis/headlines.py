@@ -43,7 +43,7 @@ from merge_runner_analysis.wording import (
 TOO_FEW = (
     f"Too few trials without a crash for a verdict (at least {ENOUGH}, and half of all, are needed)"
 )
-# What drivers that are like people do in them, and what there is no verdict on.
+# By measure: what drivers that are like people do, and the name of the measure without a verdict.
 LIKENESS = {
     "collisions": ("crash as often as people", "crashes"),
     "headway": ("let the one ahead go first, as people do", "who goes first with one ahead"),
@@ -174,7 +174,8 @@ def apart(driver: str, other: str, rows: Mapping[str, Values], *, of_left: bool)
     """Return the headline of a driver less another, and other differences, of rows by their metric.
 
     ``A crashed in 12 of 110 trials, B in 33 of 110. In the same situations A crashed less often, by
-    19.09 points [8.41, 29.78]; corrected p = 0.004.`` Who goes first is said ``of_left`` vehicles.
+    19.09 points [8.41, 29.78]; corrected p = 0.004.`` With ``of_left``, who goes first is the left
+    vehicle.
     """
     crashed = rows.get(COLLISIONS.name, {})
     others = _others(driver, other, rows, of_left=of_left)
@@ -192,7 +193,7 @@ def apart(driver: str, other: str, rows: Mapping[str, Values], *, of_left: bool)
     if p >= ALPHA:
         result = f"No difference is shown: {number(difference)} points {brackets(ci)}"
         return f"{claim}. {result}; {corrected}.", others
-    # Where trials are fewer, the ends change their signs and their places.
+    # Of a driver that crashed less often, both ends change their signs and their places.
     ends = ci and sorted(end if difference > 0 else -end for end in ci)
     result = f"{number(abs(difference))} points {brackets(ends)}".rstrip()
     often = "more" if difference > 0 else "less"
@@ -412,7 +413,7 @@ def _seen_first(values: Values) -> tuple[int, float]:
 
 
 def _differing(verdicts: Mapping[str, Values]) -> list[Values]:
-    """Return the differing measures that rest on most trials, what is seen at once first."""
+    """Return the differing measures with enough trials, what is seen at once first."""
     unlike = [values for values in verdicts.values() if differs(values) and _most(values, verdicts)]
     return sorted(unlike, key=_seen_first)
 
@@ -434,7 +435,7 @@ def _finished(verdicts: Mapping[str, Values]) -> int:
 def _enough(verdicts: Mapping[str, Values]) -> bool:
     """Return whether enough trials finished, or collided by the humans' rule, for a headline.
 
-    A driver that differs in measures of too few trials alone is not said to be alike.
+    A driver that differs only in measures with too few trials is not called like people.
     """
     outcomes = _finished(verdicts) + (verdicts["collisions"].get("k") or 0)
     if not suffice(outcomes, _ended(verdicts["collisions"])):

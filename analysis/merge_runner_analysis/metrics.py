@@ -10,8 +10,8 @@ from merge_runner.registry import Registry
 from merge_runner.scenarios.merge.measures import NO_CONFLICT_MPS
 
 Estimator = Literal["proportion", "mean", "median"]
-# By place the estimators of what it shows. tables: Tables V and VII, the contrasts and the pages
-# made of these; criticality: the table of this name.
+# The estimators of the metrics that a place shows. tables: Tables V and VII, the contrasts and the
+# pages made of these; criticality: the table of this name.
 SHOWN = {"tables": ("proportion", "mean"), "criticality": ("median",)}
 # The trials that a metric may be of, in SQL.
 STATUS = {"finished": "status = 'finished'", "ended": "status <> 'failed'"}
@@ -31,7 +31,7 @@ class Metric:
     ``trial_metrics``, or one of JUDGED; a subquery over another table knows the trial as
     ``trials.trial_id`` and ``trials.spec_hash``. A proportion is of a BOOLEAN. ``trials`` are those
     that count, unless their value is NULL; ``weight`` is SQL of how much a trial counts in a mean.
-    ``meaning`` describes one trial's number, or the whole of a proportion; intervals and axes end
+    ``meaning`` describes one trial's number, or what a proportion is; intervals and axes end
     at ``least``. ``paper_of_drivers`` and ``paper_of_humans`` are columns of
     ``paper_ablation_quantitative.csv``.
     """
@@ -128,8 +128,8 @@ LEFT_FIRST = Metric(
     name="left_first_percent",
     label="goes first",
     unit="%",
-    meaning="share of finished trials with a first merger in which it is the driver that is "
-    "named first, of two equal ones the left one",
+    meaning="share of finished trials with a first merger in which the driver that is named first "
+    "(of two equal ones the left one) merged first",
     value="merged_first = 'left'",
     estimator="proportion",
     shown=False,
@@ -167,8 +167,8 @@ VALID = Metric(
     name="valid_percent",
     label="valid replies",
     unit="%",
-    meaning="share of the replies, of two different drivers those to the one that is named "
-    "first, with a valid plan",
+    meaning="share of replies with a valid plan; of two different drivers, the replies to the one "
+    "that is named first",
     value="100 * valid_replies / nullif(replies, 0)",
     weight="replies",
     trials="ended",

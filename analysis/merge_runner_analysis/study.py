@@ -165,7 +165,7 @@ class StudyResults:
     def conditions(self) -> dict[str, tuple[float, float]]:
         """Projected headway in m and relative velocity in m/s, by name of a played condition.
 
-        The humans' conditions come first; if no model played, they are all.
+        The humans' conditions come first. If no model played, these are all of them.
         """
         played = {
             row.condition: (row.projected_headway_m, row.relative_velocity_mps)
@@ -226,7 +226,7 @@ def _chosen(db: Path, studies: Studies, source: StudySource | None) -> tuple[str
 
 
 def _pooled_order(studies: Studies) -> Order:
-    """Return levels in the order of the study that lists the most, or the newest."""
+    """Return levels in the order of the study that lists the most; of several, the newest one."""
     pooled: dict[str, list[str]] = {}
     for factor in dict.fromkeys(name for order in studies.orders.values() for name in order):
         lists = [order[factor] for order in studies.orders.values() if factor in order]

@@ -173,7 +173,7 @@ def _draw_order(
 ) -> tuple[bool, bool]:
     """Return two truth values: this driver goes first, and it does so by a misjudgement.
 
-    By a misjudgement both go first. Without a slot the projected order decides.
+    In a misjudged trial both drivers go first. Without a slot the projected order decides.
     """
     if slot is None:
         return situation.projected_lead_m > 0, False
@@ -221,7 +221,7 @@ def _open_gap(
     ``share`` is the leader's part of the distance that is missing.
     """
     lead = situation.projected_lead_m if goes_first else -situation.projected_lead_m
-    # A leader from behind needs a metre more, so that it acts at once.
+    # A leader that is less than a metre ahead, or behind, misses more, so that it acts at once.
     missing_m = gap_m + situation.vehicle_length - lead + max(0.0, 1.0 - lead)
     if goes_first:
         push = _even_acceleration(

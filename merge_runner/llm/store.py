@@ -160,7 +160,7 @@ class CacheFile:
         """Close the folder and its recording, and free its locks."""
         self.closing.close()
         self.locks.close()
-        self.reading.close()  # before the writer: the last to close ends the journal
+        self.reading.close()  # before ``texts``: the last to close ends the journal
         if self.texts is not None:
             close_texts(self.texts)
 

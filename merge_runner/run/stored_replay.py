@@ -48,7 +48,7 @@ from merge_runner.trial_records import TrialRecord, TrialSpec
 
 TOLERANCE = 1e-9
 """Numbers may differ by this much, as between the arithmetic of two machines."""
-# The columns that no replay gives; docs/recordings.md says why. A cache has the columns of
+# The columns that no replay gives; docs/recordings.md lists them. A cache has the columns of
 # ``calls``, except ``cached``.
 NOT_REPLAYED = (
     "calls.cached",

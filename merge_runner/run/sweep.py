@@ -199,7 +199,7 @@ def _has_replies(cache: ResponseCache, plan: Plan) -> bool:
 def _recorded_part(plan: Plan, recordings: Sequence[Path]) -> Plan:
     """Return the part of a plan that recordings hold; all of it if they do not name a sweep.
 
-    A sweep's recording also holds its first decisions.
+    A sweep of first decisions can be played from the recording of the whole study, too.
     """
     from merge_runner.results.recorded_sweeps import recorded_part
 

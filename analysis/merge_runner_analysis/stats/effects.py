@@ -40,7 +40,7 @@ class Effect:
     ``at_level`` and ``at_reference`` are estimates within the shared cells, without the
     ``left_out`` trials. In an interaction they have no value, ``across`` has both levels at the
     other factor's reference, and ``at_reference`` counts the trials at both references.
-    ``p_corrected`` is Holm's over all effects with the same ``primary``.
+    ``p_corrected`` is Holm's: primary effects are one family, all others another.
     """
 
     level: Level
@@ -215,7 +215,7 @@ def _interactions(study: StudyResults, by: str = "") -> Iterator[Effect]:
     pairs = [(name, by) for name in varying if name != by] if by else combinations(varying, 2)
     for factor, other in pairs:
         swapped = other in varying and varying.index(other) < varying.index(factor)
-        # Those of mock models are apart.
+        # The lists of levels of mock models are apart.
         first, *others = (
             [levels for levels in levels_by_factor(study, other, at) if levels[0].factor == factor]
             for at in factors[other]

@@ -16,7 +16,7 @@ from merge_runner_analysis.grouping import Group, levels_of
 from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.wording import TIMES
 
-# Shown by this one, prompts are compared driver by driver; a driver has all other levels in it.
+# With this factor prompts are compared driver by driver: its levels pool those of all others.
 DRIVER = "driver"
 Cell = tuple[str, ...]
 
@@ -60,7 +60,7 @@ class Level:
 
 @remembered
 def copied_cells(study: StudyResults, groups: tuple[Group, ...]) -> set[Cell]:
-    """Return the cells of programs that ignore the groups' difference, whose trials are copies.
+    """Return the cells in which programs do not read what the groups differ in: trials are copies.
 
     A condition is never left out alone: the choice would depend on the outcomes there.
     """
@@ -101,7 +101,7 @@ def copied_of_shared(study: StudyResults, *levels: Level) -> tuple[int, int]:
 def levels_by_factor(
     study: StudyResults, by: str = "", at: str = "", least: int = 2
 ) -> list[list[Level]]:
-    """Return the levels of factors with at ``least`` this number of them, the reference first."""
+    """Return the levels of each factor that has at ``least`` this number, the reference first."""
     chosen = [group for group in study.models if not by or _level_of(group, by) == at]
     kinds = [[g for g in chosen if g.scripted == scripted] for scripted in (False, True)]
     apart = any(g.scripted for g in study.models) and not all(g.scripted for g in study.models)
@@ -193,7 +193,7 @@ def distinct(study: StudyResults, group: Group) -> Group:
 def _without_copies(level: Level, first: Callable[[tuple[str, ...]], tuple[str, ...]]) -> Level:
     """Return the level with each trial once.
 
-    If copies differ in the side of their ego, no driver read what the ego gets. The kept trial then
+    If copies differ in the side of their ego, no driver read what the ego gets: then the kept trial
     has no ``focal`` side.
     """
     every = level.pooled.trials

@@ -33,14 +33,14 @@ MIN_PAIRS = 3  # fewer say nothing of how pairs vary
 STEADY_GAP_M = 0.01
 # Equivalence margin of I4: how far relative velocity alone may move the gap.
 GAP_MARGIN_M = 1.0
-# At its top a likelihood gains less than this by another step; so many steps lead there, or none.
+# A likelihood is at its top if a step gains less than FLAT; after MOST_STEPS there is no estimate.
 FLAT, MOST_STEPS, ROUNDING = 1e-9, 100, 1e-11
 # Below this logarithm of its determinant the information is singular but for rounding.
 SINGULAR = -600.0
-# A bound is looked for in steps that widen so much, up to one of so many standard errors.
+# The search for a bound multiplies its step by WIDER, up to FARTHEST standard errors.
 WIDER, FARTHEST = 1.3, 1e5
-# Other maxima are looked for from so many of the likeliest places, up to this much less likely than
-# the first; two are the same whose log-likelihoods differ by less than this.
+# The search for other maxima starts at the LIKELIEST places, whose log-likelihoods are at most
+# UNLIKELY below the first; maxima whose log-likelihoods differ by less than SAME are one.
 LIKELIEST, UNLIKELY, SAME = 20, 10.0, 1e-6
 SCALES = (0.0, 1.0, 3.0, 10.0)
 
@@ -378,7 +378,7 @@ def who_first_logit(trials: pd.DataFrame) -> Regression:
 
 
 def who_first_firth(trials: pd.DataFrame, less: pd.DataFrame | None = None) -> Regression:
-    """Return the same by Firth's penalised likelihood (1993) and its ratio tests.
+    """Return who goes first by Firth's penalised likelihood (1993), with likelihood ratio tests.
 
     With ``less``, one model with all interactions fits both samples, and the terms are the
     differences of its coefficients.
@@ -469,7 +469,7 @@ def unfit_for_logit(design: Array, left: Array) -> Fact | None:
     problem = _unidentified(design, left)
     if problem or not any(infinite := _cells(design, left).infinite()):
         return problem
-    # The level comes last, as it is said.
+    # The intercept comes last, as in the sentence.
     named = np.array([*WHO_FIRST_TERMS[1:], WHO_FIRST_TERMS[0]])[np.roll(infinite, -1)]
     return Fact(Why.SEPARATION, (", ".join(named),))
 

@@ -1,6 +1,6 @@
 """Comparison of drivers with humans: estimate, interval and test of each measure.
 
-- Who goes first: Firth's penalised logit; its difference from one model of both.
+- Who goes first: Firth's penalised logit; the difference of slopes is that of one joint model.
 - Collisions: Fisher's exact test within conditions, with the melded interval that agrees with it.
 - Mean gap: Student's t over trials, of humans over their nine pairs; Welch's test.
 - Slope of the gap on headway (I3): least squares with HC3 errors; the humans' as published or by
@@ -10,7 +10,7 @@
 - I5: how far accelerations are held, in human standard deviations (see ``likeness``).
 
 Holm (1979) corrects the p of all measures of a driver together. The interval of a measure has the
-level at which Holm tested it, so that both agree.
+level at which Holm tested it, so that both agree; 90 % where I4 or I5 lies within its margin.
 """
 
 from __future__ import annotations
@@ -172,7 +172,11 @@ def hits(group: Group, measure: str) -> pd.Series:
 
 
 def _went_first(outcomes: pd.DataFrame, measure: str) -> pd.Series:
-    """Return by trial whether the vehicle ahead (side by side: the slower one) went first."""
+    """Return by trial whether the expected vehicle went first.
+
+    For "headway" it is the one ahead, without trials that start side by side; for "velocity" the
+    slower one in these trials alone.
+    """
     headway, velocity = (np.sign(outcomes[name]) for name in CONDITION)
     expected = headway if measure == "headway" else -velocity.where(headway == 0, 0)
     first = outcomes["merged_first"].map({"left": 1, "right": -1})
