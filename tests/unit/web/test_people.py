@@ -228,7 +228,7 @@ def test_a_difference_in_a_measure_without_a_column_is_named_in_the_row():
     apart = {"state": STRONGER, "n": 110, "ended": 110}
     shown = driver("a", **{"gap": apart, "gap-headway": apart | {"measure": "gap-headway"}})
     more = "each metre that one is ahead adds more to its gap than to people's"
-    assert other_differences(shown) == more
+    assert other_differences(shown) == f"in another measure (gap, by who is ahead): {more}"
     assert other_differences(driver("a", gap=apart)) == ""
 
 
