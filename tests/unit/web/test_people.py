@@ -6,7 +6,7 @@ import pytest
 
 from merge_runner_analysis.web.judged import Driver, noted
 from merge_runner_analysis.web.marks import Cell
-from merge_runner_analysis.web.next_steps import is_found, next_steps, without
+from merge_runner_analysis.web.next_steps import is_found, next_steps
 from merge_runner_analysis.web.people import (
     could_see,
     counted,
@@ -215,13 +215,6 @@ def test_the_next_steps_follow_from_the_result(of, kind, sweep, steps):
         assert text.startswith(begins)
         assert command.startswith(run)
         assert bool(command) == bool(run)
-
-
-def test_an_option_is_left_out_of_a_command_however_it_was_typed():
-    words = ["sweep", "a.toml", "--db", "x", "--reps=2", "--db=y", "--grid", "h=-6:6:2", "--batch"]
-    left = ["sweep", "a.toml", "--reps=2", "--grid", "h=-6:6:2", "--batch"]
-    assert without("--db", words) == left
-    assert without("--d", left) == left
 
 
 def test_a_difference_in_a_measure_without_a_column_is_named_in_the_row():
