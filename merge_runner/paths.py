@@ -34,6 +34,12 @@ def home_of(study: str) -> Path:
     return home.relative_to(Path.cwd()) if home.is_relative_to(Path.cwd()) else home
 
 
+def db_words(db: Path, study: str = "") -> list[str]:
+    """Return ``--db`` with the database, unless it is the study's default one."""
+    is_default = (home_of(study) / DEFAULT_DB).absolute() == db.absolute()
+    return [] if is_default else ["--db", str(db)]
+
+
 def command_at(command: str, option: str, place: Path | str, usual: Path) -> str:
     """Return a command to type, with the option unless its path is the ``usual`` one.
 

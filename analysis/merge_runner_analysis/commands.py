@@ -191,7 +191,7 @@ def power(
     from merge_runner.run.options import Options
     from merge_runner.run.plan import make_plan
     from merge_runner.run.sweep import unsent
-    from merge_runner_analysis.power import chances, power_table
+    from merge_runner_analysis.power import chances, power_table, unread_words
     from merge_runner_analysis.study import StudyResults
     from merge_runner_analysis.tables.formats import render
 
@@ -216,7 +216,7 @@ def power(
         return
     costs = "an unknown price" if cost_usd is None else f"about {cost_usd:.2f} USD"
     about = f"{plan.name} ({plan.driver}, {plan.trials} trials, {costs}; {sims} simulated studies)"
-    table = power_table(f"What can be found by {about}", rows)
+    table = power_table(f"What can be found by {about}", rows, unread_words(plan))
     print_out(render([table], TableFormat.TEXT, terminal_width()))
 
 

@@ -16,7 +16,9 @@ from merge_runner_analysis.wording import (
     DIFFERS,
     ENOUGH,
     FEW,
+    HEADINGS,
     HUMANS,
+    IN_ANOTHER,
     LANGUAGE_MODEL,
     MEASURES,
     OPEN,
@@ -469,4 +471,5 @@ def difference_sentence(values: Values, it: str) -> str:
             driver, people = f"{driver} % of its", f"{people} %"
     level = values.get("level") if measure.margin is not None and values["ci"] else None
     at = "" if level is None or f"{level:.4g}" == "95" else f" (interval at {level:.4g} %)"
-    return f"{measure.difference.format(it=it, driver=driver, people=people)}{at}"
+    says = f"{measure.difference.format(it=it, driver=driver, people=people)}{at}"
+    return says if measure.name in HEADINGS else f"{IN_ANOTHER.format(measure.label)}, {says}"

@@ -14,12 +14,14 @@ from scipy import optimize, stats
 from scipy.special import expit
 
 from merge_runner.config import validated
+from merge_runner.drivers.registry import EMULATOR
 from merge_runner.planted_effect import PlantedEffect, planted_fields
 from merge_runner.prompts.blocks import BASELINE, composed, decomposed
 from merge_runner.records import Side
 from merge_runner.registry import require
 from merge_runner.run.estimate import typical_prompt
 from merge_runner.run.plan import Plan
+from merge_runner.run.summary import UNREAD_WORDS
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.study.arms import MODEL, PROMPT, Arm
 from merge_runner.study.file import Effect, PlantedWords
@@ -32,7 +34,7 @@ from merge_runner_analysis.stats.intervals import POWER
 from merge_runner_analysis.stats.regressions import Array
 from merge_runner_analysis.stats.sides import read_twice
 from merge_runner_analysis.tables.model import Column, Row, Table, Value
-from merge_runner_analysis.wording import ALPHA
+from merge_runner_analysis.wording import ALPHA, joined
 
 COEFFICIENTS = 7  # of a truth: of who merges first, and of the gap
 MULTIPLES = (0.5, 1.0, 2.0, 4.0)
@@ -400,10 +402,31 @@ def chances(
             yield Row("/".join(key), (), dict(zip([c.name for c in COLUMNS], values, strict=True)))
 
 
-def power_table(title: str, rows: Sequence[Row]) -> Table:
-    """Return the rows of ``chances`` as a table."""
+def unread_words(plan: Plan) -> str:
+    """Say which levels of texts change no trial of the emulator; empty without one."""
+    words = dict.fromkeys(
+        word
+        for arm in plan.arms
+        for entry in arm.entries.values()
+        if entry.provider == EMULATOR and "x_persona" not in entry.parameters
+        for word in decomposed(arm.variant)[1]
+    )
+    unread = [word for word in words if _planted_words(plan, word) == PlantedWords()]
+    if not unread:
+        return ""
+    return f"{joined(unread)}: the power is that of a model which reads the words. {UNREAD_WORDS}"
+
+
+def _planted_words(plan: Plan, word: str) -> PlantedWords:
+    factor, _, level = word.partition("=")
+    return plan.study.file.texts[factor][level].emulator
+
+
+def power_table(title: str, rows: Sequence[Row], note: str = "") -> Table:
+    """Return the rows of ``chances`` as a table, with a note of its own before the others."""
     times = ", ".join(f"x{m:g}" for m in MULTIPLES)
     notes = (
+        *filter(None, [note]),
         f"n: trials of the level or driver; {times}: the share of simulated studies with so many "
         "times the repetitions that find the effect at p < .05, by the test of its table (effects; "
         "I1 to I4: indicators; humans: verdicts), before any correction; n for 80 %, USD: the "

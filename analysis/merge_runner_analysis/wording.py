@@ -79,6 +79,8 @@ HEADINGS = {
     "velocity": "Side by side, the slower goes first",
     "gap": "Gap at the merge point",
 }
+# Before a difference in a measure without such a heading.
+IN_ANOTHER = "in another measure ({})"
 # Names of metrics in sentences and pages; others keep the label of the table.
 METRIC_NAMES = {
     LEFT_FIRST.name: "goes first",

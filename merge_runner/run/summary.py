@@ -22,6 +22,10 @@ if TYPE_CHECKING:
     from merge_runner.run.plan import Plan
     from merge_runner.run.progress import Progress
 
+UNREAD_WORDS = (
+    "The emulator reads no words: plant an effect to rehearse (docs/run-a-study.md#text-factors)"
+)
+
 
 def underpriced(tier: str) -> str:
     """Return the warning about replies whose service tier has no price in the registry."""
@@ -213,10 +217,7 @@ def _faults(summary: dict[str, Any]) -> Iterator[str]:
             yield f"{driver}: a mock model answered, not {model}"
     if same := summary["same_prompts"]:
         prompts = "; ".join(map(", ".join, same))
-        yield (
-            f"the same trials with these prompts: {prompts}. The emulator reads no words: plant an "
-            "effect to rehearse (docs/run-a-study.md#text-factors)"
-        )
+        yield f"the same trials with these prompts: {prompts}. {UNREAD_WORDS}"
     audit = summary["audit"]
     audit_it = command_at("merge-runner audit", "--db", summary["db"], DEFAULT_DB)
     findings = f"{len(audit['findings'])} findings, which `{audit_it}` lists"

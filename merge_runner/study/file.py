@@ -60,7 +60,10 @@ def _by_name(value: object) -> object:
         numbers = dict(row) if isinstance(row, dict) else {"name": row}
         name = numbers.pop("name", None)
         if not isinstance(name, str):
-            raise ValueError("it should be a list of names, or of tables with a name of their own")
+            raise ValueError(
+                "it should be a list of names, or of tables with a name of their own: "
+                'conditions = ["N_0_0"], or ["all"], as without the key'
+            )
         by_name[name] = numbers or None
     return by_name
 

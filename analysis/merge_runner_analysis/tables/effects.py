@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
@@ -258,9 +259,8 @@ def _notes(study: StudyResults, by: str) -> Iterator[str]:
         first = (
             f"the {len(of_primary)} test{'s' * (len(of_primary) != 1)} of “{_primary_name(study)}”"
         )
-        crossed = sum(effect.across is not None for effect in others)
         rest = f"the {len(others)} other tests of the table effects"
-        rest += f", {crossed} of them of interactions" * bool(crossed) + _uncounted(corrected)
+        rest += _uncounted(corrected) + _tests_by_factor(others)
         names = f" by {joined([*dict.fromkeys(of_primary)])}" if of_primary else ""
         yield f"{CORRECTED} {first}{names}, and separately for {rest}"
         yield "detectable: found at p < .05, before correction, with power .8"
@@ -283,6 +283,18 @@ def _families(tested: Sequence[Effect]) -> tuple[list[str], list[Effect]]:
     counted = [effect for effect in tested if effect.varies]
     of_primary = [effect.factor for effect in counted if effect.primary]
     return of_primary, [effect for effect in counted if not effect.primary]
+
+
+def _tests_by_factor(tested: Sequence[Effect]) -> str:
+    """Return ``: 6 by hurry and 6 by opponent, in crashes and gap at the merge point``."""
+    if not tested:
+        return ""
+    counts = Counter(
+        f"{effect.factor}{' (interaction)' * bool(effect.across)}" for effect in tested
+    )
+    by_factor = joined([f"{count} by {factor}" for factor, count in counts.items()])
+    names = dict.fromkeys(METRIC_NAMES.get(of.metric.name, of.metric.label) for of in tested)
+    return f": {by_factor}, in {joined([*names])}"
 
 
 def _words(study: StudyResults) -> Iterator[str]:

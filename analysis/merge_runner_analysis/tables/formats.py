@@ -293,7 +293,13 @@ def table_view(table: Table, link: Callable[[Table, Row, Column], object]) -> di
         "name": table.name,
         "heading": table.heading,
         "columns": [
-            {"heading": c.heading, "meaning": c.meaning, "text": c.kind == "text"} for c in columns
+            {
+                "heading": c.heading,
+                "meaning": c.meaning,
+                "text": c.kind == "text",
+                "aside": _weight(c) == 0,
+            }
+            for c in columns
         ],
         "rows": rows,
         "notes": notes_of(table),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from argparse import ArgumentParser
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -11,6 +10,7 @@ from merge_runner_analysis.web.comparison import Comparison
 from merge_runner_analysis.web.judged import Driver
 from merge_runner_analysis.web.people import repeated
 from merge_runner_analysis.web.question import Answer
+from merge_runner_analysis.web.runs import study_in, without
 from merge_runner_analysis.wording import (
     DIFFERS,
     ENOUGH,
@@ -59,15 +59,8 @@ def next_steps(
     if others and not is_rehearsal(drivers):
         steps.append((FEW.format(joined(others)), again("--reps", "N")))
     if isinstance(answers, Answer) and not any(row.is_shown for row in answers.changes):
-        steps.append((UNSHOWN, shlex.join([program, "power", sweep[1]])))
+        steps.append((UNSHOWN, shlex.join([program, "power", study_in(sweep) or sweep[1]])))
     return steps
-
-
-def without(option: str, words: Sequence[str]) -> list[str]:
-    """Return the words of a command without an option and its values."""
-    parser = ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument(option)
-    return parser.parse_known_args(words)[1]
 
 
 def is_rehearsal(drivers: Sequence[Driver]) -> bool:

@@ -15,6 +15,7 @@ from merge_runner_analysis.web.marks import Cell
 from merge_runner_analysis.wording import (
     DIFFERS,
     HEADINGS,
+    IN_ANOTHER,
     MARGINS,
     MEASURES,
     OPEN,
@@ -54,9 +55,9 @@ class Likeness:
 
 
 def other_differences(driver: Driver) -> str:
-    """Return how a driver is shown to differ from people in measures without a column."""
+    """Return how a driver is shown to differ from people in measures without a column, by name."""
     clauses = [
-        clause(cell.values)
+        f"{IN_ANOTHER.format(MEASURES[name].label)}: {clause(cell.values)}"
         for name, cell in driver.cells.items()
         if name not in HEADINGS and shown_state(cell.values) in DIFFERS
     ]

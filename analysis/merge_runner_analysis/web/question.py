@@ -160,7 +160,7 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
         _note(effects, CORRECTED),
         [chart for chart in charts if chart],
         is_adjusted,
-        OPPONENT if OPPONENT in names[1:] else names[-1] if len(names) > 1 else "",
+        (OPPONENT if OPPONENT in names else names[-1]) if len(names) > 1 else "",
         unbroken(_interactions(tested, {str(row.values["factor"]) for row in known})),
         _changes(tested, sides, metric, _words(effects)),
         _changes(others, sides, metric, {}),

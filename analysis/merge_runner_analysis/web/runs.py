@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 import shlex
+from argparse import ArgumentParser
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC
+from pathlib import Path
 from typing import Any
 
 from merge_runner.audit.checks import not_judged
 from merge_runner.driver_names import both_sides, pair_name
-from merge_runner.paths import DEFAULT_DB, command_at
+from merge_runner.paths import DEFAULT_DB, command_at, db_words
 from merge_runner.run.progress_file import ProgressSnapshot, read_snapshot
 from merge_runner_analysis.web.phrases import called, duration
 from merge_runner_analysis.web.reading import Row
@@ -84,8 +86,8 @@ def run_of(row: Row, config: Row, snapshot: ProgressSnapshot | None, later: str 
 
     ``row`` has its stored values and its counts, ``config`` its plan, and ``snapshot`` the report
     of its process, None without a file. It is ``running``, ``checking`` what is
-    stored, ``lost``, ``finished`` or ``stopped``. ``command``, as it was typed, goes on with it,
-    unless a ``later`` run already did. One that is ``followed`` may have news: it may have slept,
+    stored, ``lost``, ``finished`` or ``stopped``. ``command`` goes on with it, unless a
+    ``later`` run already did. One that is ``followed`` may have news: it may have slept,
     and go on.
     """
     study = row["name"]
@@ -124,8 +126,35 @@ def run_of(row: Row, config: Row, snapshot: ProgressSnapshot | None, later: str 
     code = row["exit_code"]
     goes_on = state in {"lost", "stopped"} and code != 4 and run["ended"] != run["planned"]
     typed = config.get("typed") if goes_on and not later else None  # a notebook types none
-    command = shlex.join(["merge-runner", *typed]) if typed else ""
+    command = shlex.join(["merge-runner", *words_here(typed, row["db"])]) if typed else ""
     return {**run, "kind": kind, "text": text, "command": command, "ended_as": ended_as(run)}
+
+
+def words_here(typed: Sequence[str], db: Path) -> list[str]:
+    """Return the words that play a study, with its file and database as they are found from here.
+
+    They may have been typed elsewhere: by default the database is below the study's folder.
+    """
+    words, home = without("--db", typed), db.parent.parent
+    is_default = len(words) == len(typed)
+    for place, word in enumerate(words):
+        if word.endswith(".toml"):
+            known = [folder / Path(word).name for folder in (home, home / "experiments")]
+            files = [*known, Path(word)] if is_default else [Path(word), *known]
+            words[place] = str(next((file for file in files if file.is_file()), word))
+    return [*words, *db_words(db, study_in(words))]
+
+
+def study_in(words: Sequence[str]) -> str:
+    """Return the first file of a study among the words of a command; empty without one."""
+    return next((word for word in words if word.endswith(".toml")), "")
+
+
+def without(option: str, words: Sequence[str]) -> list[str]:
+    """Return the words of a command without an option and its values."""
+    parser = ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument(option)
+    return parser.parse_known_args(words)[1]
 
 
 def ended_as(run: Row) -> str:
@@ -171,7 +200,7 @@ def assessment_of(run: Row) -> tuple[str, str]:
     if ended == planned:
         text = f"Ended with faults: {counted} have an outcome, but what is stored does not hold "
         audit = f"merge-runner audit --sweep {run['sweep_id']}"
-        at = command_at(audit, "--db", row.get("db", DEFAULT_DB), DEFAULT_DB)
+        at = command_at(audit, "--db", row["db"], DEFAULT_DB)
         return "stopped", f"{text}together. See: {at}"
     if run["failed"]:
         return "stopped", f"Ended: {counted} have an outcome{failures}."

@@ -15,7 +15,7 @@ from typing import Any
 from starlette.responses import Response
 
 from merge_runner.errors import MergeRunnerError, StoreError
-from merge_runner.paths import DEFAULT_DB
+from merge_runner.paths import db_words
 from merge_runner_analysis.cache import stamp_of
 from merge_runner_analysis.metrics import METRICS
 from merge_runner_analysis.tables.model import Table, from_text
@@ -169,15 +169,11 @@ class Site:
         """Return whether the trials are being read for the first time."""
         return self._first_reading is not None and self._first_reading.is_alive()
 
-    @property
-    def named_db(self) -> list[str]:
-        """Words of a command that name the shown database, unless it is the default."""
-        return [] if self.db == DEFAULT_DB else ["--db", str(self.db)]
-
     def share(self, *options: str, of_study: bool = True) -> str:
         """Return the command that exports the shown pages; ``of_study``: it takes --study."""
-        study = ["--study", self.study] if self.study and of_study else []
-        return shlex.join([self.program, "view", *self.named_db, *study, *options])
+        study = self.study if of_study else ""
+        words = [*db_words(self.db, study), *(["--study", study] if study else [])]
+        return shlex.join([self.program, "view", *words, *options])
 
     def render(self, template: str, **values: object) -> str:
         """Return a page, or a part of one."""

@@ -212,8 +212,9 @@ def test_an_interaction_is_the_difference_of_the_differences_in_shared_cells(tmp
     (note,) = notes_with(effects, "p is corrected")
     # Of 13 others the 4 of crashes and both changing their speed vary nowhere, as 3 interactions.
     assert note.endswith(
-        "for the 6 other tests of the table effects, 2 of them of interactions, without those in "
-        "which nothing varies within a situation"
+        "for the 6 other tests of the table effects, without those in which nothing varies within "
+        "a situation: 2 by prompt, 2 by mood and 2 by prompt × mood (interaction), in gap at the "
+        "merge point and deviation from the initial speed"
     )
     row = by_id(effects)["mood=late/prompt=A1/interaction/gap_m"].values
     assert (row["level"], row["n"]) == ("A1 × late", 6)

@@ -299,7 +299,8 @@ def test_a_run_of_a_crossed_study_shows_each_driver_and_what_goes_on_with_it(gol
     for words in (
         "Run of mine: cheap, dear",
         "18 of 36 trials have an outcome",
-        "merge-runner sweep mine.toml --yes --trust --db ",
+        "merge-runner sweep mine.toml --yes --trust ",
+        f" --db {db} ",
         "dear [temperature=0.2]",
     ):
         assert words in said

@@ -308,6 +308,7 @@ def test_an_interval_beside_a_margin_names_its_level_where_that_is_not_95_percen
     text = difference_sentence(row(measure, n=14, level=level), "it")
     assert ("interval at" in text) == bool(said)
     assert not said or text.endswith(f"(interval at {said} %)")
+    assert text.startswith(f"in another measure ({MEASURES[measure].label}), ")
     assert "interval at" not in difference_sentence(row("gap", n=14, level=level), "it")
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from merge_runner_analysis.web.judged import Driver, noted
 from merge_runner_analysis.web.marks import Cell
-from merge_runner_analysis.web.next_steps import is_found, next_steps, without
+from merge_runner_analysis.web.next_steps import is_found, next_steps
 from merge_runner_analysis.web.people import (
     could_see,
     counted,
@@ -217,18 +217,11 @@ def test_the_next_steps_follow_from_the_result(of, kind, sweep, steps):
         assert bool(command) == bool(run)
 
 
-def test_an_option_is_left_out_of_a_command_however_it_was_typed():
-    words = ["sweep", "a.toml", "--db", "x", "--reps=2", "--db=y", "--grid", "h=-6:6:2", "--batch"]
-    left = ["sweep", "a.toml", "--reps=2", "--grid", "h=-6:6:2", "--batch"]
-    assert without("--db", words) == left
-    assert without("--d", left) == left
-
-
 def test_a_difference_in_a_measure_without_a_column_is_named_in_the_row():
     apart = {"state": STRONGER, "n": 110, "ended": 110}
     shown = driver("a", **{"gap": apart, "gap-headway": apart | {"measure": "gap-headway"}})
     more = "each metre that one is ahead adds more to its gap than to people's"
-    assert other_differences(shown) == more
+    assert other_differences(shown) == f"in another measure (gap, by who is ahead): {more}"
     assert other_differences(driver("a", gap=apart)) == ""
 
 

@@ -95,6 +95,22 @@ def test_every_page_fits_its_window_and_axe_finds_nothing_serious(page):
     assert found == []
 
 
+def test_verdicts_stand_on_paper_and_in_a_small_window_without_a_broken_interval(page):
+    opened(page, "/drivers")
+    page.emulate_media(media="print")
+    page.set_viewport_size({"width": PAPER_PX, "height": 1000})
+    assert page.evaluate(OVER) <= 0
+    lines = page.locator(".m span:not(.vh)").evaluate_all(
+        "all => all.map(e => e.getClientRects().length)"
+    )
+    assert max(lines) == 1
+    page.emulate_media(media="screen")
+    page.set_viewport_size({"width": 1024, "height": 1000})
+    opened(page, "/tables/verdicts")
+    last = page.get_by_role("columnheader", name="verdict", exact=True).bounding_box()
+    assert last["x"] + last["width"] <= 1024
+
+
 def test_the_report_of_the_tutorials_study_is_at_most_so_high(page, tmp_path):
     kept = ("--db", tmp_path / "t.duckdb")
     played = ("sweep", "baseline", *kept, "--cache", tmp_path / "cache", "--quiet")

@@ -12,7 +12,7 @@ from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.effect_rows import MIDDLE
 from merge_runner_analysis.web.judged import Driver, by_condition, by_kind, humans_of, judged, noted
 from merge_runner_analysis.web.names import PLAYED, names_mean, opponents_text, short_names
-from merge_runner_analysis.web.next_steps import is_found, is_rehearsal, next_steps, without
+from merge_runner_analysis.web.next_steps import is_found, is_rehearsal, next_steps
 from merge_runner_analysis.web.people import (
     UNPOSED,
     could_see,
@@ -26,7 +26,7 @@ from merge_runner_analysis.web.people import (
     verdict_rules,
 )
 from merge_runner_analysis.web.question import Answer, answer_of
-from merge_runner_analysis.web.runs import standing_of
+from merge_runner_analysis.web.runs import standing_of, words_here
 from merge_runner_analysis.web.scope import Bar, Scope, descriptions_of, scope_of, unmarked
 from merge_runner_analysis.web.site import Site, news_of
 from merge_runner_analysis.wording import HEADINGS, LANGUAGE_MODEL, MOCK, PROGRAM
@@ -139,8 +139,7 @@ def home_page(site: Site, params: Mapping[str, str]) -> str:
     # The people's values are those in the first driver's conditions.
     human = humans_of(values["table"], next(iter(shown), None))
     typed = standing[0]["config"].get("typed") if standing else None
-    # The database may have been moved since.
-    sweep = [*without("--db", typed or ("sweep", "STUDY")), *site.named_db]
+    sweep = words_here(typed or ("sweep", "STUDY"), site.db)
     return site.render(
         "home.html",
         view="index",

@@ -19,7 +19,9 @@ from merge_runner_analysis.power import (
     chances,
     human,
     power,
+    power_table,
     simulate,
+    unread_words,
 )
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.stats.effects import effects
@@ -167,6 +169,15 @@ def test_rows_are_those_of_the_table_of_effects_whatever_is_planted(file, prepar
     for row in found:
         level = named[row["arms"], row["against"]].level
         assert row["trials"] == len(level.pooled.stored.trials)
+
+
+def test_a_level_whose_words_the_emulator_does_not_read_is_named(file):
+    study = str(file(REHEARSED))
+    says = "persona=taxi: the power is that of a model which reads the words. The emulator reads no"
+    assert unread_words(make_plan(study)).startswith(says)
+    assert not unread_words(make_plan(study, ["o3"]))
+    assert not unread_words(make_plan(study, only={"persona": ["none"]}))
+    assert power_table("", [], "told first").notes[0] == "told first"
 
 
 def powered(study, model=(), simulations=1):
