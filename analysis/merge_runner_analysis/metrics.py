@@ -31,7 +31,7 @@ class Metric:
     ``trial_metrics``, or one of JUDGED; a subquery over another table knows the trial as
     ``trials.trial_id`` and ``trials.spec_hash``. A proportion is of a BOOLEAN. ``trials`` are those
     that count, unless their value is NULL; ``weight`` is SQL of how much a trial counts in a mean.
-    ``meaning`` describes one trial's number, or what a proportion is; intervals and axes end
+    ``meaning`` describes one trial's number, or the share of a proportion; intervals and axes end
     at ``least``. ``paper_of_drivers`` and ``paper_of_humans`` are columns of
     ``paper_ablation_quantitative.csv``.
     """
