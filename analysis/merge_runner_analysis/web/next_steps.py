@@ -35,13 +35,14 @@ UNSHOWN = "No effect is shown. Estimate how many trials one would need"
 
 def next_steps(
     program: str,
-    sweep: Sequence[str],
+    played: Sequence[str],
     drivers: Sequence[Driver],
     short: Mapping[str, str],
     conditions: Mapping[str, Any],
     answers: Answer | Comparison | None,
 ) -> list[tuple[str, str]]:
-    """Return sentences with commands; ``sweep`` are the words that play the study."""
+    """Return sentences with commands; ``played`` are the words that played the study."""
+    sweep = ["sweep", *without("--recording", played)[1:]]  # a replay plays no further trial
 
     def again(*options: str) -> str:
         return shlex.join([program, *sweep, *options])

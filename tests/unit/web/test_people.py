@@ -200,8 +200,8 @@ TYPED = ["sweep", "s.toml", "--model", "emulator", "--yes"]
         (
             played(trials=110, n=110, ended=(110, 0)),
             MOCK,
-            TYPED,
-            [("This was", "m sweep s.toml --mo")],
+            ["replay", "s.toml", "--recording", "r.parquet", "--model", "emulator"],
+            [("This was", "m sweep s.toml --model MODEL --dry-run")],
         ),
     ],
 )

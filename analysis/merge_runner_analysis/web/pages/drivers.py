@@ -43,6 +43,8 @@ def drivers_page(site: Site, params: Mapping[str, str]) -> str:
 
 def driver_page(site: Site, name: str, params: Mapping[str, str]) -> str:
     """Return the page of a driver with one prompt, or of ``human``; raises NotThere."""
+    if name == HUMAN:  # whose published numbers are of all situations
+        params = {key: value for key, value in params.items() if key != "condition"}
     bar = scope_of(site, params, "" if name == HUMAN else name)
     scope = bar.scope
     drivers, values = judged(site, bar, params)
