@@ -32,6 +32,7 @@ from merge_runner_analysis.wording import (
     capital,
     differs,
     distance,
+    ends_of,
     equal_p,
     has_verdict,
     joined,
@@ -42,9 +43,7 @@ from merge_runner_analysis.wording import (
     with_interval,
 )
 
-TOO_FEW = (
-    f"Too few trials without a crash for a verdict (at least {ENOUGH}, and half of all, are needed)"
-)
+TOO_FEW = f"Too few finished trials for a verdict (at least {ENOUGH}, and half of all, are needed)"
 # By measure: what drivers that are like people do, and the name of the measure without a verdict.
 LIKENESS = {
     "collisions": ("crash as often as people", "crashes"),
@@ -110,13 +109,15 @@ def sentence(verdicts: Mapping[str, Values]) -> str:
     if "" in verdicts:
         return f"{capital(verdicts['']['note'])}."
     parts = [crashes(verdicts["collisions"]), *map(clause, verdicts.values())]
-    unclear = [
-        MEASURES[name].label
-        for name in ("headway", "velocity", "collisions", "gap")
-        if shown_state(verdicts[name]) == OPEN
-    ]
-    if unclear:
-        parts.append(f"cannot tell: {'; '.join(unclear)}")
+    unclear, unjudged = list[str](), list[str]()
+    for name, of in verdicts.items():
+        if of.get("state") and not has_verdict(of):
+            unjudged.append(MEASURES[name].label)
+        elif shown_state(of) == OPEN:
+            unclear.append(MEASURES[name].label)
+    for what, names in {"cannot tell": unclear, "no verdict": unjudged}.items():
+        if names:
+            parts.append(f"{what}: {'; '.join(names)}")
     text = ". ".join(capital(part) for part in parts if part)
     return f"{text or 'Nothing can be compared with people'}."
 
@@ -173,7 +174,7 @@ def _percent(collisions: Values, count: int) -> float:
 
 
 def apart(driver: str, other: str, rows: Mapping[str, Values], *, of_left: bool) -> tuple[str, str]:
-    """Return the headline of a driver less another, and other differences, of rows by their metric.
+    """Return the headline that compares two drivers, and other differences; ``rows`` by metric.
 
     ``A crashed in 12 of 110 trials, B in 33 of 110. In the same situations A crashed less often, by
     19.09 points [8.41, 29.78]; corrected p = 0.004.`` With ``of_left``, who goes first is the left
@@ -457,19 +458,16 @@ def _too_few(drivers: Mapping[str, Mapping[str, Values]], *, alone: bool) -> str
 def difference_sentence(values: Values, it: str) -> str:
     """Return a difference as ``it crashed in 24 of 110 trials, people in 28 of 990``.
 
-    Without counts of who goes first it is the sentence part of the state. A driver's interval
-    beside a margin has the level of its row, which is named if not 95 %.
+    Without counts of who goes first it is the sentence part of the state.
     """
     measure = MEASURES[str(values["measure"])]
     driver, people = values.get("counted"), values.get("human_counted")
     if driver is None or people is None:
         if measure.name in {"headway", "velocity"}:
             return clause(values)
-        driver = with_interval(values["estimate"], values["ci"])
+        driver = f"{number(values['estimate'])} {ends_of(values)}".rstrip()
         people = with_interval(values["human"], values["human_ci"])
         if measure.name == "collisions":
             driver, people = f"{driver} % of its", f"{people} %"
-    level = values.get("level") if measure.margin is not None and values["ci"] else None
-    at = "" if level is None or f"{level:.4g}" == "95" else f" (interval at {level:.4g} %)"
-    says = f"{measure.difference.format(it=it, driver=driver, people=people)}{at}"
+    says = measure.difference.format(it=it, driver=driver, people=people)
     return says if measure.name in HEADINGS else f"{IN_ANOTHER.format(measure.label)}, {says}"

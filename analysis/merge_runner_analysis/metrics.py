@@ -31,8 +31,8 @@ class Metric:
     ``trial_metrics``, or one of JUDGED; a subquery over another table knows the trial as
     ``trials.trial_id`` and ``trials.spec_hash``. A proportion is of a BOOLEAN. ``trials`` are those
     that count, unless their value is NULL; ``weight`` is SQL of how much a trial counts in a mean.
-    ``meaning`` describes one trial's number, or the share of a proportion; intervals and axes end
-    at ``least``. ``paper_of_drivers`` and ``paper_of_humans`` are columns of
+    ``meaning`` describes one trial's number, or the share of a proportion; intervals and
+    axes begin at ``least`` or above. ``paper_of_drivers`` and ``paper_of_humans`` are columns of
     ``paper_ablation_quantitative.csv``.
     """
 
@@ -128,8 +128,8 @@ LEFT_FIRST = Metric(
     name="left_first_percent",
     label="goes first",
     unit="%",
-    meaning="share of finished trials with a first merger in which the driver that is named first "
-    "(of two equal ones the left one) merged first",
+    meaning="share of finished trials in which the driver under study merged first (the ego; of "
+    "two equal drivers the one with the words, else the left one)",
     value="merged_first = 'left'",
     estimator="proportion",
     shown=False,

@@ -56,10 +56,11 @@ DIRECTIONS = {
 }
 # The rule of a verdict, a line a state; ``{tests}`` is the number of a driver's tests, if known.
 VERDICT_RULES = (
-    "Like people (crashes, gap): the whole interval of the difference lies within 5 points, or 1 m",
+    "Like people (crashes, gap): the whole interval of the difference, at the level of its "
+    "corrected test, lies within 5 points, or 1 m",
     "Same tendency as people (who goes first): the one ahead or, side by side, the slower "
     "one goes first more often, with p below .05 in a logistic regression (Firth) over all trials "
-    "without a crash, not by the counts; and no difference is shown",
+    "that finished, not by the counts; and no difference is shown",
     "More, fewer, larger, smaller, weaker or stronger: a difference is shown, with p below .05, "
     "corrected (Holm) for all tests of a driver{tests}; of a tendency, in that regression's slope",
     "Cannot tell: neither is shown",
@@ -146,11 +147,11 @@ class Why(Enum):
     """Remarks on numbers, such as why one is missing, with placeholders for values."""
 
     # Fits; ``s`` makes a plural of the first value.
-    NO_FIRST = "no trial in which one went first without a crash"
+    NO_FIRST = "no finished trial in which one went first"
     NO_GAP = "no trial with a gap"
     FEW_FIRST = (
-        "{} trial{s} in which one went first without a crash: too few, or in too few situations, "
-        "to estimate effects of headway and speed"
+        "{} finished trial{s} in which one went first: too few, or in too few situations, to "
+        "estimate effects of headway and speed"
     )
     FEW_GAPS = (
         "{} trial{s} with a gap: too few, or in too few situations, to estimate effects of headway "
@@ -336,9 +337,9 @@ MEASURES = {
             GAP.column,
             "HC3 errors: largest difference of predicted gaps within 1 m, two one-sided tests at "
             '5 %; not as with people: "within 1 m" is rejected, corrected p below .05',
-            "with {it} who is faster moves the gap by up to {driver} m, with people by {people} m",
+            "the gap of {it} differs by up to {driver} m by who is faster, people's by {people} m",
             (0.0, 3.0),
-            {UNLIKE: "who is faster moves its gap by {of} m"},
+            {UNLIKE: "its gap differs by up to {of} m by who is faster"},
             margin=1.0,
         ),
         Measure(
@@ -424,6 +425,13 @@ def number(value: float | None, decimals: int = DECIMALS, unit: str = "") -> str
     return MISSING if value is None else f"{value:z.{decimals}f}{unit}".replace("-", MINUS)
 
 
+def ends_of(values: Values) -> str:
+    """Return an estimate's interval, with a margin also its level if not 95: ``[99 %: 2, 7]``."""
+    level, ends = values.get("level"), brackets(values.get("ci"))
+    has_level = level is not None and MEASURES[str(values["measure"])].margin is not None
+    return ends.replace("[", f"[{level:.4g} %: ") if has_level and f"{level:.4g}" != "95" else ends
+
+
 def brackets(ci: Sequence[float] | None, form: Callable[[float], str] = number) -> str:
     """Return ``[47.32, 83.64]``, or nothing."""
     return "" if ci is None else f"[{', '.join(map(form, ci))}]"
@@ -451,7 +459,7 @@ def verdict_word(values: Values) -> str:
     """Return a state in words, as it stands in a list of verdicts."""
     n = values.get("n") or 0
     if values.get("state") and not has_verdict(values):
-        return f"fewer than {ENOUGH} trials" if n < ENOUGH else "too few without a crash"
+        return f"fewer than {ENOUGH} trials" if n < ENOUGH else "too few finished"
     words = VERDICTS | DIRECTIONS.get(str(values.get("measure")), {})
     return words.get(shown_state(values), "not compared")
 

@@ -60,7 +60,7 @@ class Level:
 
 @remembered
 def copied_cells(study: StudyResults, groups: tuple[Group, ...]) -> set[Cell]:
-    """Return the cells in which programs do not read what the groups differ in: trials are copies.
+    """Return the cells in which programs do not read the groups' factor, so that trials are copies.
 
     A condition is never left out alone: the choice would depend on the outcomes there.
     """
@@ -171,7 +171,7 @@ def _distinct(study: StudyResults, levels: list[Level]) -> list[Level]:
 
 
 def _with_copies(study: StudyResults, group: Group) -> Iterator[Iterable[Cell]]:
-    """Yield cells that are copies of each other; a mock model's single equal trials are chance."""
+    """Yield cells that are copies of each other; a mock model has single equal trials by chance."""
     if not group.scripted:
         yield from (cells for _, cells in group.trials.groupby(["condition", "way"])["cell"])
         return

@@ -216,9 +216,9 @@ class Fit:
     def starts(self, term: int | None = None, value: float = 0.0) -> Array:
         """Return starts that lead to all maxima, perhaps with a term held: (starts, terms).
 
-        With few trials there are several maxima. The starts far out give two conditions even
-        chances, nearest to the fit by its information. Others are scaled down to 0, where the
-        likelihood is always known.
+        With few trials there are several maxima. Some starts give two of the conditions
+        even chances, as near to the fit as that allows, measured by its information. Others are
+        scaled down to 0, where the likelihood is always known.
         """
         fixed = np.eye(len(self.b))[[] if term is None else [term]]
         pairs = self.counts.design[[*combinations(range(len(self.counts.design)), 2)]]
@@ -257,8 +257,8 @@ class Regression:
     """A fit to ``n`` trials; ``problem`` says why there are no terms, ``remark`` is a caution.
 
     ``freedom`` is infinite where tests are normal. For gaps, ``equivalence_p`` tests that relative
-    velocity alone moves them by less than GAP_MARGIN_M, and ``velocity_p`` that it has no effect.
-    None without two played conditions that differ only in it, or without residuals.
+    velocity alone moves them by less than GAP_MARGIN_M: None without two played conditions that
+    differ only in it. ``velocity_p`` tests that it has no effect: None where errors are singular.
     """
 
     n: int

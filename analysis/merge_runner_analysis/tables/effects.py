@@ -259,10 +259,11 @@ def _notes(study: StudyResults, by: str) -> Iterator[str]:
         first = (
             f"the {len(of_primary)} test{'s' * (len(of_primary) != 1)} of “{_primary_name(study)}”"
         )
-        rest = f"the {len(others)} other tests of the table effects"
+        rest = f"the {len(others)} {'other ' * bool(of_primary)}tests of the table effects"
         rest += _uncounted(corrected) + _tests_by_factor(others)
-        names = f" by {joined([*dict.fromkeys(of_primary)])}" if of_primary else ""
-        yield f"{CORRECTED} {first}{names}, and separately for {rest}"
+        names = joined([*dict.fromkeys(of_primary)] or [""])
+        alone = f"{first} by {names}, and separately for " if of_primary else ""
+        yield f"{CORRECTED} {alone}{rest}"
         yield "detectable: found at p < .05, before correction, with power .8"
     counts = [
         f"{level.id}: {level.pooled.repeated} of {len(level.pooled.stored.trials)}"

@@ -16,9 +16,9 @@ from urllib.parse import parse_qsl, quote
 import uvicorn
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
-from starlette.middleware.base import BaseHTTPMiddleware, RequestResponseEndpoint
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import ClientDisconnect, Request
@@ -31,6 +31,7 @@ from starlette.responses import (
 )
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner_analysis.web.glossary import sections
@@ -132,7 +133,7 @@ def explorer(site: Site) -> Starlette:
             Mount("/static", StaticFiles(directory=STATIC)),
         ],
         middleware=[
-            Middleware(BaseHTTPMiddleware, dispatch=guard),
+            Middleware(Guard),
             Middleware(TrustedHostMiddleware, allowed_hosts=[LOOPBACK, "localhost"]),
             Middleware(GZipMiddleware, minimum_size=2_000),
         ],
@@ -189,7 +190,7 @@ PAGES: dict[str, Callable[..., str | Response]] = {
 
 
 async def _noted(site: Site, request: Request) -> Response:
-    """Keep what a reader notes; see ``guard`` for who may write."""
+    """Keep what a reader notes; see ``Guard`` for who may write."""
     size = whole(request.headers.get("content-length", ""))
     if size is None or size > MOST_NOTED:
         return PlainTextResponse("nothing was noted: the form is too large", 413)
@@ -206,13 +207,25 @@ async def _noted(site: Site, request: Request) -> Response:
     return await run_in_threadpool(write)
 
 
-async def guard(request: Request, answer: RequestResponseEndpoint) -> Response:
-    """Refuse requests of other sites' pages but links, and add HEADERS to every reply."""
-    problem = _problem(request)
-    reply = PlainTextResponse(f"{problem}\n", 403) if problem else await answer(request)
-    for name, value in HEADERS.items():
-        reply.headers.setdefault(name, value)
-    return reply
+class Guard:
+    """Refuses requests of other sites' pages but links, and adds HEADERS to every reply."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request, as Starlette's pure middleware does."""
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in HEADERS.items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        problem = _problem(Request(scope)) if scope["type"] == "http" else ""
+        app = PlainTextResponse(f"{problem}\n", 403) if problem else self.app
+        await app(scope, receive, send_with_headers)
 
 
 def _problem(request: Request) -> str:

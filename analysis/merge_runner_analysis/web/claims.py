@@ -183,7 +183,7 @@ def _both(row: Row, driver: str) -> str:
     of, reference = (estimate_text(row, name) for name in ("estimate", "estimate_reference"))
     if metric_of(row) == LEFT_FIRST.name:
         return (
-            f"in the same situations and without a crash, {driver} goes first in {of} with "
+            f"in the same situations {driver} goes first in {of} of finished trials with "
             f"{factor}={level} and in {reference} with {factor}={called(factor, base)}"
         )
     return f"{of} with {factor}={level}, {reference} with {factor}={called(factor, base)}"

@@ -17,22 +17,14 @@ from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.scope import Bar, Scope, carried, unmarked
 from merge_runner_analysis.web.site import Site
 from merge_runner_analysis.wording import (
-    HEADINGS,
     HUMANS,
     LANGUAGE_MODEL,
-    MEASURES,
     MOCK,
-    OPEN,
     PROGRAM,
     TABLE,
-    VERDICTS,
-    Values,
     by_group,
     capital,
-    shown_state,
 )
-
-CANNOT = capital(VERDICTS[OPEN])
 
 KINDS = {
     LANGUAGE_MODEL: ("Language models", ""),
@@ -126,25 +118,10 @@ def drivers_of(site: Site, table: Table | None, scope: Scope) -> list[Driver]:
         sent = ", ".join(
             f"{key} {value}" for key, value in body if isinstance(value, str | int | float)
         )
-        text, endpoint = summary_of(verdicts), spec["endpoint"] if spec else ""
+        text, endpoint = sentence(verdicts) if verdicts else "", spec["endpoint"] if spec else ""
         of_driver = cells(verdicts, measures)
         drivers.append(Driver(name, prompt, kind, of_driver, text, of, endpoint, sent))
     return drivers
-
-
-def summary_of(verdicts: Mapping[str, Values]) -> str:
-    """Return a driver's sentences, with every open measure."""
-    if not verdicts:
-        return ""
-    text = sentence(verdicts)
-    if "" in verdicts:
-        return text
-    others = {name: values for name, values in verdicts.items() if name not in HEADINGS}
-    unclear = [MEASURES[name].label for name, of in others.items() if shown_state(of) == OPEN]
-    if unclear:
-        begin = f"{text.removesuffix('.')}; " if CANNOT in text else f"{text} {CANNOT}: "
-        text = f"{begin}{'; '.join(unclear)}."
-    return text
 
 
 def by_kind(drivers: Sequence[Driver]) -> dict[str, list[Driver]]:

@@ -17,11 +17,10 @@ from merge_runner_analysis.wording import (
     WEAKER,
     Measure,
     Values,
-    brackets,
+    ends_of,
     number,
     shown_state,
     verdict_word,
-    with_interval,
 )
 
 SHAPES = {SHOWN: "like", WEAKER: "weaker", STRONGER: "stronger", UNLIKE: "unlike", OPEN: "open"}
@@ -106,16 +105,16 @@ def cells(verdicts: dict[str, Values], measures: Mapping[str, Measure]) -> dict[
 
 
 def _cell(measure: Measure, values: Values) -> Cell:
-    value, ci = values.get("estimate"), values.get("ci")
+    value, ends = values.get("estimate"), ends_of(values)
     word = verdict_word(values) if values.get("kind") != "humans" else ""
-    whole = share(values) if values.get("undecided") else with_interval(value, ci)
+    whole = share(values) if values.get("undecided") else f"{number(value)} {ends}".rstrip()
     parts = [f"{whole} {measure.unit}", word, f"n = {values['n']}", values["note"]]
     return Cell(
         measure,
         values,
         mark(measure, values),
         share(values) if values.get("undecided") else number(value),
-        brackets(ci),
+        ends,
         word,
         "; ".join(filter(None, parts)),
     )

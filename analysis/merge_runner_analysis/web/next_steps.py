@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from merge_runner_analysis.published import human_counts
 from merge_runner_analysis.web.comparison import Comparison
 from merge_runner_analysis.web.judged import Driver
 from merge_runner_analysis.web.people import repeated
@@ -26,9 +27,13 @@ REHEARSED = (
 )
 REPEATED = (
     f"{{}}: fewer than {ENOUGH} different trials, and more repetitions would be the same again. "
-    "Add situations, or another driver"
+    "Add {}another driver"
 )
 FEW = f"{{}}: fewer than {ENOUGH} counted trials. Add repetitions"
+UNDECIDED = (
+    "By people's rule it is not known how many trials crashed, since another rule ended some. To "
+    'know it, play the study with scenario.collision_rule = "rectangle"'
+)
 UNASKED = ("--yes", "--quiet")  # of a rehearsal, not of a run that costs money
 UNSHOWN = "No effect is shown. Estimate how many trials one would need"
 
@@ -56,9 +61,13 @@ def next_steps(
     same = [short[of.name] for of in few if repeated(of, conditions)[0]]
     others = [short[of.name] for of in few if short[of.name] not in same]
     if same:
-        steps.append((REPEATED.format(joined(same)), ""))
+        unplayed = len(human_counts().keys() - conditions["names"])
+        more = "situations that people drove, or " * bool(unplayed)
+        steps.append((REPEATED.format(joined(same), more), ""))
     if others and not is_rehearsal(drivers):
         steps.append((FEW.format(joined(others)), again("--reps", "N")))
+    if any(driver.cells["collisions"].values.get("undecided") for driver in judged):
+        steps.append((UNDECIDED, ""))
     if isinstance(answers, Answer) and not any(row.is_shown for row in answers.changes):
         steps.append((UNSHOWN, shlex.join([program, "power", study_in(sweep) or sweep[1]])))
     return steps

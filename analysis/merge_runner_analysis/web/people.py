@@ -31,8 +31,8 @@ from merge_runner_analysis.wording import (
 
 # Notes on measures that no situation allows.
 UNPOSED = {
-    "headway": "In none of the situations that people drove, too, would one driver be ahead",
-    "velocity": "In none of the situations that people drove, too, are both side by side at "
+    "headway": "No situation of this study that people also drove has one driver ahead",
+    "velocity": "No situation of this study that people also drove has both side by side at "
     "different speeds",
 }
 
@@ -110,8 +110,8 @@ def _cells_of(driver: Driver, conditions: Mapping[str, Any]) -> list[Any]:
 def gap_weights(drivers: Sequence[Driver], short: Mapping[str, str]) -> str:
     """Return of which trials people's gap in their row is, and its range beside other drivers."""
     with_gap = [of for of in drivers if "gap" in of.cells]
-    gaps = [of.cells["gap"].values for of in with_gap if has_verdict(of.cells["gap"].values)]
-    ends = dict.fromkeys(number(pick(of["human"] for of in gaps)) for pick in (min, max) if gaps)
+    gaps = [gap for of in with_gap if (gap := of.cells["gap"].values["human"]) is not None]
+    ends = dict.fromkeys(number(pick(gaps)) for pick in (min, max) if gaps)
     if len(ends) < 2:
         return ""
     return unbroken(

@@ -329,21 +329,23 @@ def _crossing_of(levels: Sequence[Row]) -> str:
 
 
 def _counted(levels: Sequence[Row], metric: str, effects: Sequence[Row]) -> str:
-    """Return how many trials the measure counts, as in ``58 trials without a crash, 12 with one``.
+    """Return how many trials the measure counts, as in ``58 finished trials, 12 with a crash``.
 
     Trials of equal drivers, words and course are one: ``80 identical to another one are left out``,
     with the levels that change nothing.
     """
-    trials = f"{sum(count_of(row, 'n') for row in levels):,} trials"
+    counted, ended = (sum(count_of(row, name) for row in levels) for name in ("n", "ended"))
     repeated = sum(count_of(row, "repeated") for row in levels)
     copied = joined([level_text(row) for row in effects if is_copied(row)] or [""])
     why = f" ({copied} changes nothing)" if copied else ""
     left_out = f"; {repeated:,} identical to another one{why} are left out" if repeated else ""
     crashed = sum(count_of(row, "crashed") for row in levels)
-    what = " that ended" if metric == COLLISIONS.name else " that count"
-    if metric == LEFT_FIRST.name:
-        what = f" without a crash, {crashed:,} with one" if crashed else " without a crash"
-    return f"{trials}{what}{left_out}"
+    if metric != LEFT_FIRST.name:
+        what = "that ended" if metric == COLLISIONS.name else "that count"
+        return f"{counted:,} trials {what}{left_out}"
+    others = {"with a crash": crashed, "out of time": ended - counted - crashed}
+    parts = [f", {count:,} {what}" for what, count in others.items() if count]
+    return f"{counted:,} finished trials{''.join(parts)}{left_out}"
 
 
 def _of_one_factor(levels: Sequence[Row], drivers: Sequence[str]) -> list[Row]:

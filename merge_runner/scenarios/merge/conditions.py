@@ -70,9 +70,9 @@ class Condition:
         return left_m + speeds[0] * time_s, right_m + speeds[1] * time_s
 
 
-# A name has the side with the projected headway advantage (L, R or N), the projected headway in m
-# and the relative velocity in 0.1 m/s: in ``L_4_-8`` the left vehicle would be 4 m ahead at the
-# merge point and is 0.8 m/s slower.
+# A name has the side that is ahead or, side by side, slower (L or R; N: neither), the projected
+# headway in m and the relative velocity in 0.1 m/s: in ``L_4_-8`` the left vehicle would be 4 m
+# ahead at the merge point and is 0.8 m/s slower.
 _NAMES = "R_-4_-8 R_-4_0 R_-4_8 R_-2_8 R_0_8 N_0_0 L_0_-8 L_2_-8 L_4_-8 L_4_0 L_4_8"
 HUMAN_CONDITIONS = {
     name: Condition(float(name.split("_")[1]), int(name.split("_")[2]) / 10)

@@ -69,9 +69,7 @@ def judged_by(page, shape):
 
 def test_from_the_study_to_a_verdict_and_to_why_the_worst_condition_collides_and_a_note(page, db):
     page.goto("/")
-    words = (
-        "Too few trials without a crash for a verdict (at least 20, and half of all, are needed): "
-    )
+    words = "Too few finished trials for a verdict (at least 20, and half of all, are needed): "
     expect(page.locator(".answer")).to_contain_text(words, timeout=2000 * HANGS_S)
     page.locator("#answers").get_by_role("rowheader", name="smollm2").get_by_role(
         "link"

@@ -227,7 +227,7 @@ def test_the_first_screen_answers_a_study_of_two_factors(page, db, outcomes):
     assert f"no: {halves:g} of {len(first)}, where some count half" in beside
     assert "log-odds of going first by +0.2 (at most +5 points in a situation)" in beside
     assert "log-odds of going first by +1.5 (at most +36 points in a situation)" in beside
-    (shown,) = re.findall(r"(\d+) trials without a crash, (\d+) with one", beside)
+    (shown,) = re.findall(r"(\d+) finished trials, (\d+) with a crash", beside)
     assert sum(map(int, shown)) == query(db, "SELECT count(*) FROM trials")[1][0][0]
     shares = [float(share) for share in re.findall(r"(\d+\.\d\d) %", said)]
     assert shares[0] - shares[1] == pytest.approx(slope, abs=0.011)

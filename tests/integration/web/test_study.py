@@ -69,8 +69,8 @@ def table_of(db, *asked):
 
 
 def agree(html: str, values: list[float]) -> bool:
-    """Whether a piece of a page begins with these values, each rounded to its decimals."""
-    texts = NUMBER.findall(re.sub(r"<[^>]*>", " ", html).replace("−", "-"))
+    """Whether a piece of a page begins with these values, each rounded; an interval has a level."""
+    texts = NUMBER.findall(re.sub(r"<[^>]*>|\[[\d.]+ %:", " ", html).replace("−", "-"))
     return len(texts) >= len(values) and all(
         abs(float(text) - value) <= 0.5000001 * 10.0 ** -len(text.partition(".")[2])
         for text, value in zip(texts, values, strict=False)

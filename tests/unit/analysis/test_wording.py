@@ -255,7 +255,7 @@ def test_crashes_that_another_rule_decides_are_said_by_both():
 
 @pytest.mark.parametrize(
     ("n", "says"),
-    [(19, "fewer than 20 trials"), (20, "too few without a crash"), (28, "smaller than people's")],
+    [(19, "fewer than 20 trials"), (20, "too few finished"), (28, "smaller than people's")],
 )
 def test_a_cell_has_no_verdict_where_the_headline_has_none(n, says):
     values = driver(n, collided=55 - n, gap="unlike")
@@ -306,10 +306,10 @@ def test_an_interval_beside_a_margin_names_its_level_where_that_is_not_95_percen
     measure, level, said
 ):
     text = difference_sentence(row(measure, n=14, level=level), "it")
-    assert ("interval at" in text) == bool(said)
-    assert not said or text.endswith(f"(interval at {said} %)")
+    assert ("%:" in text) == bool(said)
+    assert not said or f"1.00 [{said} %: 0.50, 1.50]" in text
     assert text.startswith(f"in another measure ({MEASURES[measure].label}), ")
-    assert "interval at" not in difference_sentence(row("gap", n=14, level=level), "it")
+    assert "%:" not in difference_sentence(row("gap", n=14, level=level), "it")
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from tests.support.studies import played
 
 WORDS = {
     "both insisted": "Both insisted: both had sped up. At 2.0 s, the last moment at which one "
-    "driver alone could have avoided it (the right one, by braking as hard as it can), the left "
+    "driver alone could have avoided it (the right one, by braking), the left "
     "vehicle was 2.5 m/s faster and the right one 2.0 m/s faster than at the start; 0.5 m/s or "
     "more count as acting.",
     "no action": "Neither acted.",
@@ -73,7 +73,7 @@ def test_a_last_moment_to_speed_up_is_named_and_marked_apart_from_those_to_brake
     plans = (0.2, 0.2, 0.0, -0.6, 0.2, -0.6), (-0.2, -0.4, -0.2, 0.6, 0.2, 0.0)
     found = account(*crash("N_0_0", *plans), {"account": "one too little"})
     until = "At 6.4 s, the last moment at which one driver alone could have avoided it"
-    assert f"{until} (the left one, by speeding up as hard as it can)," in found.sentences[0]
+    assert f"{until} (the left one, by speeding up)," in found.sentences[0]
     assert Mark(pytest.approx(6.4), "left", "last chance", "last moment to speed up") in found.marks
 
 

@@ -43,8 +43,8 @@ def copied(factor):
 
 
 HURRY = (
-    "Hurry changes who goes first: in the same situations and without a crash, the driver under "
-    "study goes first in 63.00 % with hurry=yes and in 50.00 % with hurry=no."
+    "Hurry changes who goes first: in the same situations the driver under study goes first in "
+    "63.00 % of finished trials with hurry=yes and in 50.00 % with hurry=no."
 )
 SAME = "The difference is +13.00 points [6.00, 20.00] (95 % interval), corrected "
 SEEN = "The study had 80 % power for an effect of 10.00 points."
@@ -173,7 +173,7 @@ def test_a_planted_effect_is_said_of_a_rehearsal_with_its_size(drivers, is_said)
 @pytest.mark.parametrize("who", [EGO, LEFT])
 def test_the_driver_that_goes_first_is_named_and_explained(who):
     made = answer([effect()], levels_of("hurry"), who[1])
-    assert f"without a crash, {who[0]} goes first in" in made.claim
+    assert f"in the same situations {who[0]} goes first in" in made.claim
     assert made.who == f"G{who[1][1:]}"
 
 
@@ -191,7 +191,7 @@ def test_a_side_has_its_count_and_the_chart_the_axis_of_its_data():
     # Of both drivers, which are drawn.
     assert (
         made.counted
-        == "400 trials without a crash, 12 with one; 28 identical to another one are left out"
+        == "400 finished trials, 12 with a crash; 28 identical to another one are left out"
     )
     (chart,) = made.charts
     assert chart.title == "By factor"
@@ -249,7 +249,7 @@ def test_levels_that_are_not_tested_are_not_drawn():
     assert [line.head for line in chart.lines] == ["hurry", ""]
     assert (
         made.counted
-        == "200 trials without a crash, 6 with one; 14 identical to another one (persona=yes "
+        == "200 finished trials, 6 with a crash; 14 identical to another one (persona=yes "
         "changes nothing) are left out"
     )
 

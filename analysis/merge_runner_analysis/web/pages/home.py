@@ -92,7 +92,7 @@ def _beside_people(
                 filter(
                     None,
                     (
-                        DRAWN * (EMULATOR in driver.name),
+                        DRAWN * (EMULATOR in driver.name and "+" not in driver.name),
                         counted(driver, conditions),
                         other_differences(driver),
                     ),
@@ -162,6 +162,6 @@ def home_page(site: Site, params: Mapping[str, str]) -> str:
         middle=MIDDLE,
         linked=True,
         titles=dict(bar.prompts),
-        pair=names if len(names) == 2 and not apart else (),
+        pair=names if len(names) == 2 else (),
         conditions=conditions,
     )

@@ -250,7 +250,7 @@ def _collision(course: Course, name: str) -> str:
     left, right = (f"{abs(mps):.1f} m/s {'faster' if mps >= 0 else 'slower'}" for mps in changes)
     by = "braking" if action == BRAKING else "speeding up"
     when = f"{course.times_s[at]:.1f} s, the last moment at which one driver alone could have "
-    when += f"avoided it (the {escaping} one, by {by} as hard as it can)"
+    when += f"avoided it (the {escaping} one, by {by})"
     if escaping is None:
         when = "the end; nobody alone could have avoided it"
     return (

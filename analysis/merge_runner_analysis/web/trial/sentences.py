@@ -45,10 +45,11 @@ def facts(row: Row) -> list[str]:
     """Return a trial's condition and measures, in short sentences."""
     condition = condition_text(row["projected_headway_m"], row["relative_velocity_mps"])
     programs = "no prompt, since only programs drive"
-    prompt = programs if row["source"] == "driver" else f"the prompt {title_of(row['variant'])}"
+    title = title_of(row["variant"]) if row["variant"] else ""
+    prompt = programs if row["source"] == "driver" else f"the prompt {title}"
     texts = (
         f"{row['condition']}: {condition}",
-        row["variant"] and f"{row['variant']}: {prompt}",
+        f"prompt {title}" if title == row["variant"] else title and f"{row['variant']}: {prompt}",
         ", ".join(row["levels"] or ()),
         row["rmse_mps"] is not None and f"RMSE of the speed {number(row['rmse_mps'])} m/s",
         row["asked"] and f"{row['invalid']} of {row['asked']} decisions of models invalid",

@@ -170,8 +170,8 @@ def test_prompts_are_contrasted_without_one_that_is_called_baseline(tmp_path):
 
 # Drivers with one kind of trouble each, and what is said of it.
 TROUBLE = {
-    "1 trial in which one went first without a crash": [yielding("once", reps=1)[3]],
-    "no trial in which one went first without a crash": [
+    "1 finished trial in which one went first": [yielding("once", reps=1)[3]],
+    "no finished trial in which one went first": [
         Drive("crash", "baseline", name, 1, (0.0,), (0.0,)) for name in CONDITIONS
     ],
     "separation: no finite estimate of": [

@@ -154,7 +154,7 @@ def test_a_difference_of_groups_is_the_interaction_of_a_penalised_model_of_both(
     assert [term.p for term in terms] == pytest.approx(model.lrt_pvalues_[2:5], rel=1e-3)
     no_fit(
         who_first_firth(own, less=rest.iloc[:2]),
-        "2 trials in which one went first without a crash: too",
+        "2 finished trials in which one went first: too",
     )
 
 
@@ -270,9 +270,9 @@ EVERY_FIT = pytest.mark.parametrize(
 def test_too_little_data_are_said(fit):
     collided = frame([(h, dv, "collided", None, None) for h, dv in CELLS])
     for trials in (collided, collided[:0]):
-        no_fit(fit(trials), "no trial ")
+        no_fit(fit(trials), "no ")
         assert fit(trials).n == 0
-    no_fit(fit(frame([(4.0, 0.8, "finished", "left", 3.0)])), "1 trial ")
+    no_fit(fit(frame([(4.0, 0.8, "finished", "left", 3.0)])), "1 ")
     one_cell = [(4.0, 0.8, "finished", ("left", "right")[k % 2], 4.0 + k) for k in range(20)]
     no_fit(
         fit(frame(one_cell)),
@@ -280,4 +280,4 @@ def test_too_little_data_are_said(fit):
     )
     if fit in (who_first_logit, who_first_firth):  # as many trials as coefficients
         few = OVERLAPPING.iloc[[0, 1, 5]].assign(merged_first=["left", "right", "left"])
-        no_fit(fit(few), "3 trials in which one went first")
+        no_fit(fit(few), "3 finished trials in which one went first")
