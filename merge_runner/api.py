@@ -106,10 +106,12 @@ class Study:
 
     ``models``, ``repetitions``, ``conditions`` and ``prompts`` override the file; ``only`` selects
     a level, or a list of levels, by factor; ``mirror`` counterbalances the sides of two different
-    drivers; ``db`` and ``cache`` are beside the file by default; ``trust`` agrees to run the code
-    of the study, and to send keys where its models.toml says. ``arun``, ``areplay`` and
-    ``adry_run`` are awaited, as in a notebook; ``run``, ``replay`` and ``dry_run`` are for scripts.
-    Fields of ``Options`` configure a run, as ``in_flight=50, max_cost_usd=20``.
+    drivers; ``trust`` agrees to run the code of the study, and to send keys where its models.toml
+    says. ``db`` and ``cache`` are ``results/merge.duckdb`` and ``cache/responses`` by default: in
+    the file's folder, in the parent of a folder ``experiments``, or for a name in the working
+    directory. ``arun``, ``areplay`` and ``adry_run`` are awaited, as in a notebook; ``run``,
+    ``replay`` and ``dry_run`` are for scripts. Fields of ``Options`` configure a run, as
+    ``in_flight=50, max_cost_usd=20``.
 
     Studies run side by side, in one event loop or in threads, each with its own parts.
 
@@ -203,7 +205,12 @@ class Study:
         )
 
     async def areplay(self, *recordings: Path | str) -> StudyOutcome:
-        """Play trials from recorded replies alone, those that files hold, if any; send nothing."""
+        """Play trials from recorded replies alone; send nothing.
+
+        With ``recordings`` it plays the trials that these hold; without any, all trials from the
+        cache, or those of a shipped recording if the cache has no replies of the models. Chosen
+        ``repetitions``, ``conditions`` or ``prompts`` are all played.
+        """
         return await self.arun(replay=True, recordings=tuple(map(Path, recordings)))
 
     dry_run, run, replay = sync(adry_run), sync(arun), sync(areplay)

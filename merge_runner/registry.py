@@ -130,9 +130,10 @@ def in_use() -> Catalogue:
 
 
 def use(catalogue: Catalogue) -> None:
-    """Use this catalogue from now on, in this thread and what it starts.
+    """Use this catalogue from now on in this context: a thread, or a task and those it starts.
 
-    It is for a process that serves one study, such as a command or a worker.
+    A new thread has it only in a copy of the context. It is for a process that serves one study,
+    such as a command or a worker.
     """
     _in_use.set(catalogue)
 

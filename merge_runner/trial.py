@@ -30,7 +30,7 @@ class Trial:
         scenario: ScenarioConfig,
         drivers: Mapping[Side, Driver | LlmDriver],
     ) -> None:
-        # A driver may set the start of its side, and of the other side if its driver sets none.
+        # A driver may set the start of its side, and of the other side if that driver sets none.
         by_driver = {side: d.starts for side, d in drivers.items() if hasattr(d, "starts")}
         starts = {}
         for set_by_other in by_driver.values():

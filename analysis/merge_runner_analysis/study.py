@@ -77,7 +77,7 @@ class StudyResults:
         self.groups = [self.human] * with_human + self.models
 
     def _driven(self, trials: pd.DataFrame) -> pd.DataFrame:
-        """Return the chosen drivers' trials; raises UsageError where there is no such run."""
+        """Return trials of the chosen run and condition; raises UsageError for an unknown run."""
         run, condition = self.selection.sweep, self.selection.condition
         if run:
             links, called = self.frames.studies.trials, self.frames.studies.called

@@ -59,9 +59,9 @@ MAX_COST = "Send no request that could bring the cost of all runs of the sweep a
 STRICT = "Stop when another model answers than was requested."
 DASK = "Play on a Dask cluster: local:N, a scheduler's address, or its file."
 BATCH = "Send requests in the provider's batches: cheaper, but it takes hours."
-# Parameters of sweep that replay accepts and does not list.
-NO_EFFECT = {"max_cost_usd", "batch", "in_flight", "rpm", "tpm", "dask", "strict_model"}
-NO_EFFECT |= {"keep_going", "replay", "yes"}
+# Parameters of sweep that replay does not list: it refuses batch and dask, and ignores the others.
+UNLISTED = {"max_cost_usd", "batch", "in_flight", "rpm", "tpm", "dask", "strict_model"}
+UNLISTED |= {"keep_going", "replay", "yes"}
 RECORDING = (
     "In a replay, also use the replies of this file, without importing them; may be repeated."
 )
@@ -127,6 +127,8 @@ def sweep(
         raise UsageError("--max-cost is a number of USD")
     if show_prompts and not dry_run:
         raise UsageError("--show-prompts goes with --dry-run")
+    if replay and dask is not None:
+        raise UsageError("a replay needs no cluster: leave --dask out")
     if recordings and not replay:
         raise UsageError("--recording goes with a replay; to keep its replies: recording import")
     options = Options(
@@ -204,8 +206,6 @@ def _plans(name: str, *, selection: dict[str, Any], options: Options, trust: boo
         _check_whole(name, chosen=any(selection.values()), replay=options.replay)
         return [*recorded_plans(Path(name), db=options.db, trust=trust)]
     plan = make_plan(name, **selection, db=options.db, trust=trust)
-    if options.dask is not None and options.replay:
-        raise UsageError("a replay needs no cluster: leave --dask out")
     if options.dask is not None and plan.parts.replays_humans:
         raise UsageError("human-replay reads the database of this machine: leave --dask out")
     return [plan]
@@ -224,7 +224,7 @@ def _check_whole(recording: str, *, chosen: bool, replay: bool) -> None:
 
 def _as_in_replay(parameter: inspect.Parameter) -> inspect.Parameter:
     kind, info = get_args(parameter.annotation)
-    if parameter.name in NO_EFFECT:
+    if parameter.name in UNLISTED:
         info = copy(info)
         info.hidden = True
     return parameter.replace(annotation=Annotated[kind, info])

@@ -38,7 +38,8 @@ class Call:
     while it is in flight or being saved. ``task`` makes the call. ``trials`` has the orders of the
     trials that wait for it, ``order`` is the lowest of them. While ``is_probe``, other calls wait
     for it. ``bypass_batch`` is set after a batch without a result for it; ``pending_batch`` is the
-    batch of an earlier run in which it waits. ``damaged``: so is its recorded reply.
+    batch of an earlier run in which it waits. ``damaged``: the cache has a reply to it, or earlier
+    attempts, that cannot be used.
     """
 
     request: ChatRequest
@@ -109,8 +110,8 @@ class Calls:
     def wait(self, call: Call, wait: Wait) -> None:
         """Let a call wait, so that it can be cancelled; raise CallFailed if it is given up.
 
-        It is in flight again when its ``wait`` is None. The waits of an attempt are set by who
-        makes it, since what is reserved or sent is not given up.
+        It is in flight again when its ``wait`` is None. This is for waits outside attempts. The
+        client checks the call before each attempt; within it ``wait`` is set directly.
         """
         if self.stopping or not call.trials:
             raise self.given_up(call)

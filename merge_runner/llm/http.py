@@ -212,7 +212,7 @@ class HttpTransport:
     def _network(self, connections: int) -> AiohttpTransport:
         """Return a transport with the proxies and certificates of the environment."""
         url = httpx.URL(self._endpoint.base_url)
-        # Without TLS an empty one: loading the certificates takes long.
+        # An empty one for plain HTTP to loopback, since loading the certificates takes long.
         trusted = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         try:
             if url.scheme == "https" or url.host not in LOOPBACK:

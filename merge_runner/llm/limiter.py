@@ -1,10 +1,10 @@
 """Rate limits, requests and tokens a minute; one dispatcher serves the oldest trial first.
 
 asyncio-throttle counts the requests. It polls for every waiter and keeps no order among them, so
-only the dispatcher calls it, and only when it has room: a turn that is taken before a pause would
-be counted at the wrong time. Tokens are counted in a sliding window of a minute: an estimate at
-dispatch, the actual usage afterwards. Each process counts for itself: where several use one key,
-the server refuses the excess, which is retried.
+only the dispatcher calls it. It counts a request when it is called, so the dispatcher calls it only
+when the request can be sent at once: no pause is on, and the limits have room. Tokens are counted
+in a sliding window of a minute: an estimate at dispatch, the actual usage afterwards. Each process
+counts for itself: where several use one key, the server refuses the excess, which is retried.
 """
 
 from __future__ import annotations

@@ -2,10 +2,11 @@
 
 Servers without a reasoning parser send a model's thoughts within the content, between tags or as
 channels of the harmony format. A tag in quotes is a mention and is ignored. A reply that begins
-with an opening tag is reasoning up to its last closing tag; without a closing tag all of it is
-reasoning, truncated before the answer. In any other reply the text before the last closing tag is
-reasoning if an answer follows, since chat templates may write the opening tag themselves; a tag
-within a line, after a space, is a word of that line. Any other text is an answer.
+with an opening tag is reasoning up to the last closing tag with text after it, or if none has, up
+to the last closing tag. Without a closing tag all of it is reasoning, truncated before the answer.
+In any other reply the text before the last closing tag with text after it is reasoning, since chat
+templates may write the opening tag themselves; a tag within a line, after a space, is a word of
+that line. Any other text is an answer.
 """
 
 from __future__ import annotations

@@ -72,8 +72,9 @@ CREATE TABLE trials (
 );
 COMMENT ON TABLE trials IS 'One row per trial. One trial_id may occur with two specs: join and '
     'group by (trial_id, spec_hash).';
-COMMENT ON COLUMN trials.trial_id IS 'drivers/variant/condition/repetition, then the sample set; '
-    'levels of factors follow; a first decision''s begins with seat/';
+COMMENT ON COLUMN trials.trial_id IS 'drivers/prompt/condition/repetition, then the sample set '
+    'unless it is 0, levels of factors, and focal=SIDE unless focal is NULL; a first decision''s '
+    'begins with seat/, a human trial''s is human/pair/condition/iteration';
 COMMENT ON COLUMN trials.spec_hash IS 'hash of all that determines the result, except condition '
     'and rep';
 COMMENT ON COLUMN trials.pair IS 'the human pair; NULL: no human trial';

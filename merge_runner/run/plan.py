@@ -76,7 +76,7 @@ class Plan(BaseModel):
 
     @property
     def registered(self) -> dict[str, str]:
-        """The names in the registry of the models of ``entries``, whatever their parameters."""
+        """Names in the registry, of models and programs, by an arm's ``full_names``."""
         return {arm.full_names[side]: arm.sides[side] for arm in self.arms for side in SIDES}
 
     @computed_field  # type: ignore[prop-decorator] # https://github.com/python/mypy/issues/14461

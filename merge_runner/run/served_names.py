@@ -24,13 +24,15 @@ async def with_names(
 ) -> Plan:
     """Return the plan with its models' names, and in a replay with the recorded endpoints.
 
-    A model's name comes from its entry, its recorded replies or its server. Raises UsageError.
+    A model's name comes from its entry, else from its provider's environment variable. If neither
+    has one, it comes from recorded replies in a replay or a dry run, and from the server in a live
+    run. Raises UsageError.
     """
     entries, endpoints = dict(plan.entries), dict(plan.endpoints)
     for name, entry in entries.items():
         served_id = model_id(entry)
         if not served_id and options.sends_nothing:
-            # A server of one's own serves one model, or the recorded replies do not tell which.
+            # Recorded replies of several models of this provider leave the name open.
             models = recorded_values(cache, "model", provider=entry.provider)
             served_id = models.pop() if len(models) == 1 else UNNAMED
         entries[name] = entry.model_copy(

@@ -78,10 +78,11 @@ ORDER BY started_at DESC, sweep_id DESC
 def audit_database(
     path: Path, sweep_ids: Sequence[str] | None = None, cache: Path | None = None
 ) -> list[Audit]:
-    """Audit every sweep, oldest first, and then the orphan rows; or some sweeps alone.
+    """Return the audits of all sweeps, oldest first, and of the orphan rows; or of some sweeps.
 
-    A trial that several sweeps have is audited with the newest of them. The replies come from
-    the folder ``cache``, if it is named, and are compared with the stored ones. Raises UsageError.
+    A trial that several sweeps have is audited with the newest of them, which is audited first.
+    The replies come from the folder ``cache``, if it is named, and are compared with the stored
+    ones. Raises UsageError.
     """
     opened = nullcontext() if cache is None else closing(ResponseCache(cache, read_only=True))
     with audited_database(path) as connection, opened as named_cache:
@@ -207,8 +208,8 @@ def _replayable(
 ) -> list[TrialSpec]:
     """Return the audited trials whose stored spec equals the planned one.
 
-    A spec that differs in what follows from the sweep's configuration is a finding; trials that
-    another version of the program made are a note.
+    A spec that differs only in OF_THE_PROGRAM comes from another version of the program or other
+    data, and adds to a note. Any other difference is a finding.
     """
     hashes = dict(connection.execute("SELECT trial_id, spec_hash FROM audited").fetchall())
     stored = dict(connection.execute("SELECT spec_hash, spec::VARCHAR FROM specs").fetchall())
@@ -337,7 +338,7 @@ def _findings(
         yield Finding(kind, text, sweep_id, key[0], missing.side, missing.number)
         return
     if record.failed_calls and kind == "cache":
-        return  # which holds no call without an answer
+        return  # the cache's ``get`` returns answered calls alone: a failed one is not found
     ignored = {"cached"} | ({"error"} if failed else set())  # the reason of a failure, in words
     if kind == "replay":
         ignored |= {name.removeprefix("calls.") for name in NOT_REPLAYED}

@@ -98,7 +98,7 @@ async def run(
             store, rounds = Store(db), None
             player: Player = replay
             if plan.entries and not options.sends_nothing:
-                # A replay has no client, whose modules take a tenth of its start.
+                # Imported here, since that takes long, and a replay needs no clients.
                 from merge_runner.run.clients import open_rounds
                 from merge_runner.run.players import open_player
 
@@ -197,9 +197,10 @@ def _has_replies(cache: ResponseCache, plan: Plan) -> bool:
 
 
 def _recorded_part(plan: Plan, recordings: Sequence[Path]) -> Plan:
-    """Return the part of a plan that recordings hold; all of it if they do not name a sweep.
+    """Return the part of a plan that recordings hold.
 
-    A sweep of first decisions can be played from the recording of the whole study, too.
+    It is the whole plan if they do not name its sweep, or hold none of its trials. A sweep of first
+    decisions can be played from the recording of the whole study, too.
     """
     from merge_runner.results.recorded_sweeps import recorded_part
 

@@ -248,8 +248,10 @@ def _notes(study: StudyResults, by: str) -> Iterator[str]:
         return
     yield (
         "levels are compared within the cells that both have; a cell is a condition with one level "
-        "of each other factor. Shares are compared by the test of Mantel and Haenszel, with its "
-        "score interval; means by Welch's test, in a model with an intercept for each cell. An "
+        "of each other factor. If the driver under study is on the right, its condition is the "
+        "mirrored one, another cell unless both vehicles start alike. Shares are compared by the "
+        "test of Mantel and Haenszel, with its score interval; means by Welch's test, in a model "
+        "with an intercept for each cell. An "
         "interaction (×) is a level's difference from its reference, minus the same difference at "
         "the reference of the other factor, in the cells that all four have"
     )
@@ -463,6 +465,6 @@ def balance(study: StudyResults, levels: list[Level]) -> str:
     if played == every:
         return same
     return (
-        f"{same} for who goes first, which is read from both sides of equal drivers; for "
-        f"other measures they share {len(played)}"
+        f"{same} for who goes first, where trials of equal drivers also count in the mirrored "
+        f"cell; for other measures they share {len(played)}"
     )

@@ -208,9 +208,9 @@ def test_a_note_says_which_cells_only_who_goes_first_has(prepare, tmp_path):
     (tmp_path / "hurry.toml").write_text(conditions)
     prepare(tmp_path, "sweep", "hurry.toml", "--db", "t.duckdb", *FAST, code=0)
     study = StudyResults(tmp_path / "t.duckdb")
-    note = "every level has the same 2 cells for who goes first, which is read from both sides"
+    note = "every level has the same 2 cells for who goes first, where trials of equal drivers"
     assert (
-        f"hurry: {note} of equal drivers; for other measures they share 1"
+        f"hurry: {note} also count in the mirrored cell; for other measures they share 1"
         in made(study, "effects").notes
     )
     found = {one.metric.name: one.at_level.n for one in effects(study)}
