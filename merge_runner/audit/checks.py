@@ -7,7 +7,6 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from importlib.resources import files
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -54,7 +53,6 @@ JOIN drivers USING (trial_id, spec_hash) SEMI JOIN audited USING (trial_id, spec
 GROUP BY driver, variant, model, spec_hash ORDER BY ALL
 """  # noqa: S608 # constants
 REPLIES = "SELECT rowid, reply::VARCHAR FROM calls WHERE rowid IN (SELECT unnest(?))"
-CALL_FINDINGS = ("served_findings", "attempt_findings", "exchanged_findings", "shared_findings")
 OF_MOCKS = "attempts answered by a mock model"
 """The column of ``counts`` with the replies of mock models."""
 FINDINGS_SHOWN = 20
@@ -117,11 +115,22 @@ class Audit:
             yield f"  and {number - FINDINGS_SHOWN} more, all of them with --json"
 
 
+def _queries(file: str) -> dict[str, str]:
+    """Return the blocks of an SQL file of this package by name; the first block has none."""
+    blocks = Path(__file__).with_name(file).read_text("utf-8").split("\n\n")[1:]
+    return {block[3 : block.index(":")]: block.rstrip(";\n") for block in blocks}
+
+
+CHECKS, FACTS, REST = map(_queries, ("checks.sql", "facts.sql", "rest.sql"))
+OF_CALLS = ("served_findings", "attempt_findings", "exchanged_findings", "shared_findings")
+CALL_FINDINGS = [CHECKS[name] for name in OF_CALLS]
+
+
 @contextmanager
 def audited_database(
     path: Path, sweep_id: str | None = None
 ) -> Iterator[duckdb.DuckDBPyConnection]:
-    """Open a database with the views of checks.sql and the replies of one sweep, or of all.
+    """Open a database with the tables of checks.sql and the replies of one sweep, or of all.
 
     Raises UsageError or StoreError.
     """
@@ -135,11 +144,11 @@ def audited_database(
 
 
 def prepare(connection: duckdb.DuckDBPyConnection, sweep_id: str | None = None) -> None:
-    """Create the views of checks.sql, and read the reply ids of a sweep, or of all.
+    """Create the tables of checks.sql, and read the reply ids of a sweep, or of all.
 
     Replies whose id is repeated are compared.
     """
-    make_views(connection, "checks.sql")
+    connection.execute(CHECKS["tables"])
     append(connection, "other_models", other_models(connection))
     connection.execute("SET VARIABLE sweep_id = ?", [sweep_id])
     [(longest, _)] = connection.execute(SIZES).fetchall()
@@ -147,13 +156,13 @@ def prepare(connection: duckdb.DuckDBPyConnection, sweep_id: str | None = None) 
     step = max(1, PARSED_BYTES // longest if longest > LONG_REPLY else rows)
     for first in range(0, rows, step):
         span = f"SET VARIABLE first_row = {first}; SET VARIABLE last_row = {first + step - 1}"
-        connection.execute(f"{span}; INSERT INTO ids FROM read_ids")
-    connection.execute("INSERT INTO reply_ids FROM identified")
-    rowids = [rowid for (rowid,) in connection.execute("FROM repeated_replies").fetchall()]
+        connection.execute(f"{span}; {CHECKS['ids']}")
+    connection.execute(CHECKS["reply_ids"])
+    rowids = [rowid for (rowid,) in connection.execute(CHECKS["repeated_replies"]).fetchall()]
     for first in range(0, len(rowids), REPLIES_AT_ONCE):  # a chunk is in memory at once
         replies = connection.execute(REPLIES, [rowids[first : first + REPLIES_AT_ONCE]]).fetchall()
         append(connection, "contents", [(rowid, _content(reply)) for rowid, reply in replies])
-    connection.execute("INSERT INTO repeated_ids FROM repeating")
+    connection.execute(CHECKS["repeated_ids"])
 
 
 def _content(reply: str) -> str:
@@ -168,20 +177,15 @@ def _content(reply: str) -> str:
     return hashlib.blake2b(answer, digest_size=16).hexdigest()
 
 
-def make_views(connection: duckdb.DuckDBPyConnection, file: str) -> None:
-    """Create the views of an SQL file of this package."""
-    connection.execute(files("merge_runner.audit").joinpath(file).read_text("utf-8"))
-
-
 def sweep_facts(connection: duckdb.DuckDBPyConnection, sweep_id: str) -> dict[str, Any]:
     """Count a sweep's trials, decisions and replies in an audited database."""
     connection.execute("SET VARIABLE sweep_id = ?", [sweep_id])
-    make_views(connection, "facts.sql")
-    facts = next(by_name(connection.execute("FROM decided")))
+    connection.execute(FACTS["tables"])
+    facts = next(by_name(connection.execute(FACTS["decided"])))
     for name in ("outcomes", "failed", "others", "stand_ins", "same_prompts"):
-        facts[name] = connection.execute(f"FROM {name}").fetchall()
+        facts[name] = connection.execute(FACTS[name]).fetchall()
     for name in ("levels", "first_looks"):
-        facts[name] = list(by_name(connection.execute(f"FROM {name}")))
+        facts[name] = list(by_name(connection.execute(FACTS[name])))
     return facts
 
 
@@ -201,8 +205,8 @@ def check_sweep(
     append(connection, "subject", [(sweep_id, finished, bool(planned))])
     append(connection, "planned", planned)
     connection.execute(TRIALS)
-    counts = {"trials": len(planned), **next(by_name(connection.execute("FROM counts")))}
-    findings = findings_of(connection, ("list_findings", *CALL_FINDINGS), sweep_id)
+    counts = {"trials": len(planned), **next(by_name(connection.execute(CHECKS["counts"])))}
+    findings = findings_of(connection, (CHECKS["list_findings"], *CALL_FINDINGS), sweep_id)
     notes = [*notes_of(connection, counts)]
     missing, failed = counts["missing"], counts["failed"]
     if not finished and missing + failed:
@@ -217,22 +221,21 @@ def check_rest(connection: duckdb.DuckDBPyConnection, path: Path) -> Audit:
     connection.execute(
         "CREATE OR REPLACE TEMP TABLE audited AS SELECT trial_id, spec_hash FROM trials"
     )
-    make_views(connection, "rest.sql")
     sql = """
         FROM (SELECT count(*) AS sweeps FROM sweeps), (SELECT count(*) AS trials,
             count(*) FILTER (source = 'human') AS "human trials" FROM trials)
     """
     counts = next(by_name(connection.execute(sql)))
-    shared = connection.execute("FROM calls_in_common").fetchall()
+    shared = connection.execute(REST["calls_in_common"]).fetchall()
     notes = [f"{first} and {second} share {calls} calls" for first, second, calls in shared]
-    return Audit(str(path), counts, findings_of(connection, ["orphans"]), notes)
+    return Audit(str(path), counts, findings_of(connection, [REST["orphans"]]), notes)
 
 
 def findings_of(
-    connection: duckdb.DuckDBPyConnection, views: Iterable[str], sweep_id: str | None = None
+    connection: duckdb.DuckDBPyConnection, queries: Iterable[str], sweep_id: str | None = None
 ) -> list[Finding]:
-    """Return the rows of the views, one query each: a joint query would need their joint memory."""
-    selects = (f"SELECT DISTINCT * FROM {view} ORDER BY ALL" for view in views)  # noqa: S608 # constants
+    """Return the rows of the queries, one by one: a joint query would need their joint memory."""
+    selects = (f"SELECT DISTINCT * FROM ({query}) ORDER BY ALL" for query in queries)  # noqa: S608 # constants
     rows = [row for select in selects for row in by_name(connection.execute(select))]
     return [
         Finding(r["kind"], r["text"], sweep_id, r["trial_id"], r.get("side"), r.get("decision"))
@@ -242,9 +245,9 @@ def findings_of(
 
 def notes_of(connection: duckdb.DuckDBPyConnection, counts: Mapping[str, int]) -> Iterator[str]:
     """Yield the notes of an audit with these ``counts``."""
-    yield from (text for (text,) in connection.execute("FROM notes").fetchall())
+    yield from (text for (text,) in connection.execute(CHECKS["notes"]).fetchall())
     if not counts[OF_MOCKS]:  # the emulator has only a few phrases
-        [(answers,)] = connection.execute("FROM alike").fetchall()
+        [(answers,)] = connection.execute(CHECKS["alike"]).fetchall()
         if answers:
             yield (
                 f"all {answers} replies to prompts that were asked before are word for word as "

@@ -1,7 +1,9 @@
--- Checks that a replay cannot make. The views read the tables of a database and these: the audited
--- sweep, its planned trials (if subject.known), its list of trials, the planned ones that it does not
--- list (elsewhere: another sweep played it after this one stopped), its stored trials, the trials that
--- were audited before, and pairs of models that do not match.
+-- Checks that a replay cannot make. Each block is a query by name: DuckDB would plan a view twice.
+
+-- tables: the audited sweep, its planned trials (if subject.known), its list of trials, the planned
+-- ones that it does not list (elsewhere: another sweep played it after this one stopped), its stored
+-- trials, the trials that were audited before, and pairs of models that do not match; then the ids of
+-- replies, and the requests that they name; hashes of the answers whose id another call has too.
 CREATE OR REPLACE TEMP TABLE subject (sweep_id VARCHAR, finished BOOLEAN, known BOOLEAN);
 CREATE OR REPLACE TEMP TABLE planned (trial_id VARCHAR, spec_hash VARCHAR);
 CREATE OR REPLACE TEMP TABLE linked (trial_id VARCHAR, spec_hash VARCHAR, links BIGINT);
@@ -10,10 +12,16 @@ CREATE OR REPLACE TEMP TABLE audited AS SELECT trial_id, spec_hash FROM trials L
 CREATE OR REPLACE TEMP TABLE done AS FROM audited;
 CREATE OR REPLACE TEMP TABLE drivers AS SELECT trial_id, spec_hash, driver FROM trial_drivers;
 CREATE OR REPLACE TEMP TABLE other_models (model_requested VARCHAR, model_served VARCHAR);
+CREATE OR REPLACE TEMP TABLE ids (call_rowid BIGINT, reply_id VARCHAR, answered JSON);
+CREATE OR REPLACE TEMP TABLE reply_ids (
+    call_rowid BIGINT, trial_id VARCHAR, spec_hash VARCHAR, side VARCHAR, decision INTEGER,
+    call_key VARCHAR, provider VARCHAR, model_requested VARCHAR, endpoint VARCHAR, reply_id VARCHAR);
+CREATE OR REPLACE TEMP TABLE contents (call_rowid BIGINT, content VARCHAR);
+CREATE OR REPLACE TEMP TABLE repeated_ids (
+    endpoint VARCHAR, model_requested VARCHAR, reply_id VARCHAR, telling BOOLEAN);
+CREATE OR REPLACE TEMP MACRO text_of(json) AS if(json_type(json) = 'VARCHAR', json->>'$', NULL);
 
--- The sweep's list of trials.
-
-CREATE OR REPLACE TEMP VIEW list_findings AS
+-- list_findings: faults of the sweep's list of trials.
 SELECT 'missing' AS kind, trial_id, 'it was not played' AS text
 FROM unplayed WHERE NOT elsewhere AND (SELECT finished FROM subject)
 UNION ALL SELECT 'failed', trial_id, coalesce(error, 'it failed')
@@ -30,10 +38,7 @@ FROM sweeps SEMI JOIN subject USING (sweep_id)
 WHERE json_valid(config) AND sweep_id <> concat_ws(
     '-', name, config->>'$.model', strftime(started_at, '%Y%m%dT%H%M%S%f'));
 
--- Calls and their replies.
-
-CREATE OR REPLACE TEMP VIEW served_findings AS
--- One finding for each pair of models, at its first reply.
+-- served_findings: one for each pair of models, at its first reply.
 SELECT 'served' AS kind, arg_min(trial_id, (trial_id, decision, side)) AS trial_id,
     arg_min(side, (trial_id, decision, side)) AS side,
     arg_min(decision, (trial_id, decision, side)) AS decision,
@@ -43,8 +48,7 @@ FROM calls SEMI JOIN audited USING (trial_id, spec_hash)
 SEMI JOIN other_models USING (model_requested, model_served)
 WHERE http_status = 200 GROUP BY model_requested, model_served;
 
--- An empty reply may be requested again; any other reply is the last attempt.
-CREATE OR REPLACE TEMP VIEW attempt_findings AS
+-- attempt_findings: an empty reply may be requested again; any other reply is the last attempt.
 SELECT 'attempt' AS kind, trial_id, side, decision, text FROM (
     SELECT trial_id, side, decision, CASE
         WHEN list(attempt ORDER BY attempt) <> range(1, count(*) + 1)
@@ -55,10 +59,10 @@ SELECT 'attempt' AS kind, trial_id, side, decision, text FROM (
     GROUP BY trial_id, spec_hash, side, decision, call_key
 ) WHERE text IS NOT NULL;
 
--- The ids of the replies of the sweep in the variable sweep_id, or of all, and the requests that they
--- name, are read once and without any other column, from first_row to last_row: replies may be long.
-CREATE OR REPLACE TEMP MACRO text_of(json) AS if(json_type(json) = 'VARCHAR', json->>'$', NULL);
-CREATE OR REPLACE TEMP VIEW read_ids AS
+-- ids: of the replies of the sweep in the variable sweep_id, or of all, and the requests that they
+-- name. They are read once and without any other column, from first_row to last_row: replies may be
+-- long.
+INSERT INTO ids
 SELECT call_rowid, coalesce(nullif(text_of(members[1]), ''), text_of(members[2])) AS reply_id,
     members[3] AS answered
 FROM (
@@ -68,10 +72,8 @@ FROM (
     AND (getvariable('sweep_id') IS NULL OR (trial_id, spec_hash) IN (
         SELECT (trial_id, spec_hash) FROM sweep_trials WHERE sweep_id = getvariable('sweep_id')))
 ) WHERE reply_id IS NOT NULL OR answered IS NOT NULL;
-CREATE OR REPLACE TEMP TABLE ids AS FROM read_ids LIMIT 0;
 
--- Each reply of the emulator names the request that it answers.
-CREATE OR REPLACE TEMP VIEW exchanged_findings AS
+-- exchanged_findings: each reply of the emulator names the request that it answers.
 SELECT 'exchanged' AS kind, trial_id, calls.side, calls.decision,
     'its reply names another request' AS text
 FROM calls JOIN (FROM ids WHERE answered IS NOT NULL) ON calls.rowid = call_rowid
@@ -82,27 +84,24 @@ WHERE answered->>'$.body_sha256' <> sha256(request::VARCHAR)
         <> [condition, rep::VARCHAR, calls.side, calls.decision::VARCHAR, sample_set::VARCHAR]
     AND json_type(answered, '$.slot') = 'OBJECT';
 
--- They are compared within an endpoint: two emulators give equal requests equal ids.
-CREATE OR REPLACE TEMP VIEW identified AS
+-- reply_ids: they are compared within an endpoint, since two emulators give equal requests equal ids.
+INSERT INTO reply_ids
 SELECT call_rowid, calls.trial_id, calls.spec_hash, calls.side, decision, call_key, provider,
     model_requested,
     coalesce(json_extract_string(spec, '$.' || side || '.endpoint'), '') AS endpoint, reply_id
 FROM calls JOIN ids ON calls.rowid = call_rowid LEFT JOIN specs USING (spec_hash)
 WHERE http_status = 200 AND reply_id IS NOT NULL;
-CREATE OR REPLACE TEMP TABLE reply_ids AS FROM identified LIMIT 0;
 
--- The replies whose id another call has too, and a hash of the answer of each.
-CREATE OR REPLACE TEMP VIEW repeated_replies AS
+-- repeated_replies: the replies whose id another call has too.
 SELECT call_rowid FROM reply_ids SEMI JOIN (
     SELECT endpoint, model_requested, reply_id FROM reply_ids
     GROUP BY ALL HAVING min(call_key) <> max(call_key)
 ) USING (endpoint, model_requested, reply_id) ORDER BY call_rowid;
-CREATE OR REPLACE TEMP TABLE contents (call_rowid BIGINT, content VARCHAR);
 
--- Some servers draw ids out of a thousand, or have only one. An id with different answers proves
--- nothing; neither does an id of a server most of whose repeated ids are such, nor an id of a local
--- server, which need not be unique.
-CREATE OR REPLACE TEMP VIEW repeating AS
+-- repeated_ids: some servers draw ids out of a thousand, or have only one. An id with different answers
+-- proves nothing; neither does an id of a server most of whose repeated ids are such, nor an id of a
+-- local server, which need not be unique.
+INSERT INTO repeated_ids
 SELECT endpoint, model_requested, reply_id, same AND provider <> 'local'
     AND count(*) FILTER (same) OVER server >= count(*) FILTER (NOT same) OVER server AS telling
 FROM (
@@ -110,30 +109,28 @@ FROM (
         min(content) = max(content) AS same
     FROM reply_ids JOIN contents USING (call_rowid) GROUP BY ALL
 ) WINDOW server AS (PARTITION BY endpoint, model_requested);
-CREATE OR REPLACE TEMP TABLE repeated_ids AS FROM repeating LIMIT 0;
 
--- Two slots of one spec with one call, and two calls of any spec with one reply: a caching proxy
--- answers a repetition, or a new sample set, with an old reply. Drivers of a study may make the same
--- request in the same slot: that is no finding.
-CREATE OR REPLACE TEMP VIEW shared AS
-SELECT 'shares its call with' AS text,
-    list(DISTINCT (trial_id, side, decision) ORDER BY (trial_id, side, decision)) AS places,
-    list(DISTINCT (trial_id, spec_hash)) AS trials
-FROM decisions SEMI JOIN (
-    SELECT call_key FROM decisions GROUP BY call_key HAVING count(*) > 1
-) USING (call_key) JOIN drivers USING (trial_id, spec_hash)
-GROUP BY spec_hash, driver, call_key HAVING count(*) > 1
-UNION ALL SELECT 'shares its reply, and the provider''s id of it, with',
-    list(place ORDER BY place), list(DISTINCT trial)
-FROM (
-    SELECT endpoint, model_requested, reply_id, min((trial_id, side, decision)) AS place,
-        arg_min((trial_id, spec_hash), (trial_id, side, decision)) AS trial
-    FROM reply_ids SEMI JOIN (FROM repeated_ids WHERE telling)
-        USING (endpoint, model_requested, reply_id)
-    GROUP BY endpoint, model_requested, reply_id, call_key
-) GROUP BY endpoint, model_requested, reply_id;
-
-CREATE OR REPLACE TEMP VIEW shared_findings AS
+-- shared_findings: two slots of one spec with one call, and two calls of any spec with one reply: a
+-- caching proxy answers a repetition, or a new sample set, with an old reply. Drivers of a study may
+-- make the same request in the same slot: that is no finding.
+WITH shared AS (
+    SELECT 'shares its call with' AS text,
+        list(DISTINCT (trial_id, side, decision) ORDER BY (trial_id, side, decision)) AS places,
+        list(DISTINCT (trial_id, spec_hash)) AS trials
+    FROM decisions SEMI JOIN (
+        SELECT call_key FROM decisions GROUP BY call_key HAVING count(*) > 1
+    ) USING (call_key) JOIN drivers USING (trial_id, spec_hash)
+    GROUP BY spec_hash, driver, call_key HAVING count(*) > 1
+    UNION ALL SELECT 'shares its reply, and the provider''s id of it, with',
+        list(place ORDER BY place), list(DISTINCT trial)
+    FROM (
+        SELECT endpoint, model_requested, reply_id, min((trial_id, side, decision)) AS place,
+            arg_min((trial_id, spec_hash), (trial_id, side, decision)) AS trial
+        FROM reply_ids SEMI JOIN (FROM repeated_ids WHERE telling)
+            USING (endpoint, model_requested, reply_id)
+        GROUP BY endpoint, model_requested, reply_id, call_key
+    ) GROUP BY endpoint, model_requested, reply_id
+)
 SELECT 'shared' AS kind, places[1][1] AS trial_id, places[1][2] AS side, places[1][3] AS decision,
     format('{} {}{}', text, array_to_string(
         [format('{}, {}, decision {}', p[1], p[2], p[3]) FOR p IN places[2:4]], '; '),
@@ -142,12 +139,9 @@ FROM shared WHERE len(places) > 1
     AND list_has_any(trials, (SELECT list((trial_id, spec_hash)) FROM audited))
     AND NOT coalesce(list_has_any(trials, (SELECT list((trial_id, spec_hash)) FROM done)), false);
 
--- Notes, no findings.
-
--- Number of replies to repeated prompts, if all of them are identical and there are at least five. A
--- model that samples does not only repeat replies. A caching proxy with new ids does, and so does a
--- model at temperature 0: in both cases the replies are no samples.
-CREATE OR REPLACE TEMP VIEW alike AS
+-- alike: number of replies to repeated prompts, if all of them are identical and there are at least
+-- five. A model that samples does not only repeat replies. A caching proxy with new ids does, and so
+-- does a model at temperature 0: in both cases the replies are no samples.
 SELECT if(count(*) FILTER (different > 1) = 0 AND sum(times - 1) >= 5, sum(times - 1), 0)::BIGINT
     AS answers
 FROM (
@@ -161,7 +155,7 @@ FROM (
     ) GROUP BY model_left, model_right, side, prompt_hash
 );
 
-CREATE OR REPLACE TEMP VIEW counts AS
+-- counts: numbers of what is checked.
 FROM (SELECT count(*) AS stored FROM linked SEMI JOIN trials USING (trial_id, spec_hash)),
     (SELECT count(*) FILTER (NOT elsewhere) AS missing FROM unplayed),
     (SELECT count(*) AS failed FROM linked
@@ -174,18 +168,17 @@ FROM (SELECT count(*) AS stored FROM linked SEMI JOIN trials USING (trial_id, sp
     (SELECT count(DISTINCT reply_id) AS "reply ids"
     FROM reply_ids SEMI JOIN audited USING (trial_id, spec_hash));
 
--- Trials of a run that earlier runs played: runs of the same name and drivers, which it resumes, or
--- other sweeps.
-CREATE OR REPLACE TEMP VIEW played_before AS
-SELECT DISTINCT trial_id, spec_hash, own.sweep_id, earlier.sweep_id AS earlier,
-    earlier.started_at AS began_at,
-    regexp_replace(own.sweep_id, '-[^-]*$', '') = regexp_replace(earlier.sweep_id, '-[^-]*$', '')
-        AS resumed
-FROM linked JOIN sweep_trials USING (trial_id, spec_hash) JOIN sweeps AS earlier USING (sweep_id),
-    subject JOIN sweeps AS own ON own.sweep_id = subject.sweep_id
-WHERE earlier.started_at < own.started_at;
-
-CREATE OR REPLACE TEMP VIEW notes AS
+-- notes: no findings. Earlier runs that played trials of this one are runs of the same name and
+-- drivers, which it resumes, or other sweeps.
+WITH played_before AS (
+    SELECT DISTINCT trial_id, spec_hash, own.sweep_id, earlier.sweep_id AS earlier,
+        earlier.started_at AS began_at,
+        regexp_replace(own.sweep_id, '-[^-]*$', '') = regexp_replace(earlier.sweep_id, '-[^-]*$', '')
+            AS resumed
+    FROM linked JOIN sweep_trials USING (trial_id, spec_hash) JOIN sweeps AS earlier USING (sweep_id),
+        subject JOIN sweeps AS own ON own.sweep_id = subject.sweep_id
+    WHERE earlier.started_at < own.started_at
+)
 SELECT format('goes on from {} of {}: {} of its trials were stored before',
     if(count(DISTINCT earlier) = 1, 'the run', format('{} runs, the first', count(DISTINCT earlier))),
     strftime(min(began_at), '%Y-%m-%d %H:%M'), count(DISTINCT (trial_id, spec_hash)))

@@ -1,14 +1,14 @@
--- Facts of a sweep's summary. The views read the trials of the sweep in the variable sweep_id, and two
--- tables of checks.sql: drivers and other_models.
+-- Facts of a sweep's summary. Each block is a query by name; they read the tables of checks.sql.
+
+-- tables: the trials of the sweep in the variable sweep_id.
 CREATE OR REPLACE TEMP TABLE played AS
 FROM trials SEMI JOIN (FROM sweep_trials WHERE sweep_id = getvariable('sweep_id'))
     USING (trial_id, spec_hash);
 
-CREATE OR REPLACE TEMP VIEW outcomes AS
+-- outcomes: numbers of trials by status.
 SELECT status, count(*) AS trials FROM played GROUP BY ALL ORDER BY ALL;
 
--- Outcomes by condition, in total, and by level of each factor.
-CREATE OR REPLACE TEMP VIEW levels AS
+-- levels: outcomes by condition, in total, and by level of each factor.
 SELECT factor, value AS level, count(*) AS trials,
     count(*) FILTER (status = 'finished' AND merged_first = 'left') AS "left first",
     count(*) FILTER (status = 'finished' AND merged_first = 'right') AS "right first",
@@ -22,25 +22,22 @@ FROM played JOIN (
 ) USING (trial_id, spec_hash)
 GROUP BY ALL ORDER BY ALL;
 
-CREATE OR REPLACE TEMP VIEW failed AS
+-- failed: why each of them did.
 SELECT trial_id, error FROM played WHERE status = 'failed' ORDER BY ALL;
 
--- Replies of another model than requested.
-CREATE OR REPLACE TEMP VIEW others AS
+-- others: replies of another model than requested.
 SELECT model_requested, model_served, count(*) AS answers FROM calls
 SEMI JOIN played USING (trial_id, spec_hash) SEMI JOIN other_models USING (model_requested, model_served)
 WHERE http_status = 200 GROUP BY ALL ORDER BY ALL;
 
--- Drivers with replies of a mock model: these replies, and all replies.
-CREATE OR REPLACE TEMP VIEW stand_ins AS
+-- stand_ins: drivers with replies of a mock model: these replies, and all replies.
 SELECT driver_name(model, spec->>('$.' || side || '.endpoint')) AS driver, model, provider,
     count(*) FILTER (attempts.scripted) AS scripted, count(*) AS answers
 FROM attempts LEFT JOIN specs USING (spec_hash) SEMI JOIN played USING (trial_id, spec_hash)
 WHERE fate IN ('driven', 'fallback')
 GROUP BY ALL HAVING bool_or(attempts.scripted) ORDER BY ALL;
 
--- Prompt variants with identical trials of mock models, which read nothing that differs.
-CREATE OR REPLACE TEMP VIEW same_prompts AS
+-- same_prompts: variants with identical trials of mock models, which read nothing that differs.
 WITH driven AS (
     SELECT trial_id, spec_hash, sum(hash(step, side, position_m)) AS trace
     FROM states SEMI JOIN (
@@ -57,16 +54,15 @@ WITH driven AS (
 SELECT list(variant ORDER BY variant) AS variants
 FROM prompts GROUP BY trials HAVING count(*) > 1 ORDER BY ALL;
 
-CREATE OR REPLACE TEMP VIEW decided AS
+-- decided: numbers of decisions.
 SELECT count(*) AS decisions, count(*) FILTER (NOT valid) AS invalid,
     count(*) FILTER (fallback) AS fallbacks,
     count(*) FILTER (failure = 'no_decision') AS no_decision
 FROM decisions SEMI JOIN played USING (trial_id, spec_hash);
 
--- First decisions without the closed loop. The velocity is the driver's minus the other's. The action
--- is the net acceleration over the first step, for an invalid reply the fallback's. The share of
--- M is that among replies with a tactical decision.
-CREATE OR REPLACE TEMP VIEW first_looks AS
+-- first_looks: first decisions without the closed loop. The velocity is the driver's minus the other's.
+-- The action is the net acceleration over the first step, for an invalid reply the fallback's. The
+-- share of M is that among replies with a tactical decision.
 WITH asked AS (FROM played WHERE source = 'first_decision' AND status <> 'failed')
 SELECT driver, variant, if(side = 'left', model_left, model_right) AS model, side,
     if(side = 'left', 1, -1) * relative_velocity_mps + 0 AS relative_velocity_mps,

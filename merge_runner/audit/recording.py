@@ -11,6 +11,7 @@ import duckdb
 
 from merge_runner.audit.checks import (
     CALL_FINDINGS,
+    CHECKS,
     Audit,
     Finding,
     findings_of,
@@ -47,7 +48,7 @@ def audit_recording(file: Path) -> Audit:
         append(connection, "sweeps", rows)  # for the aliases of models
         prepare(connection)
         connection.execute("INSERT INTO audited SELECT trial_id, spec_hash FROM trials")
-        counts = next(by_name(connection.execute("FROM counts")))
+        counts = next(by_name(connection.execute(CHECKS["counts"])))
         shown = {name: counts[name] for name in ("calls", "attempts", "reply ids")}
         findings = findings_of(connection, CALL_FINDINGS)
         return Audit(str(file), shown, findings, notes=[*notes_of(connection, counts)])

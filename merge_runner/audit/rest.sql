@@ -1,7 +1,6 @@
--- Checks of a whole database. The views read its tables and those of checks.sql.
+-- Checks of a whole database. Each block is a query by name; they read the tables of checks.sql, too.
 
--- Orphan rows of the whole database; a spec's hash is the hash of its text.
-CREATE OR REPLACE TEMP VIEW orphans AS
+-- orphans: rows that belong to nothing; a spec's hash is the hash of its text.
 SELECT 'orphan' AS kind, trial_id, 'no sweep has this trial' AS text FROM trials
 ANTI JOIN sweep_trials USING (trial_id, spec_hash) WHERE source <> 'human'
 UNION ALL SELECT 'orphan', trial_id, 'its spec is not stored' FROM trials
@@ -18,8 +17,7 @@ FROM (
 UNION ALL SELECT 'spec', NULL, format('the spec stored as {} has another hash', spec_hash)
 FROM specs WHERE left(sha256(spec::VARCHAR), 16) <> spec_hash;
 
--- Identical requests of the same slot.
-CREATE OR REPLACE TEMP VIEW calls_in_common AS
+-- calls_in_common: identical requests of the same slot.
 WITH used AS (
     SELECT DISTINCT call_key, spec_hash, driver || '/' || variant AS name
     FROM decisions JOIN trials USING (trial_id, spec_hash)
@@ -33,4 +31,3 @@ WHERE (a.name, a.spec_hash) < (b.name, b.spec_hash)
     AND (a.spec_hash IN (SELECT spec_hash FROM audited)
         OR b.spec_hash IN (SELECT spec_hash FROM audited))
 GROUP BY a.name, a.spec_hash, b.name, b.spec_hash ORDER BY ALL;
-

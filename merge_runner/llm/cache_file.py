@@ -76,13 +76,14 @@ class TextDisk(diskcache.Disk):  # type: ignore[misc] # diskcache ships no types
         """Do nothing: no row of merge-runner names a file."""
 
 
-def open_texts(folder: Path) -> diskcache.Cache:
+def open_texts(folder: Path, *, durable: bool = True) -> diskcache.Cache:
     """Return the diskcache of a folder, and create its file if there is none.
 
     Its triggers, which count rows and bytes for an eviction, would cost four statements for each
     reply: they are dropped. Rows are counted on closing, and none has a size.
     """
-    texts = diskcache.Cache(str(folder), timeout=BUSY_S, disk=TextDisk, **SETTINGS)
+    settings = SETTINGS if durable else SETTINGS | {"sqlite_synchronous": 0}
+    texts = diskcache.Cache(str(folder), timeout=BUSY_S, disk=TextDisk, **settings)
     triggers = "SELECT name FROM sqlite_master WHERE type = 'trigger' AND tbl_name = 'Cache'"
     if names := texts._sql(triggers).fetchall():
         with texts.transact(retry=True):
@@ -134,10 +135,13 @@ def make(folder: Path) -> None:
         return
     with folder_lock(folder), tempfile.TemporaryDirectory(prefix="new-", dir=folder) as new:
         if not (folder / FILE).exists():
-            with closing(open_texts(Path(new))) as made, made.transact():
-                made.set(FORMAT_KEY, FORMAT)
-                for statement in CREATE_TABLES:
-                    made._sql(statement)
+            with closing(open_texts(Path(new), durable=False)) as made:
+                # The next commit makes all that was written before durable, too.
+                made.reset("sqlite_synchronous", SETTINGS["sqlite_synchronous"])
+                with made.transact():
+                    made.set(FORMAT_KEY, FORMAT)
+                    for statement in CREATE_TABLES:
+                        made._sql(statement)
             os.replace(Path(new) / FILE, folder / FILE)
 
 

@@ -14,7 +14,7 @@ import hashlib
 import os
 import sqlite3
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, closing
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -109,12 +109,24 @@ class CacheFile:
             prepare(folder, read_only=read_only, allow_previous=allow_previous)
             self._opened = self._file
             self._one_query = Lock()
-            with ExitStack() as unless_opened:
-                self.reading = unless_opened.enter_context(closing(connect(folder / FILE)))
-                self.texts: Any = None if read_only else open_texts(folder)
-                unless_opened.pop_all()
+            self.reading = connect(folder / FILE)
         except FAILURES as exc:
-            raise UsageError(f"the cache {folder} cannot be used: {exc}. {NEW_CACHE}") from exc
+            raise self._unusable(exc) from exc
+        if read_only:
+            self.texts = None
+
+    @cached_property
+    def texts(self) -> Any:  # noqa: ANN401 # diskcache ships no types
+        """The folder's diskcache, opened by the first write.
+
+        To open it takes a dozen durable writes, and a replay writes nothing. Raises UsageError, or
+        FileNotFoundError for a file that was removed: diskcache would make another one.
+        """
+        self._require_file()
+        try:
+            return open_texts(self.folder)
+        except FAILURES as exc:
+            raise self._unusable(exc) from exc
 
     def rows(self, sql: str, *values: object, execute: Execute | None = None) -> Rows:
         """Return the rows of a query; with ``execute``, as its transaction sees them.
@@ -135,8 +147,7 @@ class CacheFile:
             with self.texts.transact():
                 execute, self.summed = self.texts._sql, None
                 results = [operation(execute) for operation in operations]
-                if self._file != self._opened:
-                    raise FileNotFoundError("it is no longer there")
+                self._require_file()
                 return results
         except (diskcache.Timeout, *FAILURES) as exc:
             # On a full disk SQLite rolls back: diskcache's ROLLBACK then fails, and hides why.
@@ -161,13 +172,16 @@ class CacheFile:
         self.closing.close()
         self.locks.close()
         self.reading.close()  # before ``texts``: the last to close ends the journal
-        if self.texts is not None:
-            close_texts(self.texts)
+        if (texts := vars(self).get("texts")) is not None:
+            close_texts(texts)
 
     def _close_connection(self) -> None:
         """Close the writing thread's connection: a finished thread does not close it."""
-        if self.texts is not None:
-            self.texts.close()
+        if (texts := vars(self).get("texts")) is not None:
+            texts.close()
+
+    def _unusable(self, why: BaseException) -> UsageError:
+        return UsageError(f"the cache {self.folder} cannot be used: {why}. {NEW_CACHE}")
 
     def failure(self, done: str, why: BaseException) -> CacheFailed | RecordingError:
         """Return the error for a folder that cannot be read or written, or for invalid text."""
@@ -180,6 +194,10 @@ class CacheFile:
             f"the cache {self.folder} {reason}. When that is mended, or a copy of it put back, "
             "run the same command again: what is in no cache is asked again"
         )
+
+    def _require_file(self) -> None:
+        if self._file != self._opened:
+            raise FileNotFoundError("it is no longer there")
 
     @property
     def _file(self) -> tuple[int, int] | None:

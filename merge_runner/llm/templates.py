@@ -23,6 +23,7 @@ NEWER = """
 SELECT rowid, mode, filename, CAST(value AS BLOB) FROM Cache WHERE rowid > ? AND raw = 1
 AND length(key) = 64 AND NOT instr(key, ' ') AND typeof(value) = 'text' ORDER BY rowid LIMIT ?
 """
+LAST = "SELECT coalesce(max(last), 0) FROM kinds"
 COLUMNS = "provider, endpoint, model, path, body, own"
 TABLE = f"""
 CREATE TABLE IF NOT EXISTS kinds (
@@ -89,11 +90,19 @@ def count_by_template(calls: Iterable[tuple[ChatRequest, Attempt]]) -> TemplateC
 def answer_counts(cache: ResponseCache) -> tuple[TemplateCounts, TemplateCounts]:
     """Return the counts of the recording and of the folder, whose newer calls are counted first."""
     after = 0
-    while after := cache.run_now([partial(_count_newer, after)])[0]:
+    while _has_newer(cache) and (after := cache.run_now([partial(_count_newer, after)])[0]):
         pass
     rows = cache.rows("SELECT * FROM kinds")
     folder = {RequestTemplate(*row[:6]): AnswerCounts(*row[6:10]) for row in rows}
     return cache.recording[1], folder
+
+
+def _has_newer(cache: ResponseCache) -> bool:
+    """Return whether a call is not counted yet: only then the folder is written."""
+    if not cache.rows("SELECT 1 FROM sqlite_master WHERE name = 'kinds'"):
+        return True
+    ((last,),) = cache.rows(LAST)
+    return bool(cache.rows(NEWER, last, 1))
 
 
 def _count_newer(after: int, execute: Execute) -> int:
@@ -103,7 +112,7 @@ def _count_newer(after: int, execute: Execute) -> int:
     after which to go on, 0 at the end.
     """
     execute(TABLE)
-    ((last,),) = execute("SELECT coalesce(max(last), 0) FROM kinds").fetchall()
+    ((last,),) = execute(LAST).fetchall()
     rows = execute(NEWER, (max(last, after), BATCH)).fetchall()
     calls = []
     for _, mode, filename, value in rows:

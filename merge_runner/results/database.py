@@ -127,10 +127,11 @@ def open_database(
     try:
         if reading is not None:
             reading.uses(connection)
-        # An earlier user of the instance may have called limit_memory.
+        # An earlier user of the instance may have called limit_memory and merge_small_groups.
         connection.execute(
             f"USE {name}; SET memory_limit = '{SETTINGS['memory_limit']}'; "
-            f"SET threads = {SETTINGS['threads']}"
+            f"SET threads = {SETTINGS['threads']}; "
+            f"SET max_vacuum_tasks = {SETTINGS['max_vacuum_tasks']}"
         )
         yield connection
         is_detached = _detach(connection, name)

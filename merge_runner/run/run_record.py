@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from merge_runner.errors import MergeRunnerError, NoValidDecision, StoreError
 from merge_runner.paths import DEFAULT_DB, command_at
 from merge_runner.records import canonical_json
 from merge_runner.results.database import in_thread
-from merge_runner.results.provenance import git_state, versions
+from merge_runner.results.provenance import versions
 from merge_runner.results.store import Store
 from merge_runner.run.guard import FirstDecisions
 from merge_runner.run.session import Session
@@ -20,11 +19,10 @@ from merge_runner.run.session import Session
 SHOWN = 5  # findings
 
 
-async def begin(session: Session, store: Store) -> str:
-    """Store the row of a run that begins, and return its id."""
+def begin(session: Session, store: Store, commit: str, *, dirty: bool | None) -> str:
+    """Store the row of a run that begins, and return its id; for its commit see ``git_state``."""
     plan, options, cap = session.plan, session.options, session.ledger.cap
     started_at = datetime.now(UTC).replace(tzinfo=None)
-    commit, dirty = await asyncio.to_thread(git_state)
     sweep_id = f"{plan.name}-{plan.model}-{started_at:%Y%m%dT%H%M%S%f}"
     config = {
         **plan.model_dump(mode="json"),

@@ -101,6 +101,7 @@ async def open_session(
                 resolve_endpoint(name, entry)  # raises where its key is missing
         cap = _cap(plan, options, cache, say, is_open=bool(todo) and not options.replay)
         if live:
+            cache.run_now([])  # raises before anything is asked if it cannot be written
             models = plan.entries.items()
             cache.locks.take({f"{e.id} at {plan.endpoints[name]}" for name, e in models})
         ledger = Ledger(cache, plan.ledger, cap)

@@ -17,6 +17,7 @@ from merge_runner.paths import SHIPPED_RECORDINGS
 from merge_runner.providers import UNNAMED
 from merge_runner.registry import using
 from merge_runner.results.database import unreadable_is_usage
+from merge_runner.results.provenance import git_state
 from merge_runner.results.replay_misses import described
 from merge_runner.results.store import Store
 from merge_runner.run.estimate import Estimate, earlier_answers, estimate, usual_latencies_s
@@ -95,6 +96,8 @@ async def run(
         )
     else:
         async with AsyncExitStack() as stack:
+            # While git reads the checkout, DuckDB makes the database.
+            git = asyncio.get_running_loop().run_in_executor(None, git_state)
             store, rounds = Store(db), None
             player: Player = replay
             if plan.entries and not options.sends_nothing:
@@ -105,8 +108,9 @@ async def run(
                 rounds = open_rounds(plan, options, session.cache, session.say)
                 player = await open_player(session, store, rounds, stack)
             progress = _progress(session, player, rounds)
+            commit, dirty = await git
             with unreadable_is_usage():
-                sweep_id = await begin(session, store)
+                sweep_id = begin(session, store, commit, dirty=dirty)
             shown = show_progress(progress, db, sweep_id, quiet=options.quiet)
             await stack.enter_async_context(shown)
             batch_bytes = BATCH_BYTES if options.replay else LIVE_BATCH_BYTES

@@ -206,6 +206,7 @@ async def test_a_put_that_is_cancelled_or_cannot_be_kept_disturbs_no_other(cache
 
 
 async def test_a_write_that_fails_is_told_to_all_who_wait(cache, folder):
+    cache.run_now([])  # diskcache makes a missing table when it is opened
     with sqlite3.connect(folder / "cache.db") as database:
         database.execute("DROP TABLE Cache")
     writing = (keep(cache, entry(1)), keep(cache, entry(2)))

@@ -112,7 +112,8 @@ def played(*, trials, n, ended, human=(True, False)):
     of = replace(driver("a", collisions=crashes, **others), facts={"trials": trials})
     cells = [{"ended": number} for number in ended]
     humans = [{"ended": 90} if is_so else None for is_so in human]
-    return of, {"rows": [(of, cells)], "humans": humans}
+    names = ["L_4_0", "N_0_0"]
+    return of, {"names": names, "rows": [(of, cells)], "humans": humans}
 
 
 @pytest.mark.parametrize(
