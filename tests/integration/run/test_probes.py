@@ -139,7 +139,7 @@ async def test_situations_that_cannot_be_asked_are_refused_before_anything_is(
         assert server.requests == 0
     assert not (tmp_path / "results").exists()
     told = " ".join((await merge_runner(*FIRST, "--help")).out.split())
-    assert f"usual: {USUAL_GRID}" in told
+    assert f"`--grid usual` is {USUAL_GRID}" in told
 
 
 async def wordless(request: web.Request, handler) -> web.StreamResponse:
