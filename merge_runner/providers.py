@@ -278,8 +278,8 @@ def normalised_url(url: str, named: str = "base_url") -> str:
     parts = http_url(url.strip())
     if parts is None or "@" in parts.netloc or parts.query or parts.fragment:
         raise UsageError(
-            f"{named} is no base URL: it must begin with http:// or https:// and name a host that "
-            "there can be, without spaces, a user name, a password or a part after ? or # (write "
+            f"{named} is no base URL: it must begin with http:// or https:// and name a possible "
+            "host, without spaces, a user name, a password or a part after ? or # (write "
             "other letters than ASCII as xn--..., and a key into the provider's variable)"
         )
     default_port = ":443" if parts.scheme == "https" else ":80"

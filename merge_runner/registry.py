@@ -76,7 +76,7 @@ class Registry(Mapping[str, T]):
         """Add a thing, and return it.
 
         It belongs to the study whose plug-in registers it. Raise UsageError if the name is taken or
-        invalid, or if neither a study nor an installed package registers it.
+        invalid, or if plug-ins were looked up before and none of them registers it.
         """
         if not NAME.fullmatch(name):
             raise UsageError(f"the {self.kind} {name!r} needs a name of letters, digits, _ - and .")

@@ -447,7 +447,7 @@ def _enough(verdicts: Mapping[str, Values]) -> bool:
 
 
 def _too_few(drivers: Mapping[str, Mapping[str, Values]], *, alone: bool) -> str:
-    """Return how many trials of each driver had no crash, of those that ended."""
+    """Return how many trials of each driver finished, of those that ended."""
     counts = [
         f"{'' if alone else name} {_finished(of)} of {_ended(of['collisions'])}".strip()
         for name, of in drivers.items()

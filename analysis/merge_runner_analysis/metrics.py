@@ -129,7 +129,7 @@ LEFT_FIRST = Metric(
     label="goes first",
     unit="%",
     meaning="share of finished trials in which the driver under study merged first (the ego; of "
-    "two equal drivers the one with the words, else the left one)",
+    "two equal drivers the one that alone gets words, else the left one, or half for each)",
     value="merged_first = 'left'",
     estimator="proportion",
     shown=False,

@@ -60,7 +60,7 @@ VERDICT_RULES = (
     "corrected test, lies within 5 points, or 1 m",
     "Same tendency as people (who goes first): the one ahead or, side by side, the slower "
     "one goes first more often, with p below .05 in a logistic regression (Firth) over all trials "
-    "that finished, not by the counts; and no difference is shown",
+    "that finished, not by the counts; and no difference from people is shown",
     "More, fewer, larger, smaller, weaker or stronger: a difference is shown, with p below .05, "
     "corrected (Holm) for all tests of a driver{tests}; of a tendency, in that regression's slope",
     "Cannot tell: neither is shown",
@@ -69,8 +69,8 @@ VERDICT_RULES = (
 FITTED_RULE = (
     "Same tendency as people in the gap by headway: more headway, more gap, with p below .05 in a "
     "linear regression. Like people in the gap by relative velocity: it moves the gap by less than "
-    "1 m; in accelerations held: within half a standard deviation of people. Unlike people's in "
-    "these two: a difference is shown"
+    "1 m. Like people in how accelerations are held (I5): within half a standard deviation of "
+    "people. Unlike people's in the last two: a value beyond these bounds is shown"
 )
 VERDICT_RULE = ". ".join((*VERDICT_RULES, FITTED_RULE)).format(tests="")
 # Measures that the first page shows, with its headings.
@@ -130,8 +130,8 @@ EGO = (
     "goes first is counted for the driver under study",
 )
 HALVES = (
-    "Where two equal drivers get the same, a trial counts half for each, so that the share in "
-    "these trials is 50 % by construction"
+    "Where two equal drivers get the same, a trial counts half for each: the share in these trials "
+    "is 50 %, but for a half whose situation the other level lacks"
 )
 UNREADABLE = "the stored study cannot be read by this version"
 # Note on levels that no driver reads.
@@ -339,7 +339,7 @@ MEASURES = {
             '5 %; not as with people: "within 1 m" is rejected, corrected p below .05',
             "the gap of {it} differs by up to {driver} m by who is faster, people's by {people} m",
             (0.0, 3.0),
-            {UNLIKE: "its gap differs by up to {of} m by who is faster"},
+            {UNLIKE: "its gap differs by up to {of} m by who is faster, people's by {humans} m"},
             margin=1.0,
         ),
         Measure(

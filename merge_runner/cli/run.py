@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from merge_runner.run.plan import Plan
 
 STUDIES = (
-    "A study: experiments/NAME.toml, or a path; default: baseline. In a replay, also a recording, "
-    "FILE.parquet. Several are played one after the other."
+    "A study: a path, or one of experiments (baseline, the default; ablations; reference). In a "
+    "replay, also a recording, FILE.parquet. Several are played one after the other."
 )
 MIRROR = "Play pairs of different drivers in both positions."
 GRID = (

@@ -221,7 +221,7 @@ def _open_gap(
     ``share`` is the leader's part of the distance that is missing.
     """
     lead = situation.projected_lead_m if goes_first else -situation.projected_lead_m
-    # A leader that is less than a metre ahead, or behind, misses more, so that it acts at once.
+    # Below a lead of one metre, what lacks to it is added, so that the leader acts at once.
     missing_m = gap_m + situation.vehicle_length - lead + max(0.0, 1.0 - lead)
     if goes_first:
         push = _even_acceleration(

@@ -12,9 +12,9 @@ for its reply.
 
 The worst case of an attempt is reserved in this process while it waits for its turn, and in the
 ledger right before it is sent. A server may ignore the output cap. So an attempt joins others in
-flight only if the cap, less what is spent, covers twice the largest worst case for it and for each
-of them. If no reply costs more than that, only an attempt that is alone in flight can exceed the
-cap.
+flight only if what is left beyond all reservations covers the largest worst case once more for each
+of them. Then replies that exceed their reservations by no more than that stay under the cap; an
+attempt that is alone in flight can exceed it.
 """
 
 from __future__ import annotations

@@ -77,7 +77,7 @@ def shutdown_notes(entries: Mapping[str, ModelEntry], today: date) -> Iterator[s
         days = (entry.shutdown - today).days
         closes = f"{name} closes in {days} day{'s' * (days != 1)}, on {entry.shutdown}"
         if days <= 0:
-            note = f"WARNING: {name} closed on {entry.shutdown}: only a recording answers for it"
+            note = f"WARNING: {name} closed on {entry.shutdown}: only a recording has its replies"
         elif days <= SOON_DAYS:
             note = f"WARNING: {closes}: record it now (docs/recordings.md)"
         else:

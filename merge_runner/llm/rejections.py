@@ -17,7 +17,7 @@ REASONS = {
     "not_allowed": "the endpoint does not accept the key; set {key} to a valid one",
     "unknown_model": "the endpoint has no model {id!r}; see `merge-runner models`, or {base_url}",
     "path_twice": "the base URL ends as the path begins (such as with /v1), so that this part is "
-    "there twice: take it out of {base_url}",
+    "there twice: {base_url}",
     "proxy_refused": "the proxy (HTTPS_PROXY, HTTP_PROXY or ALL_PROXY) lets nothing through, and "
     "nothing was sent: give its URL a user name and a password if it asks for them (407), have it "
     "allow the host, or name the host in NO_PROXY",
@@ -37,7 +37,7 @@ REASONS = {
     "llama.cpp: --reasoning-format none), or let the model think, as `chat_template_kwargs = "
     "{{ enable_thinking = true }}` among `parameters` of {place} does",
 }
-# A transient fault may look like these: only several mean the configuration.
+# A transient fault may look like these: only if they come again is the configuration wrong.
 UNSURE = frozenset({"other_error", "text", "unreadable_reply", "proxy_refused"})
 # A repeated part of a path, as in /v1/v1/messages.
 _TWICE = re.compile(r"(/\w.*)\1(/|$)")

@@ -161,8 +161,8 @@ CREATE TABLE decisions (
 );
 COMMENT ON TABLE decisions IS 'One row per driver and decision instant.';
 COMMENT ON COLUMN decisions.decision IS 'number of the instant at this driver''s rate, 0 at the '
-    'start of control; higher at first if the driver leaves its tunnel later (control_start = '
-    '"own_exit")';
+    'start of control; a driver that leaves its tunnel later (control_start = "own_exit") begins '
+    'with a higher number';
 COMMENT ON COLUMN decisions.valid IS 'whether the reply holds a valid plan';
 COMMENT ON COLUMN decisions.failure IS 'why the plan is invalid; no_decision: the plan is valid, '
     'but the requested tactical decision is missing';
@@ -320,8 +320,8 @@ FROM (
 ) USING (trial_id, spec_hash)
 WHERE source <> 'human';
 COMMENT ON VIEW trial_levels IS 'One row per driven trial and factor: factors of trial_factors '
-    'without text factors, and model and prompt. The level of the factor model is the driver that '
-    'meets an opponent; without an opponent it is the pair, A+B, the ego first.';
+    'without text factors, and model and prompt. The level of the factor model is the driver; of two '
+    'different ones without a factor opponent it is the pair, A+B, the ego first.';
 COMMENT ON COLUMN trial_levels.factor IS 'name in the study''s file, or model, or prompt';
 
 CREATE VIEW attempts AS

@@ -93,4 +93,4 @@ def estimate_lines(expected: Estimate) -> Iterator[str]:
     yield f"cost    {cost}"
     yield from _by_model(expected)
     yield from _by_cap(expected)
-    yield f"time    about {time}"
+    yield f"time    about {time}{'' if expected.rounds else ' for these calls'}"

@@ -225,7 +225,7 @@ def test_under_own_exit_alone_the_driver_in_the_tunnel_is_not_asked():
     assert right_rows[6].acceleration_mps2 == -2.5
     # Who waits for number 0 would never begin: the comment says what is counted.
     (comment,) = re.findall(r"decisions\.decision IS (.*?);\n", SCHEMA.read_text(), re.DOTALL)
-    assert "higher at first if the driver leaves its tunnel later" in comment
+    assert "a driver that leaves its tunnel later" in comment
 
 
 FINE = {"step_s": 0.05, "plan_step_s": 0.2}

@@ -60,7 +60,7 @@ def effects_figure(study: StudyResults) -> Figure:
         if metric is LEFT_FIRST:
             axis.axvline(EVEN, color=GREY, ls=":", lw=0.8)
         _limit(axis, 0.0 if metric.rate else metric.least, 100.0 if metric.unit == "%" else None)
-    for axis in axes[len(metrics) :]:
+    for axis in axes[max(1, len(metrics)) :]:
         axis.set_visible(False)
     axes[0].set_yticks(range(len(lines)), [wrapped(name, LABEL) for name in lines])
     axes[0].set_ylim(max(len(lines), 1) - 0.5, -0.5)

@@ -171,7 +171,7 @@ def _distinct(study: StudyResults, levels: list[Level]) -> list[Level]:
 
 
 def _with_copies(study: StudyResults, group: Group) -> Iterator[Iterable[Cell]]:
-    """Yield cells that are copies of each other; a mock model has single equal trials by chance."""
+    """Yield cells that are copies of each other; of a mock model only if all trials are equal."""
     if not group.scripted:
         yield from (cells for _, cells in group.trials.groupby(["condition", "way"])["cell"])
         return
@@ -204,7 +204,7 @@ def _without_copies(level: Level, first: Callable[[tuple[str, ...]], tuple[str, 
 
 
 def _once(every: pd.DataFrame, *, scripted: bool) -> pd.DataFrame:
-    """Return the trials once; a mock model's are copies only if the other levels are equal."""
+    """Return the trials once; a mock model's are copies only at equal levels of other factors."""
     others = pd.Series([" ".join(others) for _, *others in every["cell"]], every.index)
     way = every["way"] + (" " + others if scripted else "")
     for _, rows in every.groupby(others):

@@ -217,8 +217,8 @@ class Fit:
         """Return starts that lead to all maxima, perhaps with a term held: (starts, terms).
 
         With few trials there are several maxima. Some starts give two of the conditions
-        even chances, as near to the fit as that allows, measured by its information. Others are
-        scaled down to 0, where the likelihood is always known.
+        a chance of 50 % each, as near to the fit as that allows, measured by its information.
+        Others are multiples of the fit (SCALES); at 0 the likelihood is always known.
         """
         fixed = np.eye(len(self.b))[[] if term is None else [term]]
         pairs = self.counts.design[[*combinations(range(len(self.counts.design)), 2)]]
@@ -256,9 +256,10 @@ class Term:
 class Regression:
     """A fit to ``n`` trials; ``problem`` says why there are no terms, ``remark`` is a caution.
 
-    ``freedom`` is infinite where tests are normal. For gaps, ``equivalence_p`` tests that relative
-    velocity alone moves them by less than GAP_MARGIN_M: None without two played conditions that
-    differ only in it. ``velocity_p`` tests that it has no effect: None where errors are singular.
+    ``freedom`` is infinite where tests are normal. For gaps, a small ``equivalence_p`` shows that
+    relative velocity alone moves them by less than GAP_MARGIN_M: None without two played conditions
+    that differ only in it. A small ``velocity_p`` shows that it has an effect: None where errors
+    are singular.
     """
 
     n: int
@@ -320,13 +321,13 @@ class Moved:
 
     @property
     def within_p(self) -> float:
-        """The p-value that all are below the margin: the largest of two one-sided tests each."""
+        """A small p shows that all are below the margin: the largest p of two one-sided tests."""
         pairs = zip(self.sizes.tolist(), self.errors.tolist(), strict=True)
         return max(equivalence_p(size, se, self.freedom) for size, se in pairs)
 
     @property
     def beyond_p(self) -> float:
-        """The p-value that one is above the margin; the interval of 1 - p begins at the margin."""
+        """A small p shows that one is above the margin; the interval of 1 - p begins there."""
         above = self.sizes > GAP_MARGIN_M
         with np.errstate(divide="ignore"):
             ratio = (self.sizes[above] - GAP_MARGIN_M) / self.errors[above]

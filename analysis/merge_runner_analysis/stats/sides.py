@@ -45,13 +45,16 @@ def level_estimate(study: StudyResults, level: Level, metric: Metric) -> Estimat
 
 
 def cells_seen(study: StudyResults, level: Level) -> set[Cell]:
-    """Return the cells of a level's ended trials, with the mirrored cells of equal drivers."""
+    """Return the cells of a level's ended trials as who goes first has them.
+
+    Where sides count, a cell has the side, and equal drivers the mirrored cells, too.
+    """
     trials = level.pooled.ended
-    seen = {*trials["cell"]}
-    if one_sided(study):
-        same = trials.loc[have_same_prompts(trials), "cell"].unique()
-        seen |= {(_mirrored(study, condition), *others) for condition, *others in same}
-    return seen
+    if not one_sided(study):
+        return {*trials["cell"]}
+    same = trials.loc[have_same_prompts(trials), "cell"].unique()
+    images = {(_mirrored(study, condition), *others, "right") for condition, *others in same}
+    return images | {(*cell, ego) for cell, ego in zip(trials["cell"], trials["ego"], strict=True)}
 
 
 def have_same_prompts(trials: pd.DataFrame) -> pd.Series:

@@ -174,8 +174,8 @@ def hits(group: Group, measure: str) -> pd.Series:
 def _went_first(outcomes: pd.DataFrame, measure: str) -> pd.Series:
     """Return by trial whether the expected vehicle went first.
 
-    For "headway" it is the one ahead, without trials that start side by side; for "velocity" the
-    slower one in these trials alone.
+    For "headway" it is the one projected to be ahead, without trials side by side at the merge
+    point; for "velocity" the slower one in these trials alone.
     """
     headway, velocity = (np.sign(outcomes[name]) for name in CONDITION)
     expected = headway if measure == "headway" else -velocity.where(headway == 0, 0)

@@ -29,7 +29,7 @@ from merge_runner_analysis.stats.effects import (
 from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.levels import DRIVER, Level, copied_of_shared, levels_by_factor
 from merge_runner_analysis.stats.measures import undecided_note
-from merge_runner_analysis.stats.sides import cells_seen, level_estimate
+from merge_runner_analysis.stats.sides import cells_seen, level_estimate, one_sided
 from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Value, interval
 from merge_runner_analysis.wording import (
@@ -56,6 +56,7 @@ DIFFERENCE = (
     Optional("p_corrected", "p, corr.", "p", "corrected by Holm"),
     Optional("detectable", "detectable", "number", "at p < .05 with power .8"),
 )
+SIDED = ", and for who goes first one side of the driver under study"
 WORDS_SHOWN = 80  # characters of a level's words
 GIVEN_TO = {
     "both": "to both drivers",
@@ -248,8 +249,7 @@ def _notes(study: StudyResults, by: str) -> Iterator[str]:
         return
     yield (
         "levels are compared within the cells that both have; a cell is a condition with one level "
-        "of each other factor. If the driver under study is on the right, its condition is the "
-        "mirrored one, another cell unless both vehicles start alike. Shares are compared by the "
+        f"of each other factor{SIDED * one_sided(study)}. Shares are compared by the "
         "test of Mantel and Haenszel, with its score interval; means by Welch's test, in a model "
         "with an intercept for each cell. An "
         "interaction (×) is a level's difference from its reference, minus the same difference at "
@@ -466,5 +466,5 @@ def balance(study: StudyResults, levels: list[Level]) -> str:
         return same
     return (
         f"{same} for who goes first, where trials of equal drivers also count in the mirrored "
-        f"cell; for other measures they share {len(played)}"
+        f"cell of the other side; for other measures they share {len(played)}"
     )

@@ -47,10 +47,11 @@ def gap(study: StudyResults) -> Table:
             )
         ],
         (
-            "of all terms with relative velocity together: equiv. p, that the predicted gaps of "
-            "any two played conditions that differ in relative velocity alone are less than "
-            f"{GAP_MARGIN_M:g} m apart (two one-sided tests of each with HC3 errors, the largest "
-            "p: a small one shows it); joint p, that none of them has an effect",
+            "equiv. p and joint p, where they can be computed, are of all terms with relative "
+            "velocity: equiv. p, that the predicted gaps of any two played conditions that differ "
+            f"in relative velocity alone are less than {GAP_MARGIN_M:g} m apart (two one-sided "
+            "tests of each with HC3 errors, the largest p: a small one shows it); joint p, that "
+            "none of them has an effect",
             TESTED_ELSEWHERE,
             *mixed_note(study, "S6", mean100),
         ),

@@ -57,8 +57,8 @@ def _of_trials(table: Table, study: StudyResults) -> Iterator[str]:
         for group in groups:
             if unknown := _without_humans(group):
                 yield (
-                    f"{group.id}: no human drove {', '.join(unknown)}: differences from the "
-                    f"humans leave out these {unknown.total()} trials"
+                    f"{group.id}: no human drove {', '.join(unknown)}: any difference "
+                    f"from the humans leaves out these {unknown.total()} trials"
                 )
     if counts := [f"{g.id}: {g.repeated} of {len(g.stored.trials)}" for g in groups if g.repeated]:
         yield (

@@ -135,8 +135,9 @@ def report_html(study: StudyResults, tables: list[Table], figures: dict[str, str
         headline = f"{apart.claim} {headline}"
     question = answer_of(made.get("effects"), made.get("levels"))
     views, numbers = _views(study, tables)
-    if study.groups == study.baselines:  # it would stand there twice
-        figures = {name: data for name, data in figures.items() if name != "figure2-variants"}
+    left_out = {"figure2-variants"} if study.groups == study.baselines else set()  # there already
+    left_out |= {"effects"} - {name for name, table in made.items() if table.rows}
+    figures = {name: data for name, data in figures.items() if name not in left_out}
     inlined = inlined_texts([STYLE])
     templates = environment(Links(lambda _: ""), policy_of(inlined), inlined)
     return templates.get_template("report.html").render(

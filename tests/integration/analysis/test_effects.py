@@ -210,8 +210,8 @@ def test_a_note_says_which_cells_only_who_goes_first_has(prepare, tmp_path):
     study = StudyResults(tmp_path / "t.duckdb")
     note = "every level has the same 2 cells for who goes first, where trials of equal drivers"
     assert (
-        f"hurry: {note} also count in the mirrored cell; for other measures they share 1"
-        in made(study, "effects").notes
+        f"hurry: {note} also count in the mirrored cell of the other side; for other measures they "
+        "share 1" in made(study, "effects").notes
     )
     found = {one.metric.name: one.at_level.n for one in effects(study)}
     assert (found["left_first_percent"], found["collided_percent"]) == (4, 2)

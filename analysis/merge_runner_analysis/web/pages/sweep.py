@@ -41,7 +41,7 @@ TRUST = [
         ("wrong model", "others", "answers", "answers, counted in each trial",
          "it is neither the one asked for nor a declared alias of it", {}),
         ("reused replies", "shared", "replies", "replies, each counted once",
-         "one reply decided in several trials, which are no separate samples there", {}),
+         "one reply decided in several trials: at these decisions they are one sample", {}),
     )
 ]  # fmt: skip
 
