@@ -154,10 +154,9 @@ def verdict_rules(drivers: Sequence[Driver], gap: Mapping[str, Any]) -> list[str
         MEASURES[name].label
         for of in drivers
         for name, cell in of.cells.items()
-        if name not in HEADINGS and cell.values.get("p_holm") is not None
+        if cell.values.get("p_holm") is not None
     )
-    besides = f", also {'; '.join(labels)}" if labels else ""
-    numbers = f" ({ends}{besides})" if ends else ""
+    numbers = f" ({ends}: {'; '.join(labels)})" if ends else ""
     likeness, *others = (rule.format(tests=numbers) for rule in VERDICT_RULES)
     low, high = gap.get("ci") or (0.0, 0.0)
     if (half := (high - low) / 2) > MARGINS["gap"] / 2:

@@ -67,10 +67,13 @@ JUDGED = {"gap": {"state": OPEN, "n": 30, "ended": 30}}
     ("drivers", "text"),
     [
         ([JUDGED], "all tests of a driver;"),
-        ([JUDGED | {"headway": {"p_holm": 0.3}}], "all tests of a driver (1);"),
+        (
+            [JUDGED | {"headway": {"p_holm": 0.3}}],
+            "all tests of a driver (1: who goes first, by who is ahead);",
+        ),
         (
             [JUDGED | {"headway": {"p_holm": 0.3}}, JUDGED, {"gap": {"p_holm": 0.3}}],
-            "all tests of a driver (0 to 1);",
+            "all tests of a driver (0 to 1: who goes first, by who is ahead; mean gap);",
         ),
     ],
 )
