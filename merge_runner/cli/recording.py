@@ -50,7 +50,10 @@ def recording_export(
         rows, keys = sweeps_to_export(db, named, opened.has_all)
         sweep_ids = " and ".join(row["sweep_id"] for row in rows)
         if not keys:
-            raise UsageError(f"the sweep {sweep_ids} made no call: there is nothing to record")
+            raise UsageError(
+                f"the sweep {sweep_ids} made no call: there is nothing to record; --sweep ID names "
+                "another"
+            )
         provenance = provenance_of(rows)
         calls = export_recording(file, opened, keys, provenance)
     say(f"{calls} calls of {sweep_ids} are in {file}")

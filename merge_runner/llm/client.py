@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from merge_runner.llm.batch.rounds import BatchSender
 
 NO_ROOM = "calls: the cap leaves money for few trials at a time"
-NO_MONEY = "for calls in flight to be paid, under the cap"
+NO_MONEY = "until calls in flight are paid: the cap leaves no money for more at once"
 
 
 @dataclass(slots=True)
