@@ -4,7 +4,7 @@ from merge_runner.results.store import query
 from tests.support.harness import PROJECT
 
 PAGE = PROJECT / "docs/reference-drivers.md"
-SAID = "gaps of {:.1f} m (`highway-env`) and {:.1f} m (`treiber-kesting`) on the average"
+SAID = "gaps of {:.1f} m (`highway-env`) and {:.1f} m (`treiber-kesting`) on average"
 # No vehicle is ahead when the first reaches the merge point: who yields is drawn.
 TIED = "L_0_-8,N_0_0,R_0_8"
 GAPS = """

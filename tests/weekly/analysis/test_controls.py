@@ -31,10 +31,8 @@ def test_the_docs_print_what_the_controls_give():
         for row in controls.candidates_table().splitlines()[2:]
     ]
     *_, gini, gain = [f"{min(of):.2f} to {max(of):.2f}" for of in areas]
-    assert (
-        f"with noise of up to {max(NOISES_MPS)} m/s, the gain's area under the ROC curve is {gain}."
-        in text
-    )
+    assert f"On simulated profiles with noise of up to {max(NOISES_MPS)} m/s, the gain" in text
+    assert f"the area under its ROC curve is {gain}." in text
     assert f"For Gini's coefficient of |Δa| the area is {gini}." in text
     clocked = [float(row.split("|")[3].split(",")[0]) for row in _steady(controls.clock_table())]
     held = [gain for gain in clocked if gain > 0]
