@@ -99,7 +99,7 @@ def write_report(
                 path = files / f"{table.name}.{form.suffix}"
                 path.write_text(render([table], form) + "\n", encoding="utf-8")
                 yield path
-    text = report_html(study, tables, finished_figures(study, say))
+    text = report_html(study, tables, finished_figures(study, figures_of(study, tables), say))
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(text, encoding="utf-8")
@@ -108,9 +108,20 @@ def write_report(
     yield out
 
 
-def finished_figures(study: StudyResults, say: Callable[[str], object] = str) -> dict[str, str]:
-    """Return every figure by name as SVG in Base64: the stored one, else a new drawing."""
-    files = {name: f"{name}.svg" for name in FIGURES}  # a table may have the name alone
+def figures_of(study: StudyResults, tables: Iterable[Table]) -> list[str]:
+    """Return the names of the figures that show something else than the others."""
+    with_rows = {table.name for table in tables if table.rows}
+    left_out = {"effects"} - with_rows
+    if study.groups == study.baselines:
+        left_out.add("figure2-variants")
+    return [name for name in FIGURES if name not in left_out]
+
+
+def finished_figures(
+    study: StudyResults, names: Iterable[str] = FIGURES, say: Callable[[str], object] = str
+) -> dict[str, str]:
+    """Return figures by name as SVG in Base64: the stored ones, else new drawings."""
+    files = {name: f"{name}.svg" for name in names}  # a table may have the name alone
     figures = finished(study.db, study.state, study.options, [*files.values()])
     drawn = {}
     for name, file in files.items():
@@ -135,9 +146,6 @@ def report_html(study: StudyResults, tables: list[Table], figures: dict[str, str
         headline = f"{apart.claim} {headline}"
     question = answer_of(made.get("effects"), made.get("levels"))
     views, numbers = _views(study, tables)
-    left_out = {"figure2-variants"} if study.groups == study.baselines else set()  # there already
-    left_out |= {"effects"} - {name for name, table in made.items() if table.rows}
-    figures = {name: data for name, data in figures.items() if name not in left_out}
     inlined = inlined_texts([STYLE])
     templates = environment(Links(lambda _: ""), policy_of(inlined), inlined)
     return templates.get_template("report.html").render(
