@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import compress
 from typing import Any, NamedTuple
 
 import pandas as pd
@@ -165,10 +166,10 @@ def _source(
 @remembered
 def _rows(group: Group, rests_on: str) -> list[tuple[Any, str, str, str]]:
     """Return (label, trial, spec, condition) of each trial that rows of a table may rest on."""
-    known = {STORED: group.trials, ENDED: group.ended, FINISHED: group.finished}
-    rows = known.get(rests_on, group.trials)
-    counted = slice(None) if rests_on in known else rows[rests_on].notna()
-    return [*rows.loc[counted, [*KEYS, "condition"]].itertuples(name=None)]
+    if rests_on in (STORED, ENDED, FINISHED):
+        rows = {STORED: group.trials, ENDED: group.ended, FINISHED: group.finished}[rests_on]
+        return [*rows[[*KEYS, "condition"]].itertuples(name=None)]
+    return [*compress(_rows(group, STORED), group.trials[rests_on].notna())]
 
 
 def _query(group: Group, trials: Sequence[str]) -> str:

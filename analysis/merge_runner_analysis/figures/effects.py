@@ -11,6 +11,7 @@ from merge_runner_analysis.figures.style import (
     GREY,
     LINE_IN,
     PAGE_IN,
+    choose_ticks,
     draw_points,
     place,
     style,
@@ -72,6 +73,7 @@ def effects_figure(study: StudyResults) -> Figure:
     ]
     if handles:
         figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False)
+    choose_ticks(*(axis.xaxis for axis in axes))
     place(figure)
     return figure
 

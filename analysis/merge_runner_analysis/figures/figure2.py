@@ -22,6 +22,7 @@ from merge_runner_analysis.figures.style import (
     PAGE_IN,
     Points,
     Style,
+    choose_ticks,
     draw_points,
     place,
     style,
@@ -107,11 +108,8 @@ def figure2(study: StudyResults, chosen: list[Group]) -> Figure:
     figure.legend(
         handles=handles, loc="outside lower center", ncols=min(len(handles), 6), frameon=False
     )
-    # The ticks of a column, which all rows share, are chosen once: to draw takes a third less.
-    for axis in (part for panel in axes[0] for part in (panel.xaxis, panel.yaxis)):
-        low, high = axis.get_view_interval()
-        ticks = [tick for tick in axis.get_majorticklocs() if low <= tick <= high]
-        axis.set_ticks(ticks, axis.get_major_formatter().format_ticks(ticks))
+    for panel in axes[0]:  # which all rows share
+        choose_ticks(panel.xaxis, panel.yaxis)
     place(figure, axes)
     return figure
 

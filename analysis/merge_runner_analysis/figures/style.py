@@ -8,6 +8,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.markers import TICKDOWN
@@ -54,13 +55,21 @@ def wrapped(text: str, width: int) -> str:
     return "\n".join(line.strip() for line in lines)
 
 
+def choose_ticks(*axes: Axis) -> None:
+    """Choose the ticks once: to draw takes a third less."""
+    for axis in axes:
+        low, high = axis.get_view_interval()
+        ticks = [tick for tick in axis.get_majorticklocs() if low <= tick <= high]
+        axis.set_ticks(ticks, axis.get_major_formatter().format_ticks(ticks))
+
+
 def place(figure: Figure, grid: NDArray[Any] = NO_GRID) -> None:
     """Lay a figure out once: matplotlib would do so at each drawing, and draw it once more.
 
     The inner panels of a ``grid`` with shared scales are aligned with the outer ones. The ticks of
     an x axis that has no labels are one line: each axis takes as long to draw as all else.
     """
-    inner = grid[1:-1, 1:]
+    inner = grid[1:, 1:]
     for panel in inner.flat:
         panel.set_in_layout(False)
     engine = figure.get_layout_engine()

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from bisect import bisect_left
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
 from math import hypot, sqrt
@@ -21,6 +22,7 @@ from merge_runner_analysis.stats.score_interval import Z
 # Where less of a trial's deviation is left over than this, it alone decides the difference.
 LEVERAGE = 1e-9
 NEAREST = 1e-9  # to a difference, of what it may be instead
+PARTS = 2**40  # of a distance, as exact as a place in it is
 LARGEST_Z = 30.0  # of this quantile p is 0 to 190 digits
 Z_WITH_POWER = Z + float(special.ndtri(POWER))
 Array = NDArray[np.float64]
@@ -86,7 +88,7 @@ class Cells:
         # The test of no difference says on which side of 0 the end lies.
         if sign * value < 0 and sign * near < 0:
             far, near = (0.0, near) if beyond(0.0) > 0 else (far, 0.0)
-        return near if beyond(near) >= 0 else float(scipy.optimize.brentq(beyond, near, far))
+        return near if beyond(near) >= 0 else _crossing(beyond, near, far)
 
     @property
     def p(self) -> float:
@@ -150,10 +152,23 @@ def contrast_rates(cells: Cells) -> Estimate:
 
 
 def _detectable(cells: Cells, sign: int) -> float | None:
-    def missing(size: float) -> float:
-        return Z_WITH_POWER * sqrt(cells.variance(sign * size)) - size
+    def beyond(size: float) -> float:
+        return size - Z_WITH_POWER * sqrt(cells.variance(sign * size))
 
-    return None if missing(NEAREST) <= 0 else float(scipy.optimize.brentq(missing, NEAREST, 1.0))
+    return None if beyond(NEAREST) >= 0 else _crossing(beyond, NEAREST, 1.0)
+
+
+def _crossing(beyond: Callable[[float], float], near: float, far: float) -> float:
+    """Return the place between two where a value that is below 0 ``near`` reaches 0.
+
+    It is exact to a trillionth of the distance, as that of ``scipy.optimize``, which a page or a
+    report would import for this alone, in 0.15 s.
+    """
+
+    def place(part: int) -> float:
+        return near + (far - near) * part / PARTS
+
+    return place(bisect_left(range(PARTS), 0.0, key=lambda part: beyond(place(part))))
 
 
 def difference_of_contrasts(cells: Cells, others: Cells) -> Estimate:
@@ -168,12 +183,12 @@ def difference_of_contrasts(cells: Cells, others: Cells) -> Estimate:
         apart = (cells.end(sign, z) - differences[0], others.end(-sign, z) - differences[1])
         return hypot(*apart)
 
-    def left_out(z: float) -> float:
-        return abs(value) - half(-1 if value > 0 else 1, z)
+    def beyond(z: float) -> float:
+        return half(-1 if value > 0 else 1, z) - abs(value)
 
     z = LARGEST_Z if abs(value) > ROUNDING else 0.0
-    if z and left_out(z) <= 0:
-        z = float(scipy.optimize.brentq(left_out, 0.0, z))
+    if z and beyond(z) >= 0:
+        z = _crossing(beyond, 0.0, z)
     below, above = half(-1, Z), half(1, Z)
     least = Z_WITH_POWER / Z * min(below, above)
     se = least / Z_WITH_POWER if cells.variance(0) or others.variance(0) else 0.0

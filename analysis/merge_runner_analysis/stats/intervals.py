@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 from math import hypot, inf, sqrt
 
 import numpy as np
@@ -21,11 +22,6 @@ LEVEL = 0.95
 POWER = 0.8
 ROUNDING = 1e-12
 TINY = 1e-300
-# Points and weights of Gauss and Legendre's rule on 0 to 1, for chances.
-_POINTS, _SHARES = np.polynomial.legendre.leggauss(200)
-NODES, WEIGHTS = (1 + _POINTS) / 2, _SHARES / 2
-
-
 NOTHING = Estimate()
 
 
@@ -72,8 +68,16 @@ def _at_most(first: tuple[float, float], second: tuple[float, float]) -> Callabl
         if missed < ROUNDING:
             return lambda _: 1.0
         return lambda at: 1 - float(_beta(share * m + 1, missed, -at))
-    most = special.betaincinv(share * m + 1, missed, NODES) if missed > ROUNDING else 1 + 0 * NODES
-    return lambda at: float(WEIGHTS @ _beta(k, n - k + 1, most + at))
+    nodes, weights = _chances()
+    most = special.betaincinv(share * m + 1, missed, nodes) if missed > ROUNDING else 1 + 0 * nodes
+    return lambda at: float(weights @ _beta(k, n - k + 1, most + at))
+
+
+@cache
+def _chances() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return points and weights of Gauss and Legendre's rule on 0 to 1."""
+    points, weights = np.polynomial.legendre.leggauss(200)
+    return (1 + points) / 2, weights / 2
 
 
 def _beta(a: float, b: float, x: float | NDArray[np.float64]) -> NDArray[np.float64]:
