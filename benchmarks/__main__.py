@@ -14,6 +14,7 @@ from pathlib import Path
 from statistics import median
 
 from benchmarks.cases import (
+    MARGINAL,
     STUDIES,
     Bench,
     Case,
@@ -23,16 +24,18 @@ from benchmarks.cases import (
     cold_floor,
     committed_recording,
     import_humans,
+    imports,
     in_flight,
     in_flight_floor,
-    libraries,
     limited,
+    on_a_cache,
     paid,
     parts,
     record_many,
     replay,
     replay_many,
     resume,
+    short,
     start,
 )
 from benchmarks.explorer import explorer, explorer_floor, export, first_page
@@ -47,15 +50,26 @@ PEERS = (
     Case("inspect-ai, killed at half, resumed", 1, peer_resume),
 )
 CASES = (
-    Case("floor, 0 ms", 2, cold_floor(0)),
-    Case("cold, 0 ms", 2, cold(0)),
+    Case("floor, 0 ms", 3, cold_floor(0)),
+    Case("cold, 0 ms", 3, cold(0)),
     Case("floor, cached", 3, cached_floor),
     Case("replay", 3, replay),
     Case("replay of the committed recording", 1, committed_recording),
+    Case("floor, imports", 3, imports("duckdb, httpx, pydantic")),
+    Case("recording 1", 1, record_many(1)),
+    Case("replay of 1", 3, replay_many(1)),
     Case("--help", 3, start("--help")),
     Case("sweep --dry-run", 2, start("sweep", "baseline", "--dry-run")),
     Case("cold, paid model", 1, paid),
     Case("cold, 200 ms", 1, cold(200)),
+    *(
+        case
+        for trials in MARGINAL
+        for case in (
+            Case(f"floor of {trials:,} short", 1, in_flight_floor(trials, 200, 0)),
+            Case(f"cold, {trials:,} short", 1, short(trials)),
+        )
+    ),
     Case("50 in flight", 1, in_flight(200, 50)),
     Case("200 in flight", 1, in_flight(200, 200)),
     Case("2,000 in flight", 1, in_flight(2_000, 2_000)),
@@ -68,10 +82,20 @@ CASES = (
     Case("replay of 110 short", 1, replay_many(110)),
     Case("recording 11,000", 1, record_many(11_000)),
     Case("replay of 11,000", 1, replay_many(11_000)),
-    Case("import of 990 human trials", 1, import_humans),
-    Case("floor, libraries", 3, libraries),
+    Case("recording 11", 1, record_many(11)),
     *(
-        Case(f"{what} of {trials:,}, {heat}", 1, analysis(trials, what, warm=heat == "warm"))
+        Case(f"{what} of 11, {replies:,} replies", 3, on_a_cache(11, trials, replayed=replayed))
+        for what, replayed in (("sweep", False), ("replay", True))
+        for trials, replies in ((11, 88), (11_000, 88_000))
+    ),
+    Case("import of 990 human trials", 1, import_humans),
+    Case("floor, libraries", 3, imports("pandas, scipy.stats, statsmodels.api")),
+    *(
+        Case(
+            f"{what} of {trials:,}, {heat}",
+            3 if (trials, heat) == (min(STUDIES), "cold") else 1,
+            analysis(trials, what, warm=heat == "warm"),
+        )
         for trials in STUDIES
         for what in ("tables", "report")
         for heat in ("cold", "warm")

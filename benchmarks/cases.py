@@ -27,6 +27,8 @@ SHORT, SHORT_CALLS = ("--conditions", "R_-4_8"), 8
 # Few trials, whose calls are all under way before the first of them is answered.
 KILLED, KILLED_TRIALS = ("--reps", "2"), 22
 KILLED_DELAY_MS, QUIET_S = 1_000, 0.15
+# So many short trials less so few: what a further call costs.
+MARGINAL = (250, 2_000)
 STUDIES, MOST_DRIVEN = (110, 3_300, 11_000), 1_100
 
 
@@ -201,6 +203,13 @@ def in_flight(trials: int, limit: int, delay_ms: int = 0) -> Callable[[Bench], F
     return measure
 
 
+def short(trials: int) -> Callable[[Bench], Figures]:
+    """Short trials with an empty cache."""
+    return lambda bench: figures_of(
+        bench.sweep(bench.fresh("short"), *SHORT, "--reps", str(trials), "--in-flight", "200")
+    )
+
+
 def in_flight_floor(trials: int, limit: int, delay_ms: int) -> Callable[[Bench], Figures]:
     """As many short trials, bare."""
     return lambda bench: figures_of(
@@ -257,6 +266,19 @@ def replay_many(trials: int) -> Callable[[Bench], Figures]:
             *SHORT,
             *("--replay", "--reps", str(trials)),
             db=f"replay-{time.monotonic_ns()}",
+        )
+    )
+
+
+def on_a_cache(trials: int, recorded: int, *, replayed: bool) -> Callable[[Bench], Figures]:
+    """The first of the recorded trials, replayed or in a sweep that finds all replies."""
+    return lambda bench: figures_of(
+        bench.sweep(
+            bench.folder / f"recorded-{recorded}",
+            *SHORT,
+            *("--reps", str(trials)),
+            *(["--replay"] * replayed),
+            db=f"start-{time.monotonic_ns()}",
         )
     )
 
@@ -354,9 +376,9 @@ def study_of(bench: Bench, trials: int, *, anew: bool = False) -> Path:
     return db
 
 
-def libraries(_: Bench) -> Figures:
-    """What tables cannot do without: the interpreter and its libraries of statistics."""
-    return figures_of(run([PYTHON, "-c", "import pandas, scipy.stats, statsmodels.api"]), calls=0)
+def imports(modules: str) -> Callable[[Bench], Figures]:
+    """The interpreter and libraries that a program cannot do without."""
+    return lambda _: figures_of(run([PYTHON, "-c", f"import {modules}"]), calls=0)
 
 
 def analysis(trials: int, what: str, *, warm: bool) -> Callable[[Bench], Figures]:
