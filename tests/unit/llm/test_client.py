@@ -17,7 +17,6 @@ from merge_runner.llm.ledger import CallLabel
 from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.llm.store import CachedCall
 from merge_runner.records import Attempt, CallFailed, ReplayMiss, Usage
-from merge_runner.run.cluster_worker import RemoteCoordinator
 from tests.support.clients import PRICE, answer, begun, error, raw, slot, ticks
 from tests.support.virtual_time import now_s
 
@@ -306,28 +305,6 @@ async def test_drain_gives_up_calls_that_wait_for_their_turn(make):
     assert client.budget.ledger.read().committed_usd == 0
     with pytest.raises(CallFailed, match="stopped"):
         await client.ask("prompt", slot(3))
-
-
-@pytest.mark.parametrize("drains", [False, True])
-async def test_a_call_that_waits_for_its_coordinator_can_be_given_up(make, drains):
-    client, coordinator = make(answer(), price=PRICE), RemoteCoordinator()
-    client.budget.ledger.coordinator = coordinator
-    asked = await begun(client.ask("prompt", slot()))
-    (waits,) = client.calls.waits
-    assert "coordinator" in waits.what
-    if drains:
-        await client.calls.drain()
-    else:
-        asked.cancel()
-    await asyncio.wait([asked])
-    await ticks()
-    assert (client.direct.transport.sent, client.calls.waits) == ([], [])
-    assert client.budget.queued_usd == 0
-    assert [(event.number, event.is_cost) for event in coordinator.events] == [
-        (1, False),
-        (1, True),
-    ]
-    assert client.budget.ledger.read().open_attempts == 0
 
 
 @pytest.mark.parametrize("in_flight", [False, True])
