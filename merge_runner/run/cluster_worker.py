@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 
 # The coordinator may be slow, or its machine suspended; one that is gone never answers.
 SILENT_S = 300
+# Pickled operations of a chunk, and the rest of its share of the cap in USD.
+Pending = tuple[list[bytes], float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,14 +101,17 @@ def unpickled(operation: bytes, stores: Mapping[str, object]) -> Operation:
 
 
 class RelayedCache(ResponseCache):
-    """Cache of a chunk; each operation is repeated by the coordinator before its result is used.
+    """Cache and ledger of a chunk, in a folder until it is closed.
 
-    ``waiting`` has pickled operations with the futures of their results, and None at the end.
+    The coordinator repeats each operation before its result is used.
     """
 
-    def __init__(self, folder: Path) -> None:
-        super().__init__(folder)
-        self.waiting = asyncio.Queue[tuple[bytes, asyncio.Future[Any]] | None]()
+    def __init__(self, scope: str, cap: Cap | None) -> None:
+        self._temporary = TemporaryDirectory(prefix="merge-runner-")
+        super().__init__(Path(self._temporary.name))
+        self.ledger = Ledger(self, scope, cap)
+        # Pickled operations, and the futures of their results; None at the end.
+        self._waiting = asyncio.Queue[tuple[bytes, asyncio.Future[Any]] | None]()
         self._sent: list[asyncio.Future[Any]] = []
         self._write_first = self.write
         self.write = lambda operation: asyncio.create_task(self._write(operation))
@@ -117,15 +122,21 @@ class RelayedCache(ResponseCache):
             return result
         pickled, repeated = BytesIO(), asyncio.get_running_loop().create_future()
         _Pickler(pickled).dump(operation)
-        self.waiting.put_nowait((pickled.getvalue(), repeated))
+        self._waiting.put_nowait((pickled.getvalue(), repeated))
         try:
             theirs: ResultT = await asyncio.wait_for(repeated, SILENT_S)
         except TimeoutError as exc:
             raise SweepStopped(f"the coordinator has said nothing for {SILENT_S} s") from exc
         return result if result == theirs else theirs
 
-    async def exchange(self, results: Sequence[Any]) -> list[bytes]:
-        """Set the results of the last operations; return the next ones, or none at the end."""
+    def close(self) -> None:
+        """Remove the folder; no operation is left."""
+        super().close()
+        self._temporary.cleanup()
+        self._waiting.put_nowait(None)
+
+    async def exchange(self, results: Sequence[Any]) -> Pending | None:
+        """Set the results of the last operations; return the next ones, or None at the end."""
         for future, result in zip(self._sent, results, strict=True):
             if future.done():  # its call is cancelled
                 continue
@@ -133,12 +144,13 @@ class RelayedCache(ResponseCache):
                 future.set_exception(result)
             else:
                 future.set_result(result)
-        taken = [await self.waiting.get()]
-        while not self.waiting.empty():
-            taken.append(self.waiting.get_nowait())
-        waiting = [*filter(None, taken)] if taken[-1] else []
-        self._sent = [future for _, future in waiting]
-        return [operation for operation, _ in waiting]
+        taken = [await self._waiting.get()]
+        while not self._waiting.empty():
+            taken.append(self._waiting.get_nowait())
+        if taken[-1] is None:
+            return None
+        operations, self._sent = map(list, zip(*filter(None, taken), strict=True))
+        return operations, self.ledger.left_usd
 
 
 @dataclass
@@ -148,7 +160,8 @@ class WorkerRun:
     stopping: asyncio.Event = field(default_factory=asyncio.Event)
     limiters: dict[float, dict[str, Limiter]] = field(default_factory=dict)
     plan: Plan | None = None
-    chunk: tuple[RelayedCache, Ledger, asyncio.Task[Played]] | None = None
+    replies: RelayedCache = field(init=False)
+    work: asyncio.Task[Played] = field(init=False)
 
 
 def _state(run: str, worker: Worker) -> WorkerRun:
@@ -176,9 +189,7 @@ def forget(run: str, *, dask_worker: Worker) -> None:
     dask_worker.extensions.pop(run, None)
 
 
-async def begin_chunk(
-    program: str, pickled: bytes, *, dask_worker: Worker
-) -> tuple[list[bytes], float] | Played:
+async def begin_chunk(program: str, pickled: bytes, *, dask_worker: Worker) -> Pending | Played:
     """Begin to play a Chunk, which only a worker with the same ``program`` can read; see go_on."""
     if fingerprint() != program:
         differs = (
@@ -190,31 +201,16 @@ async def begin_chunk(
     dask_worker.periodic_callbacks["profile"].stop()
     chunk: Chunk = pickle.loads(pickled)  # noqa: S301 # a scheduler runs any code
     state = _state(chunk.run, dask_worker)
-    folder = TemporaryDirectory(prefix="merge-runner-")
-    replies = RelayedCache(Path(folder.name))
-    ledger = Ledger(replies, chunk.plan.ledger, chunk.cap)
-    replies.put_now(*chunk.recorded, [partial(ledger.add_overruns, chunk.overruns)])
-    stack = AsyncExitStack()
-    stack.enter_context(folder)
-    stack.enter_context(closing(replies))
-    work = asyncio.create_task(_play(chunk, state, ledger, replies, stack))
-    work.add_done_callback(lambda _: replies.waiting.put_nowait(None))
-    state.chunk = replies, ledger, work
+    replies = state.replies = RelayedCache(chunk.plan.ledger, chunk.cap)
+    replies.put_now(*chunk.recorded, [partial(replies.ledger.add_overruns, chunk.overruns)])
+    state.work = asyncio.create_task(_play(chunk, state))
     return await go_on(chunk.run, [], dask_worker=dask_worker)
 
 
-async def go_on(
-    run: str, results: Sequence[Any], *, dask_worker: Worker
-) -> tuple[list[bytes], float] | Played:
-    """Give a chunk the results of operations; return its next ones, or its result at its end.
-
-    The operations come with the rest of the chunk's share of the cap in USD.
-    """
-    chunk = _state(run, dask_worker).chunk
-    assert chunk is not None
-    replies, ledger, work = chunk
-    operations = await replies.exchange(results)
-    return (operations, ledger.left_usd) if operations else work.result()
+async def go_on(run: str, results: Sequence[Any], *, dask_worker: Worker) -> Pending | Played:
+    """Give a chunk the results of operations; return its next ones, or its result at its end."""
+    state = _state(run, dask_worker)
+    return await state.replies.exchange(results) or await state.work
 
 
 def _with_code(plan: Plan) -> Plan:
@@ -224,24 +220,23 @@ def _with_code(plan: Plan) -> Plan:
     return plan.model_copy(update={"parts": plan.parts.with_code(plan.arms, catalogue)})
 
 
-async def _play(
-    chunk: Chunk, state: WorkerRun, ledger: Ledger, replies: RelayedCache, stack: AsyncExitStack
-) -> Played:
-    played = Played()
+async def _play(chunk: Chunk, state: WorkerRun) -> Played:
+    replies, played = state.replies, Played()
 
     def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
         if isinstance(record, TrialSuspended):
             record = TrialSuspended(str(record))  # without its frames, which no pickle can hold
         played.ended.append((spec, record))
 
-    async with stack:
+    async with AsyncExitStack() as stack:
+        stack.enter_context(closing(replies))
         try:
             if state.plan is None:
                 state.plan = _with_code(chunk.plan)
             plan, options, calls = state.plan, chunk.options, Calls()
             stack.enter_context(using(plan.parts.catalogue))
             clients = live_clients(
-                plan, options, chunk.usage, replies, ledger, calls=calls, stack=stack,
+                plan, options, chunk.usage, replies, replies.ledger, calls=calls, stack=stack,
                 urls=chunk.urls, share=chunk.share,
                 limiters=state.limiters.setdefault(chunk.share, {}),
             )  # fmt: skip

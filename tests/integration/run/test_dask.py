@@ -54,34 +54,31 @@ BEGIN SELECT RAISE(ABORT, 'the disk is full'); END
 
 
 @in_virtual_time
-async def test_a_coordinator_that_says_nothing_ends_its_workers_tasks(tmp_path):
-    with closing(RelayedCache(tmp_path)) as cache:
+async def test_a_coordinator_that_says_nothing_ends_its_workers_tasks():
+    with closing(RelayedCache("baseline", None)) as cache:
         with pytest.raises(SweepStopped, match="the coordinator has said nothing for 300 s"):
             await cache.write(partial(cache.remove, "a name"))
         assert now_s() == 300
-        assert len(await cache.exchange([])) == 1
+        (operation,), _ = await cache.exchange([])
+        assert operation
 
 
 async def test_an_attempt_is_reserved_where_its_worker_and_the_coordinator_have_money(tmp_path):
     async def coordinate():
         results = []
-        while operations := await cache.exchange(results):
-            results = [await theirs.write(unpickled(each, stores)) for each in operations]
+        while pending := await cache.exchange(results):
+            results = [await theirs.write(unpickled(each, stores)) for each in pending[0]]
+        return results
 
-    with (
-        closing(RelayedCache(tmp_path / "worker")) as cache,
-        closing(ResponseCache(tmp_path / "coordinator")) as theirs,
-    ):
-        chunk = Ledger(cache, "baseline", Cap(1.5))
+    with closing(ResponseCache(tmp_path)) as theirs:
         stores = {"ledger of baseline": Ledger(theirs, "baseline", Cap(0.75))}
-        coordinator = asyncio.create_task(coordinate())
-        reserved = [
-            await cache.write(partial(chunk.reserve, key, 1, usd, CallLabel("o3")))
-            for key, usd in (("a", 0.5), ("beyond all", 0.5), ("beyond the share", 0.75))
-        ]
-        cache.waiting.put_nowait(None)
-        await coordinator
-        assert reserved == [True, False, False]
+        with closing(RelayedCache("baseline", Cap(1.5))) as cache:
+            coordinator = asyncio.create_task(coordinate())
+            reserved = [
+                await cache.write(partial(cache.ledger.reserve, key, 1, usd, CallLabel("o3")))
+                for key, usd in (("a", 0.5), ("beyond all", 0.5), ("beyond the share", 0.75))
+            ]
+        assert (reserved, await coordinator) == ([True, False, False], [False])
         assert stores["ledger of baseline"].read().reserved_usd == 0.5
 
 
