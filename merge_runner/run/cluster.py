@@ -35,6 +35,7 @@ from merge_runner.run.cluster_worker import (
 )
 from merge_runner.run.estimate import most_shares
 from merge_runner.run.guard import FirstDecisions
+from merge_runner.run.parts import Parts
 from merge_runner.run.plan import Plan
 from merge_runner.run.replay import Replay
 from merge_runner.run.trials import Capacity, Ended
@@ -72,9 +73,8 @@ class ClusterRunner:
         self._workers = 0
         self._client = client
         self._plan = plan
-        self._whole = replace(
-            whole, plan=plan.model_copy(update={"parts": plan.parts.without_code()})
-        )
+        # Not everywhere can the code of its parts be imported: workers make them from its source.
+        self._whole = replace(whole, plan=plan.model_copy(update={"parts": Parts()}))
         self._most_shares = most_shares(plan, whole.options)
         self._cache = cache
         self._ledger = ledger

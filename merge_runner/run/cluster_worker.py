@@ -30,6 +30,7 @@ from merge_runner.run.clients import live_clients
 from merge_runner.run.guard import FirstDecisions
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.options import Options
+from merge_runner.run.parts import find_parts
 from merge_runner.run.plan import Plan
 from merge_runner.study.parts import catalogue_of
 from merge_runner.text_safety import one_line
@@ -213,11 +214,11 @@ async def go_on(run: str, results: Sequence[Any], *, dask_worker: Worker) -> Pen
     return await state.replies.exchange(results) or await state.work
 
 
-def _with_code(plan: Plan) -> Plan:
-    """Return the plan with its programs and its study's parts, made from their sources."""
+def _resolved(plan: Plan) -> Plan:
+    """Return the plan with the parts that its study names, made from their sources."""
     study = plan.study
     catalogue = catalogue_of(study.file, study.text, study.plugins)
-    return plan.model_copy(update={"parts": plan.parts.with_code(plan.arms, catalogue)})
+    return plan.model_copy(update={"parts": find_parts(plan.arms, plan.conditions, catalogue)})
 
 
 async def _play(chunk: Chunk, state: WorkerRun) -> Played:
@@ -232,7 +233,7 @@ async def _play(chunk: Chunk, state: WorkerRun) -> Played:
         stack.enter_context(closing(replies))
         try:
             if state.plan is None:
-                state.plan = _with_code(chunk.plan)
+                state.plan = _resolved(chunk.plan)
             plan, options, calls = state.plan, chunk.options, Calls()
             stack.enter_context(using(plan.parts.catalogue))
             clients = live_clients(
