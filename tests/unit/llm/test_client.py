@@ -9,7 +9,6 @@ import pytest
 
 from merge_runner.drivers.language_model import Question
 from merge_runner.errors import EndpointRefused, QuotaExhausted, TrialSuspended, UsageError
-from merge_runner.llm.attempts import Meter
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.call import Calls
 from merge_runner.llm.http_outcome import TransportFailure
@@ -331,14 +330,12 @@ async def test_drain_does_not_lose_an_answer_that_is_just_being_saved(make, tmp_
 
 
 async def test_a_call_knows_itself_whether_it_is_in_flight(make):
-    """A cluster's worker takes its meter away twice a second; that gives no call up."""
     client = make(error(503, retry_after="300"), answer("paid for"))
     retrying = await begun(client.ask("prompt", slot(1)))
     client.direct.transport.open.clear()
     flying = asyncio.create_task(client.ask("prompt", slot(2)))
     while client.calls.calls_in_flight != 1 or len(client.direct.transport.sent) < 2:
         await asyncio.sleep(0)
-    client.replies.meter = Meter()
     assert [wait.what for wait in client.calls.waits] == ["after HTTP 503: m"]
     drained = await begun(client.calls.drain())
     client.direct.transport.open.set()
