@@ -95,8 +95,6 @@ class Reservation:
         if self.queued:
             self.budget.queued_usd -= self.usd
             self.cost_usd = 0.0
-        if coordinator := self.budget.ledger.coordinator:
-            coordinator.report_cost(self.key, self.cost_usd)
         if self.cost_usd is not None:
             self._take(self.cost_usd - self.usd)
         self.budget.queue.wake()

@@ -13,14 +13,15 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Any, Protocol
+from typing import Any
 
 from merge_runner.errors import CacheFailed, RecordingError, UsageError
 from merge_runner.llm.cache_file import FILE
-from merge_runner.llm.durable import Execute, Rows
+from merge_runner.llm.durable import Execute
 from merge_runner.llm.store import CacheFile
 from merge_runner.records import Attempt
 
@@ -126,18 +127,6 @@ def reserved_usd_of(store: CacheFile, key: str) -> float:
     return float(rows[-1][0]) if rows else 0.0
 
 
-class Coordinator(Protocol):
-    """Coordinator of a cluster, which reserves each attempt of a chunk before it is sent."""
-
-    async def reserve(self, key: str, usd: float, label: CallLabel) -> bool:
-        """Return whether an attempt is reserved; False if it exceeds the cap."""
-        ...
-
-    def report_cost(self, key: str, usd: float | None) -> None:
-        """Report what an attempt has cost; None: unknown."""
-        ...
-
-
 class Ledger:
     """Spending of one sweep, named ``scope`` in the cache, under a ``cap``; None: no limit.
 
@@ -146,17 +135,10 @@ class Ledger:
     has no name and keeps no record.
     """
 
-    def __init__(
-        self,
-        store: CacheFile,
-        scope: str,
-        cap: Cap | None = None,
-        coordinator: Coordinator | None = None,
-    ) -> None:
+    def __init__(self, store: CacheFile, scope: str, cap: Cap | None = None) -> None:
         self.store = store
         self.scope = scope
         self.cap = cap
-        self.coordinator = coordinator
         self.spending = Spending()
         self.committed_usd = 0.0
         self._in_transaction_usd = 0.0  # the writer's: read() may replace committed_usd meanwhile
@@ -167,9 +149,8 @@ class Ledger:
 
     @property
     def left_usd(self) -> float:
-        """USD under the cap that are neither spent nor reserved."""
-        assert self.cap is not None
-        return self.cap.usd - self.committed_usd
+        """USD under the cap that are neither spent nor reserved; infinite without a cap."""
+        return self.cap.usd - self.committed_usd if self.cap is not None else math.inf
 
     def read(self) -> Spending:
         """Sum the record and return the spending; raise UsageError where it is damaged."""
@@ -226,26 +207,18 @@ class Ledger:
         return True
 
     def book(self, key: str, attempt: Attempt, driver: str, execute: Execute) -> None:
-        """Book the cost of an attempt. Runs in a transaction.
+        """Replace the reservation of an attempt by its cost. Runs in a transaction.
 
-        Its reservation stays where the cost is unknown.
+        The reservation stays where the cost is unknown.
         """
         if not self.scope:
             return
-        if attempt.cost_usd is None:  # it may have been charged
+        usd = attempt.cost_usd
+        if usd is None:  # it may have been charged
             execute(_KEEP, (attempt.outcome, key, attempt.number))
-        else:
-            self.pay(key, attempt.number, attempt.cost_usd, driver, execute)
-
-    def pay(
-        self, key: str, number: int, usd: float, driver: str, execute: Execute
-    ) -> tuple[str, float, float]:
-        """Replace the reservation of an attempt by its cost. Runs in a transaction.
-
-        Returns the driver, the cost, and its excess over the worst case.
-        """
+            return
         self._sum_once(execute)
-        closed = execute(_CLOSE, (key, number)).fetchall()
+        closed = execute(_CLOSE, (key, attempt.number)).fetchall()
         # No row: a user has released it. The reservation of a batch is of the sweep that sent it.
         scope, reserved_usd, worst_usd = closed[0] if closed else (self.scope, usd, usd)
         exceeds = usd > reserved_usd + TOLERANCE_USD
@@ -256,23 +229,11 @@ class Ledger:
         else:
             self._in_transaction_usd += usd - reserved_usd
         self.committed_usd = self._in_transaction_usd
-        return driver, usd, over[0]
 
-    def rows(self) -> tuple[Rows, Rows]:
-        """Return the rows of costs and of reservations, for ``share``."""
-        opened = self.store.rows("SELECT * FROM open WHERE scope = ?", self.scope)
-        return self.store.rows(_SPENT, self.scope), [row[1:] for row in opened]
-
-    def share(self, name: str, spent: Rows, opened: Rows, execute: Execute) -> None:
-        """Replace the reservation of a cluster's task by its costs and open reservations.
-
-        Runs in a transaction.
-        """
-        execute("DELETE FROM open WHERE scope = ? AND call = ?", (self.scope, name))
-        for row in spent:
-            execute(_PAY, (self.scope, *row))
-        for row in opened:
-            execute(_OPEN, (self.scope, *row))
+    def add_overruns(self, overruns: Mapping[str, float], execute: Execute) -> None:
+        """Add the largest overruns that another ledger has, by driver. Runs in a transaction."""
+        for driver, ratio in overruns.items():
+            execute(_PAY, (self.scope, driver, 0.0, 0.0, ratio))
 
     def release(self) -> None:
         """Drop all reservations; no run may be live."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, NamedTuple
 
-from merge_runner.errors import MergeRunnerError, TrialSuspended
-from merge_runner.llm.budget import USED_UP, Reservation
+from merge_runner.errors import MergeRunnerError
+from merge_runner.llm.budget import Reservation
 from merge_runner.llm.call import Call, Wait
 from merge_runner.llm.delays import backoff_s
 from merge_runner.llm.formats.wire import WireFormat
@@ -50,12 +50,6 @@ class DirectSender:
         # Providers count a request when they admit it: about four bytes a token, and the whole cap.
         estimate = (call.worst.input_tokens or 0) // 4 + self.entry.max_output_tokens
         correct = await self.limiter.acquire(estimate, order=call.order)
-        if coordinator := reservation.budget.ledger.coordinator:
-            # Nothing is sent or durable here yet, so this wait can be cancelled.
-            call.wait = Wait("for the coordinator, which shares out the cap")
-            worst = reservation.key, reservation.usd, reservation.label
-            if not await coordinator.reserve(*worst):
-                raise TrialSuspended(USED_UP)
         call.wait = None
         number = len(call.attempts) + 1
         await reservation.begin(number)

@@ -1,10 +1,9 @@
 """Plays a sweep on a Dask cluster whose workers share nothing.
 
-A chunk of trials has a share of the rate limits and of the cap. Its worker plays it with the
-ordinary runner and a reply folder of its own. The coordinator keeps its records and replies in one
-transaction before it counts the chunk as done, and gives the chunk of a lost worker to another. It
-fetches each attempt and each cost from the worker, and reserves the attempt's worst case durably
-before it is sent, so that a lost attempt counts with its worst case.
+A worker plays a chunk of trials with the ordinary runner, a reply folder of its own, and a share of
+the rate limits and of the cap. Each write of its folder is made at the coordinator, too: an attempt
+is reserved there before it is sent, and a reply is kept there before its trial goes on. So the
+chunk of a lost worker goes to another, and only its attempts in flight are made again.
 """
 
 from __future__ import annotations
@@ -13,35 +12,30 @@ import asyncio
 import contextlib
 import math
 import pickle
-import secrets
 from collections import Counter, deque
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 from merge_runner.errors import MergeRunnerError, RecordingError, SweepStopped, TrialSuspended
 from merge_runner.llm.attempts import Meter
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.call import Wait
-from merge_runner.llm.durable import Operation, Rows
 from merge_runner.llm.ledger import Cap, Ledger
-from merge_runner.llm.store import CachedCall
-from merge_runner.records import Attempt
+from merge_runner.llm.store import Attempts, CachedCall
 from merge_runner.run.cluster_worker import (
     Chunk,
-    MoneyEvent,
     Played,
-    RunSetup,
-    StoredCalls,
     begin_chunk,
     fingerprint,
     forget,
     go_on,
     stop,
+    unpickled,
 )
 from merge_runner.run.estimate import most_shares
 from merge_runner.run.guard import FirstDecisions
+from merge_runner.run.parts import Parts
 from merge_runner.run.plan import Plan
 from merge_runner.run.replay import Replay
 from merge_runner.run.trials import Capacity, Ended
@@ -51,75 +45,18 @@ if TYPE_CHECKING:
     from distributed import Client
 
 COUNT_WORKERS_EVERY_S = 1.0  # they may come and go
-# Trials of a chunk for each trial in flight. A worker that dies loses its chunk, and the longest
-# trial of a chunk delays the next one.
+# Trials of a chunk for each trial in flight. The longest trial of a chunk delays the next chunk.
 TRIALS_PER_SLOT = 4
 MOST_LOSSES = 3
 
 
 @dataclass(eq=False)
 class Assignment:
-    """A chunk on a worker, and the money of its attempts.
-
-    ``usd`` has, by attempt, the worst case, or the cost if that is known. The rows ``booked`` are
-    counted as spent already. ``unbooked`` is the error that ended the booking.
-    """
+    """A chunk on a worker; ``left_usd`` is the rest of its share of the cap."""
 
     address: str
     chunk: Chunk
-    usd: dict[int, float] = field(default_factory=dict)
-    booked: Rows = field(default_factory=list)
-    unbooked: MergeRunnerError | None = None
-
-    @property
-    def unused_usd(self) -> float:
-        """The rest of the chunk's share of the cap."""
-        cap = self.chunk.cap
-        return max(0.0, cap.usd - sum(self.usd.values())) if cap is not None else 0.0
-
-    async def play(self, client: Client, ledger: Ledger) -> Played | Exception:
-        """Let the worker play the chunk and book its attempts; return why the worker is lost."""
-        run, name, answers = self.chunk.setup.run, self.chunk.name, dict[int, bool]()
-        # Not as a task of Dask, which would play a lost one again before its loss is booked.
-        ask = partial(client.run, workers=[self.address], on_error="return")
-        begun = await ask(begin_chunk, fingerprint(), pickle.dumps(self.chunk))
-        played: Played | Exception | None = begun[self.address]
-        while played is None:
-            progress = (await ask(go_on, run, name, answers))[self.address]
-            if isinstance(progress, Exception):
-                return progress
-            events, played = progress
-            if self.unbooked is None:
-                try:
-                    answers = await self._book(events, ledger)
-                except MergeRunnerError as exc:
-                    # No attempt gets an answer any more; paid replies are kept.
-                    self.unbooked, answers = exc, {}
-                    await ask(stop, run)
-        return played
-
-    async def _book(self, events: Sequence[MoneyEvent], ledger: Ledger) -> dict[int, bool]:
-        """Reserve the attempts and book the costs of events, in their order.
-
-        Returns, for each attempt to reserve, whether it is reserved.
-        """
-        operations = list[Operation]()
-        for event in events:
-            attempt, label = (self.chunk.name, event.number, event.usd), event.label
-            if event.is_cost:
-                operations.append(partial(ledger.pay, *attempt, label.driver))
-            else:
-                operations.append(partial(ledger.reserve, *attempt, label))
-        results = await asyncio.gather(*map(ledger.store.write, operations))
-        answers = {}
-        for event, result in zip(events, results, strict=True):
-            if event.is_cost:
-                self.booked.append(result)
-            else:
-                answers[event.number] = result
-            if result:
-                self.usd[event.number] = event.usd
-        return answers
+    left_usd: float
 
 
 class ClusterRunner:
@@ -129,15 +66,23 @@ class ClusterRunner:
     waiting_for_money = 0
 
     def __init__(
-        self, client: Client, setup: RunSetup, cache: ResponseCache, ledger: Ledger
+        self, client: Client, plan: Plan, whole: Chunk, cache: ResponseCache, ledger: Ledger
     ) -> None:
-        self.meters = {name: Meter() for name in setup.plan.entries}
+        """Take the ``whole`` run as one chunk, of which parts are given to workers."""
+        self.meters = {name: Meter() for name in plan.entries}
         self._workers = 0
         self._client = client
-        self._setup = setup
-        self._most_shares = most_shares(setup.plan, setup.options)
+        self._plan = plan
+        # Not everywhere can the code of its parts be imported: workers make them from its source.
+        self._whole = replace(whole, plan=plan.model_copy(update={"parts": Parts()}))
+        self._most_shares = most_shares(plan, whole.options)
         self._cache = cache
         self._ledger = ledger
+        self._stores = {
+            "cache": cache,
+            "ledger of " + ledger.scope: ledger,
+            "ledger of ": Ledger(cache, ""),
+        }
         self._groups: deque[list[TrialSpec]] = deque()
         self._assigned: dict[asyncio.Task[Played | Exception], Assignment] = {}
         self._losses = Counter[int]()  # by the order of a chunk's first trial
@@ -146,7 +91,7 @@ class ClusterRunner:
     @property
     def first(self) -> FirstDecisions:
         """The first decisions of each model, over all workers."""
-        return self._setup.first
+        return self._whole.first
 
     @property
     def running_trials(self) -> int:
@@ -190,16 +135,16 @@ class ClusterRunner:
         """Stop the workers, and keep the results of their chunks."""
         addresses = [assignment.address for assignment in self._assigned.values()]
         with contextlib.suppress(OSError):
-            await self._client.run(stop, self._setup.run, workers=addresses, on_error="ignore")
+            await self._client.run(stop, self._whole.run, workers=addresses, on_error="ignore")
         while self._assigned:
             with contextlib.suppress(MergeRunnerError, OSError):  # the first one has ended the run
                 await self._collect()
         with contextlib.suppress(OSError):
-            await self._client.run(forget, self._setup.run, on_error="ignore")
+            await self._client.run(forget, self._whole.run, on_error="ignore")
 
     async def _give(self, address: str) -> None:
         """Give a chunk to a worker, unless the chunks under way hold all shares."""
-        setup, options = self._setup, self._setup.options
+        options = self._whole.options
         slots = 1 if self._one_by_one else min(self._workers, self._most_shares)
         shares = sum(assignment.chunk.share for assignment in self._assigned.values())
         if shares + 1 / slots > 1.001:
@@ -209,25 +154,37 @@ class ClusterRunner:
         specs = self._groups.popleft()
         while self._groups and len(specs) + len(self._groups[0]) <= size:
             specs = specs + self._groups.popleft()
-        calls = await recorded_calls(setup.plan, self._cache, specs)
-        cap, spending = self._ledger.cap, self._ledger.read()
+        recorded = await recorded_calls(self._plan, self._cache, specs)
+        cap, spending, share_usd = self._ledger.cap, self._ledger.read(), math.inf
         if cap is not None:
-            kept_usd = sum(assignment.unused_usd for assignment in self._assigned.values())
+            kept_usd = sum(assignment.left_usd for assignment in self._assigned.values())
             share_usd = max(0.0, self._ledger.left_usd - kept_usd) / idle
             cap = Cap(share_usd, f"a task's share of {cap.source}")
-        plan = setup.plan.model_copy(update={"parts": setup.plan.parts.without_code()})
-        chunk = Chunk(
-            name=f"task {secrets.token_hex(8)}",
-            setup=replace(setup, plan=plan, options=replace(options, in_flight=in_flight)),
-            cap=cap,
-            specs=specs,
-            share=1 / slots,
-            calls=calls,
-            overruns=[*spending.overruns.items()],
-        )
-        assignment = Assignment(address, chunk)
-        task = asyncio.create_task(assignment.play(self._client, self._ledger))
-        self._assigned[task] = assignment
+        chunk = replace(
+            self._whole, options=replace(options, in_flight=in_flight), share=1 / slots, cap=cap,
+            specs=specs, recorded=recorded, overruns=spending.overruns,
+        )  # fmt: skip
+        assignment = Assignment(address, chunk, share_usd)
+        self._assigned[asyncio.create_task(self._played(assignment))] = assignment
+
+    async def _played(self, assignment: Assignment) -> Played | Exception:
+        """Let a worker play its chunk; return why the worker is lost."""
+
+        async def ask(function: Callable[..., object], *arguments: object) -> Any:  # noqa: ANN401
+            # Not as a task of Dask, which would play a lost one again as it was.
+            run = self._client.run(function, *arguments, workers=[address], on_error="return")
+            return (await run)[address]
+
+        address = assignment.address
+        heard = await ask(begin_chunk, fingerprint(), pickle.dumps(assignment.chunk))
+        while isinstance(heard, tuple):
+            pickled, assignment.left_usd = heard
+            operations = [unpickled(operation, self._stores) for operation in pickled]
+            writing = map(self._cache.write, operations)
+            results = await asyncio.gather(*writing, return_exceptions=True)
+            heard = await ask(go_on, self._whole.run, results)
+        played: Played | Exception = heard
+        return played
 
     async def _collect(self) -> None:
         """Wait briefly for chunks, and keep the results of those that have ended."""
@@ -245,21 +202,15 @@ class ClusterRunner:
                 self._keep(assignment, played)
             else:
                 self._lose(assignment, played)
-            if assignment.unbooked is not None:
-                raise assignment.unbooked
 
     def _keep(self, assignment: Assignment, played: Played) -> None:
-        """Keep the results and the costs of a chunk; costs already ``booked`` count once."""
-        chunk, plan = assignment.chunk, self._setup.plan
-        booked = [(driver, -usd, -over_usd, 0.0) for driver, usd, over_usd in assignment.booked]
-        spent = [*booked, *played.spent]
-        share = partial(self._ledger.share, chunk.name, spent, played.opened)
-        self._cache.put_now(*played.calls, [] if plan.is_free else [share])
+        """Keep the results of a chunk."""
+        plan = self._plan
         for model, meter in played.meters.items():
             self.meters[model].add(meter)
         arms = plan.by_label()
         for spec, record in played.ended:
-            if isinstance(record, TrialSuspended) and chunk.share < 1:
+            if isinstance(record, TrialSuspended) and assignment.chunk.share < 1:
                 # All the money that is left goes to one chunk at a time.
                 self._one_by_one = True
                 self._groups.appendleft([spec])
@@ -277,7 +228,7 @@ class ClusterRunner:
             raise stopped
 
     def _lose(self, assignment: Assignment, error: Exception) -> None:
-        """Put the trials of a lost chunk back; its attempts of unknown cost stay reserved."""
+        """Put the trials of a lost chunk back; its attempts in flight stay reserved."""
         specs = [*assignment.chunk.specs]
         self._losses[specs[0].order] += 1
         if self._losses[specs[0].order] == MOST_LOSSES:
@@ -293,11 +244,14 @@ class ClusterRunner:
 
 async def recorded_calls(
     plan: Plan, cache: ResponseCache, specs: Sequence[TrialSpec]
-) -> StoredCalls:
-    """Return the recorded calls of trials, of each one up to its first missing call."""
+) -> tuple[list[CachedCall], list[tuple[str, Attempts]]]:
+    """Return the recorded calls of trials, of each one up to its first missing call.
+
+    They are the calls with an answer, and by key the attempts at those without one.
+    """
     replay = Replay(plan, cache)
     answered: dict[str, CachedCall] = {}
-    unanswered: dict[str, tuple[Attempt, ...]] = {}
+    unanswered: dict[str, Attempts] = {}
     for spec in specs:
         await asyncio.sleep(0)
         record = replay.play_one(spec)

@@ -5,31 +5,32 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import pickle
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AsyncExitStack, closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache, partial
-from itertools import count
+from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from traceback import walk_tb
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import merge_runner
 from merge_runner.errors import MergeRunnerError, SweepStopped, TrialSuspended, UsageError
 from merge_runner.llm.attempts import Meter
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.call import Calls
-from merge_runner.llm.durable import Rows
-from merge_runner.llm.ledger import CallLabel, Cap, Ledger
+from merge_runner.llm.durable import Execute, Operation, ResultT
+from merge_runner.llm.ledger import Cap, Ledger
 from merge_runner.llm.limiter import Limiter
-from merge_runner.llm.store import CachedCall
-from merge_runner.records import Attempt, Usage
+from merge_runner.llm.store import Attempts, CachedCall
+from merge_runner.records import Usage
 from merge_runner.registry import plugin_sources, using
 from merge_runner.run.clients import live_clients
 from merge_runner.run.guard import FirstDecisions
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.options import Options
+from merge_runner.run.parts import find_parts
 from merge_runner.run.plan import Plan
 from merge_runner.study.parts import catalogue_of
 from merge_runner.text_safety import one_line
@@ -40,13 +41,18 @@ if TYPE_CHECKING:
 
 # The coordinator may be slow, or its machine suspended; one that is gone never answers.
 SILENT_S = 300
-# The calls with an answer, and by key the attempts at those without one.
-StoredCalls = tuple[Sequence[CachedCall], Sequence[tuple[str, tuple[Attempt, ...]]]]
+# Pickled operations of a chunk, and the rest of its share of the cap in USD.
+Pending = tuple[list[bytes], float]
 
 
 @dataclass(frozen=True, slots=True)
-class RunSetup:
-    """A run and how it is played; ``urls`` are the coordinator's base URLs."""
+class Chunk:
+    """Trials of a run for one worker, and its ``share`` of the rate limits.
+
+    ``options`` have its share of the trials in flight, ``cap`` its share of the money. ``urls`` are
+    the coordinator's base URLs. ``recorded`` are the calls with an answer, and by key the attempts
+    at those without one.
+    """
 
     run: str
     plan: Plan
@@ -54,36 +60,18 @@ class RunSetup:
     usage: Mapping[str, Usage | None]
     first: FirstDecisions
     urls: Mapping[str, str]
-
-
-@dataclass(frozen=True, slots=True)
-class Chunk:
-    """Trials for one worker, their recorded calls, and its ``share`` of the rate limits.
-
-    Its attempts are reserved under its ``name`` until it ends. The options of ``setup`` have its
-    share of the trials in flight, and ``cap`` its share of the money.
-    """
-
-    name: str
-    setup: RunSetup
-    cap: Cap | None
-    specs: Sequence[TrialSpec]
-    share: float
-    calls: StoredCalls
-    overruns: Sequence[tuple[str, float]]
+    share: float = 1.0
+    cap: Cap | None = None
+    specs: Sequence[TrialSpec] = ()
+    recorded: tuple[Sequence[CachedCall], Sequence[tuple[str, Attempts]]] = ((), ())
+    overruns: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
 class Played:
-    """Result of a chunk; ``spent`` and ``opened`` are rows of the worker's ledger.
-
-    ``error`` is the text of what ended it, for a run that exits with ``exit_code``.
-    """
+    """Result of a chunk; ``error`` is the text of what ended it, for an exit with ``exit_code``."""
 
     ended: list[tuple[TrialSpec, TrialRecord | TrialSuspended]] = field(default_factory=list)
-    calls: StoredCalls = ((), ())
-    spent: Rows = field(default_factory=list)
-    opened: Rows = field(default_factory=list)
     meters: Mapping[str, Meter] = field(default_factory=dict)
     error: str = ""
     exit_code: int = 0
@@ -96,59 +84,74 @@ class Played:
             self.error, self.exit_code = _described(error), SweepStopped.exit_code
 
 
-@dataclass(frozen=True, slots=True)
-class MoneyEvent:
-    """An attempt that waits until its worst case is reserved, or the cost of one that is."""
+class _Pickler(pickle.Pickler):
+    """Pickler of operations, which have names in place of the chunk's cache and ledgers."""
 
-    number: int
-    usd: float
-    label: CallLabel
-    is_cost: bool
+    def persistent_id(self, obj: Any) -> str | None:  # noqa: ANN401 # of any type
+        if isinstance(obj, Ledger):
+            return "ledger of " + obj.scope
+        return "cache" if isinstance(obj, ResponseCache) else None
 
 
-class RemoteCoordinator:
-    """Coordinator of a chunk, which reserves its attempts before they are sent.
+def unpickled(operation: bytes, stores: Mapping[str, object]) -> Operation:
+    """Return an operation of a chunk for the coordinator's cache and ledgers, by their names."""
+    unpickler = pickle.Unpickler(BytesIO(operation))  # noqa: S301 # a scheduler runs any code
+    unpickler.persistent_load = stores.__getitem__  # type: ignore[method-assign] # as documented
+    loaded: Operation = unpickler.load()
+    return loaded
 
-    ``go_on`` gives it the ``events`` once they have ``changed``; the attempts ``waiting`` for its
-    answers are by number.
+
+class RelayedCache(ResponseCache):
+    """Cache and ledger of a chunk, in a folder until it is closed.
+
+    The coordinator repeats each operation before its result is used.
     """
 
-    def __init__(self) -> None:
-        self.events: list[MoneyEvent] = []
-        self.changed = asyncio.Event()  # also at the end of the chunk
-        self.waiting: dict[int, asyncio.Future[bool]] = {}
-        self.work: asyncio.Task[Played] | None = None
-        self._numbers = count(1)
-        self._reserved: dict[str, tuple[int, CallLabel]] = {}  # a call has one attempt at a time
+    def __init__(self, scope: str, cap: Cap | None) -> None:
+        self._temporary = TemporaryDirectory(prefix="merge-runner-")
+        super().__init__(Path(self._temporary.name))
+        self.ledger = Ledger(self, scope, cap)
+        # Pickled operations, and the futures of their results; None at the end.
+        self._waiting = asyncio.Queue[tuple[bytes, asyncio.Future[Any]] | None]()
+        self._sent: list[asyncio.Future[Any]] = []
+        self._write_first = self.write
+        self.write = lambda operation: asyncio.create_task(self._write(operation))
 
-    def _tell(self, number: int, usd: float, label: CallLabel, *, is_cost: bool = False) -> None:
-        self.events.append(MoneyEvent(number, usd, label, is_cost))
-        self.changed.set()
-
-    async def reserve(self, key: str, usd: float, label: CallLabel) -> bool:
-        """Return whether an attempt is reserved; False if it exceeds the cap."""
-        number = next(self._numbers)
-        answer = self.waiting[number] = asyncio.get_running_loop().create_future()
-        self._tell(number, usd, label)
+    async def _write(self, operation: Callable[[Execute], ResultT]) -> ResultT:
+        result = await self._write_first(operation)
+        if result is False:  # the chunk's share of the cap is used up
+            return result
+        pickled, repeated = BytesIO(), asyncio.get_running_loop().create_future()
+        _Pickler(pickled).dump(operation)
+        self._waiting.put_nowait((pickled.getvalue(), repeated))
         try:
-            async with asyncio.timeout(SILENT_S):
-                is_paid: bool = await answer
+            theirs: ResultT = await asyncio.wait_for(repeated, SILENT_S)
         except TimeoutError as exc:
             raise SweepStopped(f"the coordinator has said nothing for {SILENT_S} s") from exc
-        except asyncio.CancelledError:
-            self._tell(number, 0.0, label, is_cost=True)  # it may be reserved
-            raise
-        finally:
-            del self.waiting[number]
-        if is_paid:
-            self._reserved[key] = number, label
-        return is_paid
+        return result if result == theirs else theirs
 
-    def report_cost(self, key: str, usd: float | None) -> None:
-        """Report the cost of an attempt that may be reserved, where it is known."""
-        number, label = self._reserved.pop(key, (0, CallLabel()))
-        if number and usd is not None:
-            self._tell(number, usd, label, is_cost=True)
+    def close(self) -> None:
+        """Remove the folder; no operation is left."""
+        super().close()
+        self._temporary.cleanup()
+        self._waiting.put_nowait(None)
+
+    async def exchange(self, results: Sequence[Any]) -> Pending | None:
+        """Set the results of the last operations; return the next ones, or None at the end."""
+        for future, result in zip(self._sent, results, strict=True):
+            if future.done():  # its call is cancelled
+                continue
+            if isinstance(result, BaseException):
+                future.set_exception(result)
+            else:
+                future.set_result(result)
+        taken = [await self._waiting.get()]
+        while not self._waiting.empty():
+            taken.append(self._waiting.get_nowait())
+        if taken[-1] is None:
+            return None
+        operations, self._sent = map(list, zip(*filter(None, taken), strict=True))
+        return operations, self.ledger.left_usd
 
 
 @dataclass
@@ -158,8 +161,8 @@ class WorkerRun:
     stopping: asyncio.Event = field(default_factory=asyncio.Event)
     limiters: dict[float, dict[str, Limiter]] = field(default_factory=dict)
     plan: Plan | None = None
-    # By the name of a chunk under way.
-    chunks: dict[str, RemoteCoordinator] = field(default_factory=dict)
+    replies: RelayedCache = field(init=False)
+    work: asyncio.Task[Played] = field(init=False)
 
 
 def _state(run: str, worker: Worker) -> WorkerRun:
@@ -187,11 +190,8 @@ def forget(run: str, *, dask_worker: Worker) -> None:
     dask_worker.extensions.pop(run, None)
 
 
-async def begin_chunk(program: str, pickled: bytes, *, dask_worker: Worker) -> Played | None:
-    """Begin to play a Chunk, which only a worker with the same ``program`` can read.
-
-    Returns the result of one that cannot be played.
-    """
+async def begin_chunk(program: str, pickled: bytes, *, dask_worker: Worker) -> Pending | Played:
+    """Begin to play a Chunk, which only a worker with the same ``program`` can read; see go_on."""
     if fingerprint() != program:
         differs = (
             f"it has merge-runner {fingerprint()}, and the coordinator {program}: install the same "
@@ -201,47 +201,28 @@ async def begin_chunk(program: str, pickled: bytes, *, dask_worker: Worker) -> P
     # Dask's profiler samples all threads; Python 3.11 can deadlock there.
     dask_worker.periodic_callbacks["profile"].stop()
     chunk: Chunk = pickle.loads(pickled)  # noqa: S301 # a scheduler runs any code
-    state = _state(chunk.setup.run, dask_worker)
-    try:
-        if state.plan is None:
-            state.plan = _with_code(chunk.setup.plan)
-    except MergeRunnerError as exc:
-        return Played(error=str(exc), exit_code=exc.exit_code)
-    chunk = replace(chunk, setup=replace(chunk.setup, plan=state.plan))
-    coordinator = state.chunks[chunk.name] = RemoteCoordinator()
-    with using(state.plan.parts.catalogue):
-        coordinator.work = asyncio.create_task(_play(chunk, state, coordinator))
-    coordinator.work.add_done_callback(lambda _: coordinator.changed.set())
-    return None
+    state = _state(chunk.run, dask_worker)
+    replies = state.replies = RelayedCache(chunk.plan.ledger, chunk.cap)
+    replies.put_now(*chunk.recorded, [partial(replies.ledger.add_overruns, chunk.overruns)])
+    state.work = asyncio.create_task(_play(chunk, state))
+    return await go_on(chunk.run, [], dask_worker=dask_worker)
 
 
-async def go_on(
-    run: str, name: str, answers: Mapping[int, bool], *, dask_worker: Worker
-) -> tuple[list[MoneyEvent], Played | None]:
-    """Give a chunk the coordinator's answers; return its next events, and its result at its end."""
-    chunks = _state(run, dask_worker).chunks
-    coordinator = chunks[name]
-    for number, is_paid in answers.items():
-        if number in coordinator.waiting and not coordinator.waiting[number].done():
-            coordinator.waiting[number].set_result(is_paid)
-    await coordinator.changed.wait()
-    coordinator.changed.clear()
-    events, coordinator.events = coordinator.events, []
-    if coordinator.work is None or not coordinator.work.done():
-        return events, None
-    del chunks[name]
-    return events, coordinator.work.result()
+async def go_on(run: str, results: Sequence[Any], *, dask_worker: Worker) -> Pending | Played:
+    """Give a chunk the results of operations; return its next ones, or its result at its end."""
+    state = _state(run, dask_worker)
+    return await state.replies.exchange(results) or await state.work
 
 
-def _with_code(plan: Plan) -> Plan:
-    """Return the plan with its programs and its study's parts, made from their sources."""
+def _resolved(plan: Plan) -> Plan:
+    """Return the plan with the parts that its study names, made from their sources."""
     study = plan.study
     catalogue = catalogue_of(study.file, study.text, study.plugins)
-    return plan.model_copy(update={"parts": plan.parts.with_code(plan.arms, catalogue)})
+    return plan.model_copy(update={"parts": find_parts(plan.arms, plan.conditions, catalogue)})
 
 
-async def _play(chunk: Chunk, state: WorkerRun, coordinator: RemoteCoordinator) -> Played:
-    setup, played = chunk.setup, Played()
+async def _play(chunk: Chunk, state: WorkerRun) -> Played:
+    replies, played = state.replies, Played()
 
     def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
         if isinstance(record, TrialSuspended):
@@ -249,20 +230,18 @@ async def _play(chunk: Chunk, state: WorkerRun, coordinator: RemoteCoordinator) 
         played.ended.append((spec, record))
 
     async with AsyncExitStack() as stack:
-        folder = Path(stack.enter_context(TemporaryDirectory(prefix="merge-runner-")))
-        replies = stack.enter_context(closing(ResponseCache(folder)))
-        ledger = Ledger(replies, setup.plan.ledger, chunk.cap, coordinator)
-        overruns = [(driver, 0, 0, ratio) for driver, ratio in chunk.overruns]
-        replies.put_now(*chunk.calls, [partial(ledger.share, "", overruns, [])])
+        stack.enter_context(closing(replies))
         try:
-            calls = Calls()
+            if state.plan is None:
+                state.plan = _resolved(chunk.plan)
+            plan, options, calls = state.plan, chunk.options, Calls()
+            stack.enter_context(using(plan.parts.catalogue))
             clients = live_clients(
-                setup.plan, setup.options, setup.usage, replies, ledger, calls=calls, stack=stack,
-                urls=setup.urls, share=chunk.share,
+                plan, options, chunk.usage, replies, replies.ledger, calls=calls, stack=stack,
+                urls=chunk.urls, share=chunk.share,
                 limiters=state.limiters.setdefault(chunk.share, {}),
             )  # fmt: skip
-            in_flight = setup.options.in_flight
-            runner = LocalRunner(setup.plan, clients, in_flight, setup.first, calls=calls)
+            runner = LocalRunner(plan, clients, options.in_flight, chunk.first, calls=calls)
             played.meters = runner.meters
             work = asyncio.create_task(runner.play(chunk.specs, ended))
             stopped = asyncio.create_task(state.stopping.wait())
@@ -271,16 +250,12 @@ async def _play(chunk: Chunk, state: WorkerRun, coordinator: RemoteCoordinator) 
             stopped.cancel()
             await asyncio.wait([work])
             await runner.drain()
-            # Of whatever kind: the replies that are paid go to the coordinator all the same.
+            # Of whatever kind: the trials that have ended go to the coordinator all the same.
             error = None if work.cancelled() else work.exception()
         except MergeRunnerError as exc:
             error = exc
         if error is not None:
             played.fail(error)
-        known = {call.request.key for call in chunk.calls[0]}
-        new = [call for call in replies.entries() if call.request.key not in known]
-        played.calls = new, [*replies.all_unanswered().items()]
-        played.spent, played.opened = ledger.rows()
     return played
 
 

@@ -44,23 +44,6 @@ class Parts:
         """True where a program replays imported human trials."""
         return any(program.data is not None for program in self.programs.values())
 
-    def with_code(self, arms: Iterable[Arm], catalogue: Catalogue, hint: str = "") -> Parts:
-        """Return the same with the programs and wire formats of arms; raises UsageError."""
-        entries = {name: arm.entries.get(name) for arm in arms for name in arm.full_names.values()}
-        with using(catalogue):
-            return replace(
-                self,
-                programs={
-                    n: PROGRAMS.require(n, hint) for n, entry in entries.items() if not entry
-                },
-                formats={e.format: FORMATS[e.format] for e in entries.values() if e},
-                catalogue=catalogue,
-            )
-
-    def without_code(self) -> Parts:
-        """Return the same without the code of plug-ins, which are not installed everywhere."""
-        return Parts(self.conditions, self.prompts)
-
     def with_humans(self, connection: DuckDBPyConnection | None) -> Parts:
         """Return the same with the human trials of a database to replay; None: there are none."""
         programs = {n: program.replaying(connection) for n, program in self.programs.items()}
@@ -81,15 +64,16 @@ def find_parts(
 
     Raises UsageError, with a ``hint``, for an unknown name.
     """
+    entries = {name: arm.entries.get(name) for arm in arms for name in arm.full_names.values()}
+    prompts = dict.fromkeys(chain.from_iterable(map(_read, arms)))
     with using(catalogue):
-        parts = Parts(
+        return Parts(
             {name: CONDITIONS.require(name, hint) for name in conditions},
-            {
-                name: prompt_of(name)
-                for name in dict.fromkeys(chain.from_iterable(map(_read, arms)))
-            },
+            {name: prompt_of(name) for name in prompts},
+            {name: PROGRAMS.require(name, hint) for name, entry in entries.items() if not entry},
+            {entry.format: FORMATS[entry.format] for entry in entries.values() if entry},
+            catalogue,
         )
-    return parts.with_code(arms, catalogue, hint)
 
 
 def _read(arm: Arm) -> list[str]:

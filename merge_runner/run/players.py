@@ -12,7 +12,7 @@ from merge_runner.results.store import Store
 from merge_runner.run.clients import live_clients
 from merge_runner.run.cluster import ClusterRunner
 from merge_runner.run.cluster_connection import connected
-from merge_runner.run.cluster_worker import RunSetup
+from merge_runner.run.cluster_worker import Chunk
 from merge_runner.run.estimate import earlier_answers
 from merge_runner.run.guard import MOST_INVALID, FirstDecisions
 from merge_runner.run.local_runner import LocalRunner
@@ -36,8 +36,8 @@ async def open_player(
     if options.dask is not None:
         client = await stack.enter_async_context(connected(options.dask))
         urls = base_urls(plan.entries)
-        setup = RunSetup(secrets.token_hex(), plan, options, usage, first, urls)
-        return ClusterRunner(client, setup, session.cache, ledger)
+        whole = Chunk(secrets.token_hex(), plan, options, usage, first, urls)
+        return ClusterRunner(client, plan, whole, session.cache, ledger)
     calls = Calls()
     clients = live_clients(
         plan, options, usage, session.cache, ledger, calls=calls, stack=stack, rounds=rounds

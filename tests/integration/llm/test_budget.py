@@ -13,7 +13,7 @@ from merge_runner.errors import CacheFailed, RecordingError, TrialSuspended, Usa
 from merge_runner.llm import budget as admission
 from merge_runner.llm.attempts import Meter
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.ledger import _SUMS, CallLabel, Cap, Ledger, reasons
+from merge_runner.llm.ledger import _SUMS, CallLabel, Cap, Ledger, Spending, reasons
 from merge_runner.llm.store import CachedCall
 from merge_runner.records import Attempt, Slot, make_request
 from merge_runner.run.local_runner import LocalRunner
@@ -335,18 +335,9 @@ def test_what_is_booked_counts_at_once_whoever_has_reserved_or_released_it(ledge
     assert other.committed_usd == other.read().committed_usd == 0.3125
 
 
-async def test_a_task_s_share_gives_way_to_what_the_task_has_spent_and_open(ledger, tmp_path):
-    cache = ResponseCache(tmp_path)
-    task = Ledger(cache, "task")
-    for key in ("a", "b"):
-        now(task, task.reserve, key, 1, 0.25, O3)
-    now(task, task.book, "a", tried(0.5), O3.driver)
-    now(ledger, ledger.reserve, "task 1", 1, 2.0, O3)
-    now(ledger, ledger.share, "task 1", *task.rows())
-    assert ledger.read() == task.read()
-    assert (ledger.spending.spent_usd, ledger.spending.reserved_usd) == (0.5, 0.25)
-    assert ledger.spending.overruns[O3.driver] == 2
-    cache.close()
+def test_a_chunk_s_ledger_begins_with_the_overruns_that_are_known(ledger):
+    now(ledger, ledger.add_overruns, {O3.driver: 2.0, "o4": 1.5})
+    assert ledger.read() == Spending(overruns={O3.driver: 2.0, "o4": 1.5})
 
 
 @pytest.mark.parametrize("fails", ["keep", "book"])

@@ -1,7 +1,4 @@
-"""A sweep on a Dask cluster is the same sweep, whatever dies; what hinders it is told in one line.
-
-Its workers share nothing, so that a lost one's trials are asked again as a whole.
-"""
+"""A sweep on a Dask cluster is the same sweep, whatever dies; an error is told in one line."""
 
 import asyncio
 import contextlib
@@ -16,18 +13,16 @@ import sqlite3
 from contextlib import closing
 from functools import partial
 from importlib import import_module
-from types import SimpleNamespace
 
 import psutil
 import pytest
 
 from merge_runner.errors import SweepStopped, UsageError
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.ledger import CallLabel, Ledger, reasons
+from merge_runner.llm.ledger import CallLabel, Cap, Ledger
 from merge_runner.records import SLOT_HEADER, ReplayMiss
-from merge_runner.run.cluster import Assignment
 from merge_runner.run.cluster_connection import connected
-from merge_runner.run.cluster_worker import Chunk, Played, RemoteCoordinator, WorkerRun, go_on
+from merge_runner.run.cluster_worker import Played, RelayedCache, unpickled
 from tests.support.braking import deciding
 from tests.support.cluster import SIX, SMALL, all_held, ended, held_from, repetition_of, workers_of
 from tests.support.crossed_study import MODEL
@@ -51,39 +46,40 @@ conditions = ["L_4_0", "N_0_0"]
 [plugins]
 files = ["mine.py"]
 """
-# The worker's seventh attempt cannot be reserved.
+# The attempt after six replies cannot be reserved.
 UNWRITABLE = """
-CREATE TRIGGER full BEFORE INSERT ON open WHEN NEW.attempt = 7
+CREATE TRIGGER full BEFORE INSERT ON open WHEN (SELECT count(*) FROM Cache) >= 6
 BEGIN SELECT RAISE(ABORT, 'the disk is full'); END
 """
 
 
 @in_virtual_time
 async def test_a_coordinator_that_says_nothing_ends_its_workers_tasks():
-    with pytest.raises(SweepStopped, match="the coordinator has said nothing for 300 s"):
-        await RemoteCoordinator().reserve("a key", 1.0, CallLabel())
-    assert now_s() == 300
+    with closing(RelayedCache("baseline", None)) as cache:
+        with pytest.raises(SweepStopped, match="the coordinator has said nothing for 300 s"):
+            await cache.write(partial(cache.remove, "a name"))
+        assert now_s() == 300
+        (operation,), _ = await cache.exchange([])
+        assert operation
 
 
-async def test_an_attempt_waits_until_it_is_reserved_and_its_cost_is_booked(tmp_path):
-    async def attempt():
-        is_paid = await coordinator.reserve("a key", 1.0, CallLabel("o3"))
-        coordinator.report_cost("a key", 0.25)
-        return is_paid
+async def test_an_attempt_is_reserved_where_its_worker_and_the_coordinator_have_money(tmp_path):
+    async def coordinate():
+        results = []
+        while pending := await cache.exchange(results):
+            results = [await theirs.write(unpickled(each, stores)) for each in pending[0]]
+        return results
 
-    coordinator = RemoteCoordinator()
-    worker = SimpleNamespace(extensions={"run": WorkerRun(chunks={"task 1": coordinator})})
-    assignment = Assignment("tcp://1", Chunk("task 1", None, None, (), 1.0, ((), ()), ()))
-    coordinator.work = asyncio.create_task(attempt())
-    coordinator.work.add_done_callback(lambda _: coordinator.changed.set())
-    with closing(ResponseCache(tmp_path)) as cache:
-        ledger, answers, sums, ended = Ledger(cache, "baseline"), {}, [], None
-        while ended is None:
-            events, ended = await go_on("run", "task 1", answers, dask_worker=worker)
-            answers = await assignment._book(events, ledger)
-            sums.append((ledger.read().spent_usd, ledger.read().reserved_usd))
-    assert (ended, sums[0], sums[-1]) == (True, (0, 1.0), (0.25, 0))
-    assert worker.extensions["run"].chunks == {}
+    with closing(ResponseCache(tmp_path)) as theirs:
+        stores = {"ledger of baseline": Ledger(theirs, "baseline", Cap(0.75))}
+        with closing(RelayedCache("baseline", Cap(1.5))) as cache:
+            coordinator = asyncio.create_task(coordinate())
+            reserved = [
+                await cache.write(partial(cache.ledger.reserve, key, 1, usd, CallLabel("o3")))
+                for key, usd in (("a", 0.5), ("beyond all", 0.5), ("beyond the share", 0.75))
+            ]
+        assert (reserved, await coordinator) == ([True, False, False], [False])
+        assert stores["ledger of baseline"].read().reserved_usd == 0.5
 
 
 async def test_what_cannot_be_on_a_cluster_is_told_in_one_line(merge_runner, tmp_path):
@@ -201,10 +197,10 @@ async def test_replies_are_kept_where_the_cost_of_a_later_attempt_cannot_be_rese
     assert len(cached_calls(folder)) == 6
 
 
-async def test_a_worker_that_is_killed_costs_its_task_and_nothing_else(
+async def test_a_worker_that_is_killed_costs_its_calls_in_flight_and_nothing_else(
     merge_runner, started, tmp_path
 ):
-    """What its attempts have cost is spent, and what the others may have stays reserved."""
+    """What they may have cost stays reserved, and no answered call is made again."""
     gate = Gate(math.inf, tmp_path, decisions=3)  # of some ten: each trial begins, and none ends
     with (tmp_path / "models.toml").open("a") as file:
         file.write(DEAR.format(name="dear", price=1.0, hangs_s=HANGS_S))
@@ -224,48 +220,27 @@ async def test_a_worker_that_is_killed_costs_its_task_and_nothing_else(
         process = await started(*ON_TWO, *priced, **server.env)
         await all_held(gate, trials=4)
         victim = next(w for w in workers_of(process.pid) if held_from(gate, w))
-        lost = set(map(repetition_of, held_from(gate, victim)))
+        lost = held_from(gate, victim)
         victim.kill()
         await process.said("is lost: its ")
         gate.open()
         code, out, err = await ended(process)
         assert code == 0, err
         summary = json.loads(out)
-        again = set(map(repetition_of, gate.asked_again))
-        assert lost <= again
-        assert len(again) <= 3, "trials of the other worker are asked again, too"
+        assert gate.asked_again == lost
         assert summary["trials"]["finished"] + summary["trials"]["collided"] == 6
-        # Of a killed worker's trials each driver had been answered thrice, and waited once more.
         spent, aside = summary["sweep_cost_usd"], summary["set_aside_usd"]
         assert spent <= asked_usd + 1e-6 <= spent + aside + 2e-6
         (told,) = json.loads((await merge_runner("ledger", "--json")).out)
-        assert 0 < told["open_attempts"] <= 2 * len(lost)
-        assert 0 < aside <= told["open_attempts"] * (most_usd + 4000 * 2 / 1e6)
+        assert told["open_attempts"] == len(lost)
+        assert 0 < aside <= len(lost) * (most_usd + 4000 * 2 / 1e6)
         kept = [call.attempts[-1].cost_usd for call in cached_calls(tmp_path / "cache/responses")]
-        assert len(kept) == 114
-        assert spent > sum(kept) + most_usd, "what is lost is paid"
+        assert (len(kept), sum(kept)) == (114, pytest.approx(spent))
         requests = server.requests
         plain = await merge_runner(*SIX, *priced, "--db", "plain", **server.env)
         assert (plain.code, server.requests) == (0, requests), "a reply is not kept"
     digests = {(await merge_runner("digest", *db)).out for db in ((), ("--db", "plain"))}
     assert len(digests) == 1
-
-
-def test_the_share_of_a_task_stays_reserved_until_the_task_is_kept(tmp_path):
-    with closing(ResponseCache(tmp_path)) as cache:
-        ledger = Ledger(cache, "baseline")
-        for name in ("lost", "kept"):
-            asked = CallLabel("Dask worker tcp://1", "L_4_0", 5.0)
-            reserve = partial(ledger.reserve, name, 1, 5.0, asked)
-            assert cache.run_now([reserve]) == [True]
-        assert (ledger.read().reserved_usd, ledger.read().open_attempts) == (10, 2)
-        unclear = ("a key", 1, 0.5, "o3", "N_0_0", 0.5, "2026-01-01T00:00:00Z", "read_timeout")
-        cache.run_now([partial(ledger.share, "kept", [("o3", 1.5, 0.25, 2.0)], [unclear])])
-        spending = Ledger(cache, "baseline").read()
-        assert (spending.spent_usd, spending.reserved_usd, spending.open_attempts) == (1.5, 5.5, 2)
-        assert spending.overruns == {"o3": 2.0}
-        why = reasons(cache, ledger.scope)
-        assert [reason["driver"] for reason in why] == ["Dask worker tcp://1", "o3"]
 
 
 async def test_a_coordinator_that_is_killed_takes_its_workers_along_and_goes_on(
@@ -303,7 +278,7 @@ async def test_a_coordinator_that_is_killed_takes_its_workers_along_and_goes_on(
         # Their trials may be stored, too, before the kill comes.
         assert run.summary["calls"]["cached"] >= kept or run.summary["trials"]["stored_before"]
         asked_for = len(cached_calls(tmp_path / "cache/responses"))
-        assert server.requests - asked_for < asked_for - kept
+        assert server.requests - asked_for <= told["open_attempts"]
     assert run.summary["trials"]["finished"] + run.summary["trials"]["collided"] == 12
     assert run.summary["set_aside_usd"] == pytest.approx(told["reserved_usd"])
 

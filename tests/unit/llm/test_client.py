@@ -9,7 +9,6 @@ import pytest
 
 from merge_runner.drivers.language_model import Question
 from merge_runner.errors import EndpointRefused, QuotaExhausted, TrialSuspended, UsageError
-from merge_runner.llm.attempts import Meter
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.call import Calls
 from merge_runner.llm.http_outcome import TransportFailure
@@ -17,7 +16,6 @@ from merge_runner.llm.ledger import CallLabel
 from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.llm.store import CachedCall
 from merge_runner.records import Attempt, CallFailed, ReplayMiss, Usage
-from merge_runner.run.cluster_worker import RemoteCoordinator
 from tests.support.clients import PRICE, answer, begun, error, raw, slot, ticks
 from tests.support.virtual_time import now_s
 
@@ -308,28 +306,6 @@ async def test_drain_gives_up_calls_that_wait_for_their_turn(make):
         await client.ask("prompt", slot(3))
 
 
-@pytest.mark.parametrize("drains", [False, True])
-async def test_a_call_that_waits_for_its_coordinator_can_be_given_up(make, drains):
-    client, coordinator = make(answer(), price=PRICE), RemoteCoordinator()
-    client.budget.ledger.coordinator = coordinator
-    asked = await begun(client.ask("prompt", slot()))
-    (waits,) = client.calls.waits
-    assert "coordinator" in waits.what
-    if drains:
-        await client.calls.drain()
-    else:
-        asked.cancel()
-    await asyncio.wait([asked])
-    await ticks()
-    assert (client.direct.transport.sent, client.calls.waits) == ([], [])
-    assert client.budget.queued_usd == 0
-    assert [(event.number, event.is_cost) for event in coordinator.events] == [
-        (1, False),
-        (1, True),
-    ]
-    assert client.budget.ledger.read().open_attempts == 0
-
-
 @pytest.mark.parametrize("in_flight", [False, True])
 async def test_drain_does_not_wait_for_another_attempt(make, in_flight):
     client = make(error(503, retry_after="300"), answer())
@@ -354,14 +330,12 @@ async def test_drain_does_not_lose_an_answer_that_is_just_being_saved(make, tmp_
 
 
 async def test_a_call_knows_itself_whether_it_is_in_flight(make):
-    """A cluster's worker takes its meter away twice a second; that gives no call up."""
     client = make(error(503, retry_after="300"), answer("paid for"))
     retrying = await begun(client.ask("prompt", slot(1)))
     client.direct.transport.open.clear()
     flying = asyncio.create_task(client.ask("prompt", slot(2)))
     while client.calls.calls_in_flight != 1 or len(client.direct.transport.sent) < 2:
         await asyncio.sleep(0)
-    client.replies.meter = Meter()
     assert [wait.what for wait in client.calls.waits] == ["after HTTP 503: m"]
     drained = await begun(client.calls.drain())
     client.direct.transport.open.set()

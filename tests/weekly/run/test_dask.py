@@ -48,6 +48,7 @@ async def test_a_scheduler_that_dies_ends_the_run_in_one_line(merge_runner, sche
         assert "Traceback" not in run.err
         again = await merge_runner(*SMALL, EMULATOR_BASE_URL=url)
     assert again.code == 0, again.err
+    assert sum(server.asked.values()) <= len(server.asked) + 2, "an answered call is made again"
 
 
 async def test_a_worker_that_stands_still_holds_up_its_own_trials_alone(
