@@ -8,7 +8,7 @@ import logging
 import os
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar, copy_context
 from functools import cache, partial
@@ -108,6 +108,10 @@ async def in_thread(read: Callable[[], ResultT]) -> ResultT:
 
 
 SHARED = Instance()
+_ONE_AT_A_TIME = Lock()  # two threads may make a table of the same name
+RESET = "; ".join(
+    f"SET {name} = '{SETTINGS[name]}'" for name in ("memory_limit", "threads", "max_vacuum_tasks")
+)
 ATTACHED = "merge_runner_"  # prefix of the names of attached files
 # The file is held by another process, or by another connection of this one.
 _BUSY = ("Could not set lock", "Unique file handle conflict", "already attached")
@@ -115,10 +119,18 @@ _BUSY = ("Could not set lock", "Unique file handle conflict", "already attached"
 
 @contextmanager
 def open_database(
-    path: Path, *, read_only: bool, patience_s: float, instance: Instance = SHARED
+    path: Path,
+    *,
+    read_only: bool,
+    patience_s: float,
+    instance: Instance = SHARED,
+    cursor: duckdb.DuckDBPyConnection | None = None,
 ) -> Iterator[duckdb.DuckDBPyConnection]:
-    """Open the database once other programs have closed it; raises StoreError."""
-    connection, reading = instance.cursor(), _READING.get()
+    """Open the database once other programs have closed it; raises StoreError.
+
+    A ``cursor`` of the instance stays open; without one, there is a new one.
+    """
+    connection, reading = cursor or instance.cursor(), _READING.get()
     name = f"{ATTACHED}{id(connection)}"  # unique among the open files
     mode = "READ_ONLY" if read_only else f"READ_WRITE, ROW_GROUP_SIZE {ROWS_OF_A_GROUP}"
     # As an absolute path, since DuckDB gives names such as md:x or :memory: another meaning.
@@ -127,20 +139,20 @@ def open_database(
     try:
         if reading is not None:
             reading.uses(connection)
-        # An earlier user of the instance may have called limit_memory and merge_small_groups.
-        connection.execute(
-            f"USE {name}; SET memory_limit = '{SETTINGS['memory_limit']}'; "
-            f"SET threads = {SETTINGS['threads']}; "
-            f"SET max_vacuum_tasks = {SETTINGS['max_vacuum_tasks']}"
-        )
+        connection.execute(f"USE {name}")
         yield connection
         is_detached = _detach(connection, name)
+        if instance is SHARED:  # other instances may not be configured any more
+            # The user may have called limit_memory and merge_small_groups. The file is not held
+            # meanwhile: DuckDB returns memory to the system, which takes up to 7 ms.
+            connection.execute(RESET)
     finally:
         if not is_detached:  # as after any error of the block
             instance.drop()
         if reading is not None:
             reading.uses(None)
-        connection.close()
+        if cursor is None:
+            connection.close()
 
 
 def _detach(connection: duckdb.DuckDBPyConnection, name: str) -> bool:
@@ -240,20 +252,80 @@ def append(
         appender.flush()
 
 
+class Buffer:
+    """Rows in DuckDB's memory that a transaction adds to tables of the database.
+
+    To convert them takes as long as to add them, and needs no open file.
+    """
+
+    def __init__(self, columns: Mapping[str, Mapping[str, str]]) -> None:
+        """Make a buffer for these tables, whose columns have these types."""
+        self.cursor = SHARED.cursor()
+        self._appenders = {
+            table: _appender(self.cursor, table, types) for table, types in columns.items()
+        }
+
+    def add(self, rows: Mapping[str, Sequence[tuple[Any, ...]]]) -> None:
+        """Add rows by table; rows of other tables are left out."""
+        for table, appender in self._appenders.items():
+            appender.append_rows(rows.get(table, ()))
+
+    def flush(self) -> None:
+        """Add the rows to the database that is open on the cursor."""
+        for appender in self._appenders.values():
+            appender.flush()
+
+    def clear(self) -> None:
+        """Forget the rows."""
+        for appender in self._appenders.values():
+            appender.clear()
+
+    def close(self) -> None:
+        """Forget the rows, and close the cursor."""
+        self.clear()
+        self.cursor.close()
+
+
+def _appender(
+    cursor: duckdb.DuckDBPyConnection, table: str, types: Mapping[str, str]
+) -> duckdb.Appender:
+    # DuckDB looks for the table now, in the instance's memory, and for that of the open database at
+    # each flush. Without an open database, a flush is an error.
+    columns = ", ".join(f"{name} {kind}" for name, kind in types.items())
+    with _ONE_AT_A_TIME:
+        cursor.execute(f"CREATE TABLE IF NOT EXISTS {table} ({columns}, CHECK (false))")
+    return cursor.query_appender(f"INSERT INTO {table} FROM appender_data", dict(types))
+
+
+def columns_of(connection: duckdb.DuckDBPyConnection, table: str) -> dict[str, str]:
+    """Return the types of a table's columns by name."""
+    relation = connection.table(table)
+    return dict(zip(relation.columns, map(str, relation.types), strict=True))
+
+
 @contextmanager
 def write_database(
-    path: Path, patience_s: float = PATIENCE_S
+    path: Path, patience_s: float = PATIENCE_S, cursor: duckdb.DuckDBPyConnection | None = None
 ) -> Iterator[duckdb.DuckDBPyConnection]:
     """Open the database for one transaction, committed at the end; raises StoreError."""
-    with open_database(path, read_only=False, patience_s=patience_s) as connection:
-        try:
-            connection.begin()
-            yield connection
-            connection.commit()
-        except duckdb.Error as exc:
-            # DuckDB's own words on a commit, which is a checkpoint too, go before what went wrong.
-            why = first_line(exc).rpartition("Original error: ")[2]
-            raise StoreError(f"{path} cannot be used: {why}") from exc
+    with (
+        open_database(path, read_only=False, patience_s=patience_s, cursor=cursor) as connection,
+        errors_of(path),
+    ):
+        connection.begin()
+        yield connection
+        connection.commit()
+
+
+@contextmanager
+def errors_of(path: Path) -> Iterator[None]:
+    """Turn DuckDB's errors into a StoreError that names the database."""
+    try:
+        yield
+    except duckdb.Error as exc:
+        # DuckDB's own words on a commit, which is a checkpoint too, go before what went wrong.
+        why = first_line(exc).rpartition("Original error: ")[2]
+        raise StoreError(f"{path} cannot be used: {why}") from exc
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from datetime import datetime
 from itertools import chain, groupby
 from operator import itemgetter
@@ -18,8 +18,11 @@ from merge_runner.errors import UsageError
 from merge_runner.results.database import (
     PATIENCE_S,
     SCHEMA_VERSION,
+    Buffer,
     append,
     check_schema,
+    columns_of,
+    errors_of,
     fetched,
     has_these_measures,
     names_of,
@@ -48,6 +51,8 @@ IS_WRITTEN = """
 SELECT total_blocks > 0 OR wal_size <> '0 bytes' FROM pragma_database_size()
 WHERE database_name = current_database()
 """
+# Factor levels are no results: another study may have others for the same trial.
+RESULTS = [table for table in KEY_COLUMNS if table != FACTOR_TABLE]
 # Columns that depend on the run: whether it made an attempt itself, and when.
 RUN_COLUMNS = frozenset({"cached", "started_at", "latency_s"})
 # The first and the third column order the rows of a trial. Digests call the source of a first
@@ -82,6 +87,8 @@ class Store:
             else:
                 connection.execute(schema_sql())
                 connection.execute("INSERT INTO meta VALUES (?)", [SCHEMA_VERSION])
+            tables = (*RESULTS, "sweep_trials")
+            self._columns = {table: columns_of(connection, table) for table in tables}
 
     def begin_sweep(
         self, sweep: dict[str, Any], specs: dict[str, str], stored: Sequence[TrialSpec]
@@ -153,20 +160,21 @@ class Store:
         They are linked to a sweep unless ``sweep_id`` is None. Returns the keys of trials that are
         stored with other values, with the differing columns.
         """
-        # Made before the database is locked, so that the lock is short.
-        played = [(record.spec.key, record.status, rows_of(record)) for record in records]
         calls = [call for record in records for call in record.calls]
-        texts = [call.request.body for call in calls]
-        texts += [attempt.reply or "" for call in calls for attempt in call.attempts]
-        with write_database(self.path, patience_s) as connection:
-            limit_memory(connection, max(map(len, texts), default=0))
-            merge_small_groups(connection, sum(len(rows["calls"]) for *_, rows in played))
-            if specs:
-                _add_specs(connection, specs)
-            differing = _add_trials(connection, played)
-            if sweep_id is not None:
-                append(connection, "sweep_trials", ((sweep_id, *key) for key, *_ in played))
-            return differing
+        replies = [attempt.reply or "" for call in calls for attempt in call.attempts]
+        texts = [*(call.request.body for call in calls), *replies]
+        links = [] if sweep_id is None else [(sweep_id, *record.spec.key) for record in records]
+        with errors_of(self.path), closing(Buffer(self._columns)) as buffer:
+            # Before the database is locked, so that the lock is short.
+            buffer.add({"sweep_trials": links})
+            for record in records:
+                buffer.add(rows_of(record))
+            with write_database(self.path, patience_s, buffer.cursor) as connection:
+                limit_memory(connection, max(map(len, texts), default=0))
+                merge_small_groups(connection, len(replies))
+                if specs:
+                    _add_specs(connection, specs)
+                return _add_trials(connection, records, buffer, links)
 
     def add_recorded(
         self, records: Sequence[TrialRecord], specs: Mapping[str, str]
@@ -289,36 +297,45 @@ def _ended(connection: duckdb.DuckDBPyConnection, keys: Sequence[TrialKey]) -> d
 
 def _add_trials(
     connection: duckdb.DuckDBPyConnection,
-    played: Sequence[tuple[TrialKey, str, dict[str, list[Row]]]],
+    records: Sequence[TrialRecord],
+    buffer: Buffer,
+    links: Sequence[Row],
 ) -> dict[TrialKey, list[str]]:
     """Store whole trials, replacing failed ones; compare those that are already stored.
 
-    Returns the keys of trials that are stored with other values, with the differing columns.
+    The buffer has the rows of all of them. Returns the keys of trials that are stored with other
+    values, with the differing columns.
     """
-    stored = _ended(connection, [key for key, *_ in played])
-    new: dict[TrialKey, dict[str, list[Row]]] = {}
-    again: dict[TrialKey, dict[str, list[Row]]] = {}
-    for key, status, rows in played:
+    stored = _ended(connection, [record.spec.key for record in records])
+    new: dict[TrialKey, TrialRecord] = {}
+    again: dict[TrialKey, TrialRecord] = {}
+    for record in records:
+        key = record.spec.key
         if not stored.get(key) and key not in new:
-            new[key] = rows
-        elif status != "failed":
-            again[key] = rows
-    # Factor levels are no results: another study may have others for the same trial.
-    results = [table for table in KEY_COLUMNS if table != FACTOR_TABLE]
-    for table in results:
+            new[key] = record
+        elif record.status != "failed":
+            again[key] = record
+    if len(new) < len(records):
+        buffer.clear()
+        buffer.add({"sweep_trials": links})
+        for record in new.values():
+            buffer.add(rows_of(record))
+    for table in RESULTS:
         for key in new.keys() & stored.keys():
             connection.execute(
                 f"DELETE FROM {table} WHERE trial_id = ? AND spec_hash = ?",  # noqa: S608 # constants
                 key,
             )
-        append(connection, table, chain.from_iterable(rows[table] for rows in new.values()))
-    for played_rows in (new, again):
-        levels = [row for rows in played_rows.values() for row in rows[FACTOR_TABLE]]
+    buffer.flush()
+    for of_trials in (new, again):
+        levels = [row for record in of_trials.values() for row in factor_rows(record.spec)]
         _add_factors(connection, levels)
     differing: dict[TrialKey, list[str]] = {}
-    for table in results if again else ():
+    rows = {key: rows_of(record) for key, record in again.items()}
+    for table in RESULTS if again else ():
         stored_trials = stored_rows(connection, table, list(again))
-        for key, rows in again.items():
-            for difference in stored_trials.differences(key, rows[table], ignored=RUN_COLUMNS):
+        for key in again:
+            expected = rows[key][table]
+            for difference in stored_trials.differences(key, expected, ignored=RUN_COLUMNS):
                 differing.setdefault(key, []).append(difference.name)
     return differing

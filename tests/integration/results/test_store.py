@@ -4,7 +4,7 @@ import asyncio
 import shutil
 import subprocess
 import sys
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from datetime import datetime
 from functools import partial
@@ -16,8 +16,8 @@ import pytest
 from merge_runner.audit.checks import audited_database, sweep_facts
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.registry import PROGRAMS
-from merge_runner.errors import StoreLocked, UsageError
-from merge_runner.results.database import append, in_thread, open_database
+from merge_runner.errors import StoreError, StoreLocked, UsageError
+from merge_runner.results.database import Buffer, append, in_thread, open_database
 from merge_runner.results.instance import Instance
 from merge_runner.results.store import Store, query, results_digest
 from merge_runner.results.sweeps import sweeps_to_export
@@ -228,6 +228,19 @@ async def test_trials_wait_in_memory_while_the_database_is_locked(store, path, h
     assert f"1 trials wait to be stored: {path} is held by python" in said[0]
     assert f"(PID {process.pid}): close it there" in said[0]
     assert query(path, "select count(*) from trials")[1] == [(1,)]
+
+
+def test_rows_are_converted_before_the_database_is_locked(store, holder):
+    unfit = replace(played(), status="failed", error="half of a pair: \ud800")
+    with holder(), pytest.raises(StoreError, match=r"cannot be used: .* surrogate"):
+        store.write("s1", [played(), unfit], patience_s=0)
+
+
+def test_rows_that_are_added_to_no_open_database_are_refused():
+    with closing(Buffer({"table_of_a_file": {"number": "BIGINT"}})) as buffer:
+        buffer.add({"table_of_a_file": [(1,)]})
+        with pytest.raises(duckdb.ConstraintException):
+            buffer.flush()
 
 
 def test_a_database_that_this_process_holds_itself_is_named_unless_we_hold_it(store, path):
