@@ -121,12 +121,12 @@ def _ask(study: StudySource, risks: Collection[tuple[Path, str]]) -> None:
     words = one_line("; ".join(f"{file} {does}" for file, does in risks))
     if not sys.stdin.isatty():
         raise UsageError(
-            f"{words}. There is no terminal to ask at: read these files, then add --trust (in "
-            "Python: trust=True)"
+            f"{words}. There is no terminal to ask at, which would show the code: read these "
+            "files, then add --trust (in Python: trust=True)"
         )
     if study.path in [file for file, _ in risks]:
         for name, source in study.plugins.items():
-            sys.stderr.write(printable(f"---- {study.path.parent / name}\n{source}\n----\n"))
+            sys.stderr.write(printable(f"---- {name} of {study.path}\n{source}\n----\n"))
     say(words)
     sys.stderr.write("Go ahead? [y]es, [N]o: ")
     sys.stderr.flush()
