@@ -300,7 +300,7 @@ class Budget:
         elsewhere = f", {elsewhere_usd:.4f} by others under this cap" if is_elsewhere else ""
         total_usd = self.ledger.committed_usd + self.queued_usd
         return TrialSuspended(
-            f"{what}, and {total_usd:.4f} of {cap.usd:g} USD are spent or reserved "
+            f"{what}, and {total_usd:.4f} of {cap.usd:g} USD ({cap.source}) are spent or reserved "
             f"({spending.spent_usd:.4f} spent, {reserved_usd:.4f} reserved for "
             f"{spending.open_attempts} attempts whose cost is not known{elsewhere}: "
             "`merge-runner ledger`); "

@@ -409,9 +409,9 @@ async def test_a_suspended_trial_says_what_the_cap_is_needed_for(ledger):
     with pytest.raises(TrialSuspended) as caught:
         await set_aside(budget, 1, 5.0)
     assert str(caught.value) == (
-        "the next call may cost 5.0000 USD, and 1.0000 of 5 USD are spent or reserved (0.5000 "
-        "spent, 0.5000 reserved for 1 attempts whose cost is not known: `merge-runner ledger`); "
-        "3.0000 more are reserved for the trials that have begun"
+        "the next call may cost 5.0000 USD, and 1.0000 of 5 USD (--max-cost) are spent or reserved "
+        "(0.5000 spent, 0.5000 reserved for 1 attempts whose cost is not known: "
+        "`merge-runner ledger`); 3.0000 more are reserved for the trials that have begun"
     )
 
 
