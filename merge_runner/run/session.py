@@ -130,4 +130,4 @@ def _cap(
             others.append(scope)
     if spent_usd := sum(Ledger(cache, scope).read().committed_usd for scope in others):
         say(f"{spent_usd:.4f} USD of {', '.join(others)} count against the budget, too")
-    return Cap(usd, source, (ledger, *others))
+    return Cap(usd, source, tuple(others))

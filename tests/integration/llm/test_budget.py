@@ -135,7 +135,7 @@ async def test_the_ledger_refuses_what_two_processes_reserved_at_once(ledger, ca
     # Neither knows of the other's yet.
     paid = [await set_aside(budget, trial, 0.75) for trial, budget in enumerate(both)]
     await paid[0].begin(1)
-    with pytest.raises(TrialSuspended, match="others under the same cap"):
+    with pytest.raises(TrialSuspended, match="the cap was used up while the attempt waited"):
         await paid[1].begin(1)
     assert both[1].ledger.read().committed_usd == 0.75
 
