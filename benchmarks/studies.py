@@ -158,7 +158,7 @@ def _played(
             decisions.append(DecisionRow(start // HELD, world.time_s, side, found))
         for step in range(start, start + HELD):
             if world.status is None and not lost:
-                world.advance({side: actions[side][step] for side in SIDES})
+                world.drive([actions["left"][step]], [actions["right"][step]])
     return TrialRecord(
         spec,
         world.status or "failed",
@@ -200,7 +200,8 @@ def _human(rng: np.random.Generator, name: str, rep: int) -> TrialRecord:
     actions = _actions(rng, condition, 0.05)
     pair = list(PAIRS.values())[rep % len(PAIRS)]
     while world.status is None:
-        world.advance({side: actions[side][world.step // 4] for side in SIDES})
+        now = world.step // 4
+        world.drive([actions["left"][now]], [actions["right"][now]])
     spec = TrialSpec(
         f"human/{pair}/{name}/iter{rep:03d}",
         *(SPEC_HASH, "human", "human", "human", None, name, rep, 0, 0),

@@ -1,4 +1,4 @@
-"""Configuration as frozen models; the only reader of TOML files and the environment."""
+"""Configuration as frozen models; the only reader of TOML files."""
 
 from __future__ import annotations
 

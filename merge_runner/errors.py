@@ -1,4 +1,8 @@
-"""All errors of the program, as one tree of exceptions."""
+"""Errors that users see as one line, as a tree of exceptions.
+
+Those of one call or attempt derive from MergeRunnerError where they are raised: CallFailed and
+ReplayMiss (``records``), TryAgain, TransportFailure and BatchFailed (``llm``).
+"""
 
 from __future__ import annotations
 

@@ -210,11 +210,6 @@ class ChatReply:
     attempts: tuple[Attempt, ...]
     cached_attempts: int
 
-    @property
-    def cached(self) -> bool:
-        """True if all attempts are from earlier runs or other trials."""
-        return self.cached_attempts == len(self.attempts)
-
 
 @dataclass(frozen=True, slots=True)
 class Decision:

@@ -38,7 +38,8 @@ T = TypeVar("T")
 class Catalogue:
     """Parts that a study adds, by kind and name.
 
-    ``text`` is the study's file, ``plugins`` the sources of its plug-ins by file name.
+    ``text`` is the study's file, empty where no study is loaded; ``plugins`` has the sources of its
+    plug-ins by file name.
     """
 
     text: str = ""

@@ -11,7 +11,6 @@ from copy import copy
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from functools import partial, wraps
-from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
@@ -97,12 +96,12 @@ def sweep(
     dry_run: Annotated[bool, cli.flag("--dry-run", DRY_RUN, **cli.PACE)] = False,
     show_prompts: Annotated[bool, cli.flag("--show-prompts", SHOW_PROMPTS, **cli.PACE)] = False,
     max_cost_usd: Annotated[
-        float | None, cli.option("USD", MAX_COST, "--max-cost", min=0, **cli.PACE)
+        float | None, cli.option("USD", MAX_COST, "--max-cost", **cli.PACE)
     ] = None,
     batch: Annotated[bool, cli.flag("--batch", BATCH, **cli.PACE)] = False,
-    in_flight: Annotated[int, cli.option("N", IN_FLIGHT, min=1, **cli.PACE)] = 200,
-    rpm: Annotated[int | None, cli.option("N", RPM, min=1, **cli.PACE)] = None,
-    tpm: Annotated[int | None, cli.option("N", TPM, min=1, **cli.PACE)] = None,
+    in_flight: Annotated[int, cli.option("N", IN_FLIGHT, **cli.PACE)] = 200,
+    rpm: Annotated[int | None, cli.option("N", RPM, **cli.PACE)] = None,
+    tpm: Annotated[int | None, cli.option("N", TPM, **cli.PACE)] = None,
     dask: Annotated[str | None, cli.option("CLUSTER", DASK, **cli.PACE)] = None,
     strict_model: Annotated[bool, cli.flag("--strict-model", STRICT, **cli.FAULTS)] = False,
     keep_going: Annotated[bool, cli.flag("--keep-going", KEEP_GOING, **cli.FAULTS)] = False,
@@ -123,8 +122,6 @@ def sweep(
     """
     from merge_runner.run.options import Options
 
-    if not isfinite(max_cost_usd or 0):
-        raise UsageError("--max-cost is a number of USD")
     if show_prompts and not dry_run:
         raise UsageError("--show-prompts goes with --dry-run")
     if replay and dask is not None:
@@ -180,16 +177,17 @@ def _play_all(
     options: Options,
 ) -> int:
     """Play studies one after the other; return the first exit code that is not 0."""
-    if len(studies) > 1:  # all plans are made before the first one is played
-        ledgers = [plan.ledger for name in studies for plan in plans(name)]
-        options = replace(options, ledgers=() if options.max_cost_usd is None else ledgers)
+    planned = [(name, plans(name)) for name in studies]
+    if options.max_cost_usd is not None:  # one cap covers them all
+        ledgers = [plan.ledger for _, made in planned for plan in made]
+        options = replace(options, ledgers=ledgers)
     codes = []
-    for name in studies:
+    for name, made in planned:
         if len(studies) > 1:
             say(f"{name}:")
         files = [Path(name)] if name.endswith(".parquet") else []
         played = replace(options, recordings=(*files, *options.recordings))
-        codes += [play(plan, played) for plan in plans(name)]
+        codes += [play(plan, played) for plan in made]
         # Trials that failed, or are not recorded, are no reason to leave the next sweep out.
         if codes[-1] not in (0, 1, 4):
             break

@@ -1,6 +1,6 @@
 """Drivers of vehicles: the built-in programs, and language models."""
 
-# The built-in programs, each of which registers itself.
+# The built-in programs: the import of each registers it in PROGRAMS.
 from merge_runner.drivers import (
     cei,
     constant,

@@ -17,8 +17,10 @@ from merge_runner.trial_records import TrialSpec
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """Prompt for the model of a driver; ``decision`` makes the decision of prompt and reply.
+    """Prompt for the model of a driver.
 
+    ``decision`` makes the decision of prompt and reply, and gives the driver its plan: it is called
+    once.
     ``older`` is the prompt as earlier versions worded it for a driver without a valid plan: "this
     is your first decision". A stored reply to it is replayed in place of a new call.
     """

@@ -35,12 +35,12 @@ from merge_runner.records import Attempt
 
 # A run of another model, in another process under the same cap, may free money.
 READ_EVERY_S = 90.0
-USED_UP = "others under the same cap have used it up"
+USED_UP = "the cap was used up while the attempt waited, by others under it or by an overrun"
 
 
 @dataclass(slots=True)
 class Reservation:
-    """Worst case of one attempt, ``usd``, from its reservation to its end, ``close``.
+    """Worst case of one attempt, ``usd``: the constructor reserves it, ``close`` ends it.
 
     While ``queued`` it is reserved in this process, and after ``begin`` in the ledger. ``close``
     returns money to the trial: ``usd`` if the attempt has not begun, ``usd`` less the cost if the
@@ -71,7 +71,7 @@ class Reservation:
     async def begin(self, number: int) -> None:
         """Reserve in the ledger, right before the attempt is sent.
 
-        Raises TrialSuspended if other processes have used up the cap.
+        Raises TrialSuspended if the cap was used up meanwhile.
         """
         if not self.queued:  # it is reserved: by an earlier run, or for a batch that was refused
             return
@@ -170,7 +170,7 @@ class MoneyQueue:
 class Budget:
     """Spending under a ledger's cap; without a cap it is only recorded.
 
-    All models of a run that have a price share a budget. Models without a price share another,
+    All models of a run share a budget, also those of unknown price. Only free models share another,
     without a cap. A trial is named by its order in the sweep; ``trial_usd`` returns its expected
     cost. ``open_reservations`` counts reservations, ``queued_usd`` is reserved in this process
     alone. ``expected_usd`` has, by running trial, the rest of its expected cost, below 0 where it
@@ -270,7 +270,7 @@ class Budget:
         return label.worst_usd * self.ledger.spending.overruns.get(label.driver, 1.0)
 
     def _left_usd(self, needed_usd: float) -> float:
-        """Return the USD left under the cap.
+        """Return the USD left under the cap, less what is reserved in this process alone.
 
         What is spent and reserved is summed anew before a trial is suspended, as other processes
         may have freed money.
@@ -298,7 +298,7 @@ class Budget:
         elsewhere = f", {elsewhere_usd:.4f} by others under this cap" if is_elsewhere else ""
         total_usd = self.ledger.committed_usd + self.queued_usd
         return TrialSuspended(
-            f"{what}, and {total_usd:.4f} of {cap.usd:g} USD are spent or reserved "
+            f"{what}, and {total_usd:.4f} of {cap.usd:g} USD ({cap.source}) are spent or reserved "
             f"({spending.spent_usd:.4f} spent, {reserved_usd:.4f} reserved for "
             f"{spending.open_attempts} attempts whose cost is not known{elsewhere}: "
             "`merge-runner ledger`); "

@@ -181,8 +181,8 @@ def may_be_charged(raw: RawReply, endpoint: str) -> bool:
     """Return whether a reply without usage may have been billed.
 
     Not billed are refusals before any work, and errors that a provider's own host sends in the
-    documented form (``endpoint`` identifies the host). An error of a gateway, or a timeout, may
-    follow a generated answer.
+    documented form: ``endpoint`` is an ``Endpoint.identity``, a provider's name only at that host.
+    An error of a gateway, or a timeout, may follow a generated answer.
     """
     provider = PROVIDERS.get(endpoint)
     if raw.status < 300 or raw.status in TOO_LATE or '"usage' in raw.body:

@@ -59,11 +59,11 @@ WHERE scope = ? GROUP BY driver, outcome ORDER BY sum(usd) DESC
 
 @dataclass(frozen=True, slots=True)
 class Cap:
-    """Spending limit: ``usd`` over the ledgers named in ``scopes``, given by ``source``."""
+    """Spending limit of a ledger, ``usd``, as ``source`` sets it; ``others`` share it."""
 
     usd: float
     source: str = "--max-cost"
-    scopes: tuple[str, ...] = ()
+    others: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +142,7 @@ class Ledger:
         self.spending = Spending()
         self.committed_usd = 0.0
         self._in_transaction_usd = 0.0  # the writer's: read() may replace committed_usd meanwhile
-        self._others = json.dumps([name for name in cap.scopes if name != scope] if cap else [])
+        self._others = json.dumps(cap.others if cap else ())
         # A replay spends nothing and needs no record: a damaged one is an error only in a live run.
         with contextlib.suppress(UsageError, CacheFailed, RecordingError):
             self.read()
@@ -153,7 +153,10 @@ class Ledger:
         return self.cap.usd - self.committed_usd if self.cap is not None else math.inf
 
     def read(self) -> Spending:
-        """Sum the record and return the spending; raise UsageError where it is damaged."""
+        """Sum the record anew, into ``spending`` and ``committed_usd``, and return the spending.
+
+        Raises UsageError where it is damaged.
+        """
         if self.scope:
             self.committed_usd = self._sum(self.store.rows(_SUMS, self.scope, self._others))
         return self.spending

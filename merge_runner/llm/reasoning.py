@@ -40,7 +40,7 @@ _FENCE = "```"
 _NEARBY = 80
 
 
-class Parts(NamedTuple):
+class SplitText(NamedTuple):
     """Parts of a reply's text; ``cut``: it ends within the reasoning."""
 
     reasoning: str
@@ -48,7 +48,7 @@ class Parts(NamedTuple):
     cut: bool = False
 
 
-def split_reasoning(text: str) -> Parts:
+def split_reasoning(text: str) -> SplitText:
     """Return the reasoning and the answer of a reply's text, without the tags."""
     opening = _OPENING.match(text)
     if opening is None:
@@ -56,21 +56,21 @@ def split_reasoning(text: str) -> Parts:
     rest = text[opening.end() :]
     ends = _ends(rest)
     if not ends:
-        return Parts(rest, "", cut=True)
+        return SplitText(rest, "", cut=True)
     end = next((tag for tag in ends if _is_followed(rest, tag)), ends[0])
     thoughts, answer = rest[: end.start()], _answer(rest, end)
     if again := _OPENING.match(answer):  # and no closing tag follows that
-        return Parts(thoughts + answer[again.end() :], "", cut=True)
-    return Parts(thoughts, answer)
+        return SplitText(thoughts + answer[again.end() :], "", cut=True)
+    return SplitText(thoughts, answer)
 
 
-def _without_opening(text: str) -> Parts:
+def _without_opening(text: str) -> SplitText:
     if bare := _BARE_CHANNELS.match(text):
-        return Parts(bare[0].removesuffix(_BARE_FINAL), text[bare.end() :])
+        return SplitText(bare[0].removesuffix(_BARE_FINAL), text[bare.end() :])
     for end in _ends(text):
         if _is_followed(text, end) and not _is_a_word(text, end):
-            return Parts(text[: end.start()], _answer(text, end))
-    return Parts("", text)
+            return SplitText(text[: end.start()], _answer(text, end))
+    return SplitText("", text)
 
 
 def _ends(text: str) -> list[re.Match[str]]:

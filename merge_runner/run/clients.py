@@ -50,10 +50,10 @@ def live_clients(
 ) -> dict[str, LlmClient]:
     """Return clients with connections, closed with ``stack``, and a share of the rate limits.
 
-    ``usage`` is a result of ``earlier_answers``. ``rounds`` are this run's; they get the
-    batch modes of its models. Variables in ``urls`` override the environment. ``limiters``, by
-    registered model, are reused from earlier clients; new ones are added. Raises UsageError
-    where a key is missing, or a cap could not be enforced.
+    ``usage`` is a result of ``earlier_answers``: a model in it has answered before. ``rounds`` are
+    this run's; they get the batch modes of its models. Variables in ``urls`` override the
+    environment. ``limiters``, by registered model, are reused from earlier clients; new ones are
+    added. Raises UsageError where a key is missing, or a cap could not be enforced.
     """
     _check_money(plan, ledger)
     _allow_files(options.connections + SPARE_FILES)

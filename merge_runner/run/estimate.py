@@ -91,8 +91,8 @@ class Estimate:
     It is ``measured`` if the tokens per call come from earlier replies. ``singly_usd`` is the
     cost of normal requests; batches cost less, and take ``rounds`` in place of minutes.
     ``usd_by_model`` has the models of the registry. ``planned`` counts all trials, also the
-    ``stored`` ones. ``left_usd`` is left under the cap; None: there is no cap. ``output_caps`` has
-    the maximum tokens of a reply by model.
+    ``stored`` ones. ``left_usd`` is left under the cap that ``cap_source`` sets; None: there is no
+    cap. ``output_caps`` has the maximum tokens of a reply by model.
     """
 
     driver: str
@@ -110,6 +110,7 @@ class Estimate:
     stored: int = 0
     usd_by_model: dict[str, float | None] = field(default_factory=dict)
     left_usd: float | None = None
+    cap_source: str | None = None
     output_caps: dict[str, int] = field(default_factory=dict)
 
 

@@ -35,7 +35,7 @@ def _by_cap(expected: Estimate) -> Iterator[str]:
     if left_usd is not None and cost_usd and left_usd < cost_usd:
         yield (
             f"        stops at {left_usd:.2f} USD, about {100 * left_usd / cost_usd:.0f} % of it: "
-            "what --max-cost, or the study's budget, leaves"
+            f"what {expected.cap_source} leaves"
         )
 
 

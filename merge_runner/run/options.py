@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 
+from merge_runner.errors import UsageError
 from merge_runner.providers import ModelEntry
 
 
@@ -38,6 +40,18 @@ class Options:
     batch: bool = False
     typed: Sequence[str] = ()
     name: str = ""
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for a number that no run can use, by whichever name it was given."""
+        usd = self.max_cost_usd
+        if usd is not None and not (usd >= 0 and isfinite(usd)):
+            raise UsageError(f"--max-cost (max_cost_usd) is a number of USD from 0, not {usd:g}")
+        for name in ("in_flight", "rpm", "tpm"):
+            number = getattr(self, name)
+            if number is not None and number < 1:
+                option = f"--{name.replace('_', '-')}"
+                shown = option if option == f"--{name}" else f"{option} ({name})"
+                raise UsageError(f"{shown} is a whole number from 1, not {number}")
 
     @property
     def connections(self) -> int:

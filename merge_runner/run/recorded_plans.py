@@ -38,7 +38,7 @@ def recorded_plans(file: Path, *, db: Path, trust: bool) -> Iterator[Plan]:
         elif plan.trials > MOST_TRIALS:
             raise RecordingError(f"{file} claims {plan.trials:,} trials")
         else:
-            plan = _with_parts(plan, db, trust=trust)
+            plan = _with_parts(file, plan, db, trust=trust)
         if (text := plan.model_dump_json()) not in seen:
             seen.add(text)
             yield plan
@@ -46,10 +46,11 @@ def recorded_plans(file: Path, *, db: Path, trust: bool) -> Iterator[Plan]:
         raise RecordingError(f"{file} does not say what was played")
 
 
-def _with_parts(plan: Plan, db: Path, *, trust: bool) -> Plan:
-    _, catalogue = load_study(plan.study, trust=trust)
+def _with_parts(file: Path, plan: Plan, db: Path, *, trust: bool) -> Plan:
+    study = plan.study.model_copy(update={"path": file})  # named in the question and in errors
+    _, catalogue = load_study(study, trust=trust)
     parts = find_parts(plan.arms, plan.conditions, catalogue).with_humans_of(db)
-    return plan.model_copy(update={"parts": parts})
+    return plan.model_copy(update={"study": study, "parts": parts})
 
 
 def _of_a_known_study(file: Path, name: str, config: dict[str, object], db: Path) -> Plan:

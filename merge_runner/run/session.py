@@ -99,7 +99,7 @@ async def open_session(
         if live and options.dask is None:
             for name, entry in plan.entries.items():
                 resolve_endpoint(name, entry)  # raises where its key is missing
-        cap = _cap(plan, options, cache, say, is_open=bool(todo) and not options.replay)
+        cap = _cap(plan, options, cache, say, is_open=bool(todo))
         if live:
             cache.run_now([])  # raises before anything is asked if it cannot be written
             models = plan.entries.items()
@@ -111,7 +111,7 @@ async def open_session(
 def _cap(
     plan: Plan, options: Options, cache: ResponseCache, say: Callable[[str], None], *, is_open: bool
 ) -> Cap | None:
-    """Return the cap of a run, by --max-cost or by its study's budget; None: there is none.
+    """Return the cap of a run, by --max-cost or by its study's budget; None in a replay, too.
 
     If something ``is_open`` to be run, it also covers the ledgers of sweeps under the same cap. A
     study with a budget has one ledger by its name, without a budget one for each set of models:
@@ -121,7 +121,7 @@ def _cap(
     usd, source = options.max_cost_usd, "--max-cost"
     if usd is None:
         usd, source = plan.study.file.budget.get("total_usd"), f"[budget] of {study}"
-    if usd is None:
+    if usd is None or options.replay:
         return None
     others = []
     for scope in scopes(cache) if is_open else ():
@@ -130,4 +130,4 @@ def _cap(
             others.append(scope)
     if spent_usd := sum(Ledger(cache, scope).read().committed_usd for scope in others):
         say(f"{spent_usd:.4f} USD of {', '.join(others)} count against the budget, too")
-    return Cap(usd, source, (ledger, *others))
+    return Cap(usd, source, tuple(others))

@@ -79,7 +79,7 @@ def as_dict(
 
 
 def _counts(progress: Progress) -> dict[str, Any]:
-    spending, meter = progress.ledger.spending, progress.meter()
+    spending, meter, cap = progress.ledger.spending, progress.meter(), progress.ledger.cap
     return {
         "calls": {"live": meter.calls_live, "cached": meter.calls_cached},
         "calls_shared": meter.calls_shared,
@@ -90,6 +90,8 @@ def _counts(progress: Progress) -> dict[str, Any]:
         "sweep_cost_usd": round(spending.spent_usd, 6),
         "set_aside_usd": round(spending.reserved_usd, 6),
         "attempts_of_unknown_cost": spending.open_attempts,
+        "cap_usd": cap.usd if cap else None,
+        "cap_source": cap.source if cap else None,
         "over_the_worst_case_usd": round(spending.overrun_usd, 6),
         "dearest": spending.largest_overruns,
         "underpriced": meter.underpriced,
@@ -191,6 +193,8 @@ def _costs(summary: dict[str, Any]) -> Iterator[str]:
     text = f"calls: {calls}; cost {summary['cost_usd']:.4f} USD{alone}{unknown}"
     if (expected := summary["estimate"]) is not None:
         text += f"; estimated before: {expected['calls']} calls, {usd_text(expected['cost_usd'])}"
+    if (cap_usd := summary["cap_usd"]) is not None:
+        text += f"; cap: {cap_usd:g} USD ({summary['cap_source']})"
     yield text
     if apart:
         ledger = command_at("merge-runner ledger", "--cache", summary["cache"], DEFAULT_CACHE)

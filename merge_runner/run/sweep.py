@@ -169,10 +169,11 @@ async def estimate_rest(session: Session, *, whole: bool = False) -> Estimate:
         facts=facts,
         latencies_s=usual_latencies_s(plan, cache, facts),
     )
-    if session.ledger.cap is None or whole:
+    ledger = session.ledger
+    if ledger.cap is None or whole:
         return expected
-    session.ledger.read()
-    return replace(expected, left_usd=max(0.0, session.ledger.left_usd))
+    ledger.read()
+    return replace(expected, left_usd=max(0.0, ledger.left_usd), cap_source=ledger.cap.source)
 
 
 async def unsent(

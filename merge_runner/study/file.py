@@ -229,7 +229,7 @@ class StudyFile(Frozen):
 class StudySource(Frozen):
     """Text of a study file, with the source of its plug-ins by file name.
 
-    A study from a database has no ``path``.
+    ``path`` is the study's file, or the recording that holds it; a study from a database has none.
     """
 
     name: str

@@ -58,7 +58,7 @@ STUDY_PLUGINS = "study_plugins"
 
 
 def load_study(
-    name: str | StudySource,
+    named: str | StudySource,
     models: Sequence[str] | None = None,
     *,
     trust: bool = False,
@@ -66,11 +66,12 @@ def load_study(
 ) -> tuple[StudySource, Catalogue]:
     """Read a study, and return it with its catalogue after the user's consent to its code.
 
-    ``registered`` are parts that were registered for it. ``models`` replace the file's models; an
-    empty sequence replaces none, and None means that no model is called. Consent also covers the
-    servers that get keys. ``trust`` gives consent. Raises UsageError.
+    ``named`` is its name, its path, or its source if it has been read. ``registered`` are parts
+    that were registered for it. ``models`` replace the file's models; an empty sequence replaces
+    none, and None means that no model is called. Consent also covers the servers that get keys.
+    ``trust`` gives consent. Raises UsageError.
     """
-    study = read_study(name) if isinstance(name, str) else name
+    study = read_study(named) if isinstance(named, str) else named
     file = study.file
     called: set[str] = set()
     if models is not None:
@@ -121,12 +122,12 @@ def _ask(study: StudySource, risks: Collection[tuple[Path, str]]) -> None:
     words = one_line("; ".join(f"{file} {does}" for file, does in risks))
     if not sys.stdin.isatty():
         raise UsageError(
-            f"{words}. There is no terminal to ask at: read these files, then add --trust (in "
-            "Python: trust=True)"
+            f"{words}. There is no terminal to ask at, which would show the code: read these "
+            "files, then add --trust (in Python: trust=True)"
         )
     if study.path in [file for file, _ in risks]:
         for name, source in study.plugins.items():
-            sys.stderr.write(printable(f"---- {study.path.parent / name}\n{source}\n----\n"))
+            sys.stderr.write(printable(f"---- {name} of {study.path}\n{source}\n----\n"))
     say(words)
     sys.stderr.write("Go ahead? [y]es, [N]o: ")
     sys.stderr.flush()

@@ -1,5 +1,6 @@
 """A study run from Python: its results as data frames, and what is refused."""
 
+import math
 import os
 import subprocess
 import sys
@@ -114,6 +115,16 @@ async def test_a_study_is_asked_in_batches_for_half_the_price(folder, monkeypatc
         half = await Study("study.toml", **wanted, **elsewhere).arun(yes=True, batch=True)
     assert half.facts["cost_usd"] == pytest.approx(whole.facts["cost_usd"] / 2)
     assert half.calls()["batch_id"].notna().all()
+
+
+@pytest.mark.parametrize(
+    "number",
+    [*({"max_cost_usd": usd} for usd in (math.nan, math.inf, -1.0)), {"in_flight": 0}, {"rpm": 0}],
+)
+async def test_a_number_that_no_run_can_use_is_refused(folder, number):
+    ((name, _),) = number.items()
+    with pytest.raises(UsageError, match=rf"{name}\b.* is a .*number.* from [01], not "):
+        await Study("study.toml").arun(**number)
 
 
 async def test_trials_that_failed_are_in_the_outcome(folder):

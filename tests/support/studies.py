@@ -77,7 +77,7 @@ def played(drive: Drive, scenario: ScenarioConfig = SCENARIO) -> TrialRecord:
                 decisions.append(DecisionRow(number, world.time_s, side, found))
         for index in range(5):
             if world.status is None and not lost:
-                world.advance({side: plans[side][index] for side in SIDES})
+                world.drive([plans["left"][index]], [plans["right"][index]])
         number += 1
     return TrialRecord(
         spec=TrialSpec(

@@ -105,7 +105,7 @@ def test_every_option_of_a_sweep_reaches_its_plan_or_its_run(monkeypatch, tmp_pa
     assert whole
     assert options == Options(
         Path("d"), Path("c"), 6, 7, 8, 9, strict_model=True, keep_going=True, quiet=True,
-        dask="local:2", batch=True, typed=words,
+        dask="local:2", batch=True, typed=words, ledgers=[plan.ledger],
     )  # fmt: skip
     assert (plan.probe, plan.sample_set, plan.order_seed) == ("first", 4, 5)
     assert (len(plan.conditions), plan.repetitions) == (4, {"A1": 3})

@@ -53,7 +53,7 @@ def drive(pairs, condition="L_4_-8", scenario=None, steps=5):
     yield world
     for left, right in pairs:
         for _ in range(steps):
-            world.advance({"left": left, "right": right})
+            world.drive([left], [right])
             yield world
 
 

@@ -75,7 +75,7 @@ def is_per_day(error: ServerError) -> bool:
 
 
 def known_meaning(error: ServerError) -> str | None:
-    """Return the meaning of an error of one of the four services, as ``WireFormat.meaning`` does.
+    """Return the meaning of an error of a known service or gateway, as ``WireFormat.meaning`` does.
 
     The format of a plug-in defines its meanings itself, and so changes no other format's replies.
     """

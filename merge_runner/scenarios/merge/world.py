@@ -54,12 +54,11 @@ class World:
         """Return whether the vehicle has left its tunnel; until then it cruises by itself."""
         return self._vehicles[side].positions[-1] > self._track.tunnel_exit_m - 1e-9
 
-    def advance(self, actions: Mapping[Side, float | None]) -> None:
-        """Drive one step with normalised actions in [-1, 1]; None lets a vehicle cruise."""
-        self.drive([actions["left"]], [actions["right"]])
-
     def drive(self, left: Sequence[float | None], right: Sequence[float | None]) -> None:
-        """Drive some steps with the actions of both sides, or until the trial ends."""
+        """Drive some steps with normalised actions in [-1, 1], or until the trial ends.
+
+        None lets a vehicle cruise.
+        """
         config, track, vehicles = self._config, self._track, self._vehicles
         places = (
             vehicles["left"].drive(left, config, track.merge_point_m),

@@ -135,7 +135,7 @@ async def test_the_ledger_refuses_what_two_processes_reserved_at_once(ledger, ca
     # Neither knows of the other's yet.
     paid = [await set_aside(budget, trial, 0.75) for trial, budget in enumerate(both)]
     await paid[0].begin(1)
-    with pytest.raises(TrialSuspended, match="others under the same cap"):
+    with pytest.raises(TrialSuspended, match="the cap was used up while the attempt waited"):
         await paid[1].begin(1)
     assert both[1].ledger.read().committed_usd == 0.75
 
@@ -400,9 +400,9 @@ async def test_a_suspended_trial_says_what_the_cap_is_needed_for(ledger):
     with pytest.raises(TrialSuspended) as caught:
         await set_aside(budget, 1, 5.0)
     assert str(caught.value) == (
-        "the next call may cost 5.0000 USD, and 1.0000 of 5 USD are spent or reserved (0.5000 "
-        "spent, 0.5000 reserved for 1 attempts whose cost is not known: `merge-runner ledger`); "
-        "3.0000 more are reserved for the trials that have begun"
+        "the next call may cost 5.0000 USD, and 1.0000 of 5 USD (--max-cost) are spent or reserved "
+        "(0.5000 spent, 0.5000 reserved for 1 attempts whose cost is not known: "
+        "`merge-runner ledger`); 3.0000 more are reserved for the trials that have begun"
     )
 
 

@@ -22,6 +22,7 @@ from merge_runner.run.options import Options
 from merge_runner.run.plan import make_plan
 from merge_runner.run.progress import Progress
 from merge_runner.run.progress_file import read_snapshot
+from merge_runner.run.summary import as_lines
 from tests.support.crossed_study import MODEL
 from tests.support.gate import HANGS_S
 from tests.support.harness import PROJECT, run_sweep
@@ -176,13 +177,15 @@ async def test_the_cap_is_kept_as_the_user_gave_it_whoever_else_spends_under_it(
     with duckdb.connect(str(options.db), read_only=True) as connection:
         [(config,)] = connection.execute("SELECT config FROM sweeps").fetchall()
     assert json.loads(config)["max_cost_usd"] == cap
+    assert (summary["cap_usd"], summary["cap_source"]) == (cap, "--max-cost")
+    assert f"; cap: {cap:g} USD (--max-cost)" in "\n".join(as_lines(summary))
     spent = summary["sweep_cost_usd"]
     if cap == 5.0:
         assert (summary["exit_code"], spent > 0) == (0, True)
     else:
         assert summary["exit_code"] == 3
         assert spent + 0.49 <= cap
-        assert f"{0.49 + spent:.4f} of 0.5 USD are spent" in summary["messages"][0]
+        assert f"{0.49 + spent:.4f} of 0.5 USD (--max-cost) are spent" in summary["messages"][0]
         assert "0.4900 by others under this cap" in summary["messages"][0]
 
 

@@ -24,6 +24,7 @@ from merge_runner.results.recording import (
     read_recording,
 )
 from merge_runner.results.recording_summary import summarise, summary_lines
+from merge_runner.run.plan import make_plan
 from merge_runner.run.recorded_plans import recorded_plans
 from tests.support.raw_server import a_request
 from tests.support.recording_files import quoted, rewritten
@@ -368,6 +369,17 @@ def test_a_recording_that_does_not_say_what_was_played_is_no_study(told, tmp_pat
     with pytest.raises((RecordingError, UsageError)):
         list(recorded_plans(file, db=tmp_path / "none.duckdb", trust=False))
     assert any(line.startswith("calls    1 ") for line in summary_lines(file, summarise(file)))
+
+
+def test_an_error_in_the_study_of_a_recording_names_the_recording(tmp_path):
+    source, file = ResponseCache(tmp_path / "source"), tmp_path / "theirs.parquet"
+    source.put_now([entry(1)])
+    config = make_plan("baseline", "constant").model_dump(mode="json")
+    config["study"]["text"] = "repetitions = 0"
+    played = {"name": "baseline", "config": json.dumps(config)}
+    export_recording(file, source, [entry(1).request.key], played)
+    with pytest.raises(UsageError, match=f"^{file}: repetitions"):
+        list(recorded_plans(file, db=tmp_path / "none.duckdb", trust=False))
 
 
 def everything_in(cache):

@@ -136,6 +136,14 @@ def test_the_question_shows_the_code_and_comes_once_for_each_content(
         load_study(study)
 
 
+async def test_several_studies_run_their_code_once_each(merge_runner, stranger, study):
+    (stranger / "second.toml").write_text(CODE)
+    places = ("--db", stranger / "m.duckdb", "--cache", stranger / "cache")
+    both = ("sweep", study, stranger / "second.toml", "--model", "constant", *places)
+    await merge_runner(*both, "--trust", code=0)
+    assert (stranger.parent / "ran").read_text() == "xx"
+
+
 def test_an_agreement_to_a_folder_is_none_to_the_registry_of_the_working_folder(
     state, stranger, tmp_path, study
 ):

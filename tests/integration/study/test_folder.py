@@ -77,7 +77,7 @@ async def test_a_recording_alone_replays_its_study_in_an_empty_folder_once_its_c
     empty = tmp_path / "empty"
     empty.mkdir()
     refused = await merge_runner("replay", file, cwd=empty)
-    assert (refused.code, "runs code (plugin.py)" in refused.err) == (2, True)
+    assert (refused.code, f"{file} runs code (plugin.py)" in refused.err) == (2, True)
     await merge_runner("replay", file, "--trust", cwd=empty, code=0)
     assert results_digest(empty / "results/merge.duckdb") == results_digest(db)
     for words, said in (

@@ -48,7 +48,7 @@ async def test_a_second_ask_is_answered_from_the_cache(make):
     client = make(answer("first"), answer("second"))
     first, second = [await client.ask("prompt", slot()) for _ in range(2)]
     assert (first.text, second.text) == ("first", "first")
-    assert (first.cached, second.cached) == (False, True)
+    assert (first.cached_attempts, second.cached_attempts) == (0, 1)
     assert first.attempts == second.attempts
     meter = client.meter
     assert (meter.calls_live, meter.calls_cached, meter.calls_shared) == (1, 1, 1)
@@ -65,7 +65,7 @@ async def test_all_who_ask_the_same_at_once_share_one_call_whose_attempts_count_
         *(asker.ask("prompt", slot()) for asker in (client, client, twin))
     )
     assert [reply.text for reply in replies] == ["from 0"] * 3
-    assert [reply.cached for reply in replies] == [False, True, True]
+    assert [reply.cached_attempts for reply in replies] == [0, 1, 1]
     meter = client.meter
     assert (meter.calls_live, meter.calls_cached, meter.calls_shared) == (1, 1, 1)
     failing = make(error(400))
@@ -99,7 +99,7 @@ async def test_a_reply_that_an_import_has_stored_first_is_no_attempt_of_this_run
     cache.put_now([CachedCall(request, (imported,))])
     client.direct.transport.open.set()
     reply = await asked
-    assert (reply.text, reply.cached_attempts, reply.cached) == ("imported", 1, True)
+    assert (reply.text, reply.cached_attempts) == ("imported", 1)
 
 
 async def test_a_call_whose_wait_for_money_times_out_is_no_call_that_was_given_up(
@@ -445,7 +445,7 @@ async def test_a_replay_misses_what_is_not_recorded(make):
     client = make(answer("recorded"))
     await client.ask("prompt", slot())
     prompt, reply = client.replies.answer(question())
-    assert (prompt, reply.text, reply.cached) == ("prompt", "recorded", True)
+    assert (prompt, reply.text, reply.cached_attempts) == ("prompt", "recorded", 1)
     with pytest.raises(ReplayMiss) as caught:
         client.replies.answer(question(repetition=2))
     assert caught.value.request.slot == slot(2)

@@ -167,7 +167,7 @@ async def test_a_prompt_that_is_refused_for_its_content_fails_alone(begin):
 async def test_an_answer_that_is_recorded_needs_no_first_call(begin):
     await begin(answer()).ask("prompt", slot())
     client = begin(error(401))
-    assert (await client.ask("prompt", slot())).cached
+    assert (await client.ask("prompt", slot())).cached_attempts == 1
     assert client.direct.transport.sent == []
 
 

@@ -134,7 +134,7 @@ def test_in_a_finer_world_the_histories_are_those_of_the_plans_steps(history_sta
             action = (0.313, -0.717, 0.919, 0.123, -0.231)[k] / (number + 1)
             for world, steps in zip(worlds, (1, 4), strict=True):
                 for _ in range(steps):
-                    world.advance({"left": action / 2, "right": action})
+                    world.drive([action / 2], [action])
 
 
 @pytest.mark.parametrize("field", ["{own_speed:>999999999}", "{own_speed!r}"])

@@ -198,11 +198,12 @@ def test_an_estimate_says_where_replies_are_cut_off():
 
 def test_an_estimate_says_how_far_a_cap_that_it_exceeds_goes():
     def stops(left_usd):
-        return [line for line in estimate_lines(expected(3, left_usd=left_usd)) if "stops" in line]
+        capped = expected(3, left_usd=left_usd, cap_source="[budget] of mine")
+        return [line for line in estimate_lines(capped) if "stops" in line]
 
     assert (stops(None), stops(1.5)) == ([], [])
     (line,) = stops(0.3)
-    assert line.strip().startswith("stops at 0.30 USD, about 20 % of it: ")
+    assert line.strip() == "stops at 0.30 USD, about 20 % of it: what [budget] of mine leaves"
 
 
 def test_an_estimate_says_what_each_of_several_models_costs():

@@ -49,7 +49,8 @@ def braked(course, condition, side, since, mps2):
             drag = 0.5 + 0.005 * before**2 if scenario.resistance == "human" else 0.0
             net = (after - before) / scenario.step_s
             action = (net + drag) / scenario.max_acceleration_mps2
-        world.advance({side: -mps2 / scenario.max_acceleration_mps2, other: action})
+        actions = {side: -mps2 / scenario.max_acceleration_mps2, other: action}
+        world.drive([actions["left"]], [actions["right"]])
     return world.status
 
 

@@ -41,7 +41,7 @@ def test_every_condition_collides_at_constant_speed_and_not_at_once(rule, contro
         world = World(scenario, condition, TRACK)
         assert world.status is None
         while world.status is None:
-            world.advance({"left": 0.0, "right": 0.0})
+            world.drive([0.0], [0.0])
         assert world.status == "collided"
 
 

@@ -38,7 +38,7 @@ def drive(world, left, right, steps=10_000):
     for _ in range(steps):
         if world.status is not None:
             return
-        world.advance({"left": left, "right": right})
+        world.drive([left], [right])
 
 
 def trace(world, side):
@@ -85,12 +85,12 @@ def test_acceleration_stays_within_its_bound_and_explains_every_change_of_speed(
 
 def test_each_side_executes_its_own_action_less_the_resistance_unless_it_cruises():
     world, resisted = start(), start(resistance="human")
-    world.advance({"left": 1.0, "right": -0.5})
+    world.drive([1.0], [-0.5])
     assert [trace(world, side)[1][2:] for side in SIDES] == [
         (pytest.approx(52.05), 10.5, 2.5),
         (pytest.approx(51.975), 9.75, -1.25),
     ]
-    resisted.advance({"left": 0.0, "right": None})
+    resisted.drive([0.0], [None])
     assert [trace(resisted, side)[1][3:] for side in SIDES] == [(9.8, -1.0), (10.0, 0.0)]
 
 
@@ -101,7 +101,7 @@ def test_steps_that_are_driven_at_once_are_as_if_one_by_one_up_to_the_end(name, 
     at_once.drive(*zip(*pairs, strict=True))
     for left, right in pairs:
         if one_by_one.status is None:
-            one_by_one.advance({"left": left, "right": right})
+            one_by_one.drive([left], [right])
     assert at_once.states() == one_by_one.states()
     for side in SIDES:
         assert at_once.observe(side) == one_by_one.observe(side)
@@ -164,7 +164,7 @@ def test_histories_hold_the_last_ten_steps_before_now_after_cruising_or_nothing(
     """The oldest value comes first, and the other's present speed is not history."""
     world = start("L_4_-8", history_start=history_start)
     for k in range(1, steps + 1):
-        world.advance({"left": 0.01 * k, "right": -0.01 * k})
+        world.drive([0.01 * k], [-0.01 * k])
     for side, sign in (("left", 1), ("right", -1)):
         executed = [sign * A_MAX_MPS2 * 0.01 * k for k in range(1, steps + 1)]
         *speeds, now_mps = [row[3] for row in trace(world, OTHER[side])]
@@ -214,7 +214,7 @@ def test_own_exit_starts_at_the_earlier_exit_and_the_other_cruises_on_to_its_own
     in_control = []
     for _ in range(5):
         in_control.append((world.in_control("left"), world.in_control("right")))
-        world.advance({"left": 0.0, "right": None})
+        world.drive([0.0], [None])
     # The right vehicle leaves its tunnel after 0.785 s, so the fifth sample sees it outside.
     assert in_control == [(True, False)] * 4 + [(True, True)]
     assert {row[3] for row in trace(world, "right")} == {10.4}
@@ -224,7 +224,7 @@ def test_the_road_turns_straight_behind_the_own_merge_point_or_for_both_at_once(
     world = start()
     while (seen := world.observe("left")).road == "merge":
         assert seen.distance_to_merge_m > 0
-        world.advance({"left": 0.0, "right": -1.0})
+        world.drive([0.0], [-1.0])
     # Exactly at the merge point, after 50 m at 10 m/s.
     assert (world.time_s, seen.distance_to_merge_m) == (5.0, None)
     other = world.observe("right")
@@ -236,6 +236,6 @@ def test_the_road_turns_straight_behind_the_own_merge_point_or_for_both_at_once(
     assert world.observe("left").distance_to_merge_m < 0
     while world.states()[-1].position_m < 100:
         assert [world.observe(side).road for side in SIDES] == ["merge", "merge"]
-        world.advance({"left": 0.5, "right": -0.25})
+        world.drive([0.5], [-0.25])
     assert world.status is None
     assert [world.observe(side).road for side in SIDES] == ["straight", "straight"]
