@@ -1,8 +1,8 @@
 """Rate limits, requests and tokens a minute; one dispatcher serves the oldest trial first.
 
-asyncio-throttle counts the requests. It polls for every waiter and keeps no order among them, so
-only the dispatcher calls it. It counts a request when it is called, so the dispatcher calls it only
-when the request can be sent at once: no pause is on, and the limits have room. Tokens are counted
+asyncio-throttle counts the requests. It polls for every waiter and keeps no order among them, and
+it counts a request when it is called. So it is called only where a request can be sent at once: no
+pause is on, the limits have room, and no other request waits for the dispatcher. Tokens are counted
 in a sliding window of a minute: an estimate at dispatch, the actual usage afterwards. Each process
 counts for itself: where several use one key, the server refuses the excess, which is retried.
 """
@@ -93,9 +93,10 @@ class Limiter:
             )
         loop = asyncio.get_running_loop()
         turn = _Turn(order, next(self._arrivals), tokens, loop.create_future())
-        # Without a limit or a queue no dispatcher is needed, which would be a further task.
-        limited = self._throttles or self._tpm is not None
-        if limited or self._waiting or loop.time() < self._pause.until:
+        # Where nobody waits and there is room, a dispatcher would only be a further task.
+        if not self._waiting and self._blocked_for(turn, loop.time()) <= 0:
+            await self._take(turn)
+        else:
             turn.given.add_done_callback(lambda _: self._changed.set())
             heapq.heappush(self._waiting, turn)
             self._changed.set()
@@ -133,14 +134,18 @@ class Limiter:
                         await self._changed.wait()
                 continue
             heapq.heappop(self._waiting)  # before a wait in which an older trial's may arrive
-            for throttle in self._throttles:
-                await throttle.acquire()  # type: ignore[no-untyped-call] # ships no types
-            if self._tpm is not None:
-                turn.dispatched_at = loop.time()
-                self._window.append(turn)
-                self._tokens_in_window += turn.tokens
+            await self._take(turn)
             if not turn.given.done():  # it may be cancelled meanwhile
                 turn.given.set_result(None)
+
+    async def _take(self, turn: _Turn) -> None:
+        """Count a request that can be sent at once."""
+        for throttle in self._throttles:
+            await throttle.acquire()  # type: ignore[no-untyped-call] # ships no types
+        if self._tpm is not None:
+            turn.dispatched_at = asyncio.get_running_loop().time()
+            self._window.append(turn)
+            self._tokens_in_window += turn.tokens
 
     def _blocked_for(self, turn: _Turn, now: float) -> float:
         """Return the minimum wait in s of the head of the queue."""

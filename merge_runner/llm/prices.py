@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from dataclasses import replace
+from datetime import UTC, datetime
 from decimal import Decimal
-from functools import partial
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING
 
 from merge_runner.llm.http_outcome import may_be_charged
@@ -42,12 +44,35 @@ def cost_usd(entry: ModelEntry, usage: Usage, tier: str | None = None) -> float 
         plain = (read - cached) * Decimal(str(price.input)) + cached * Decimal(str(cached_price))
         plain += written * Decimal(str(price.output))
         return float(plain / PER_MILLION * Decimal(str(price.tiers.get(tier or "", 1))))
+    return _listed_usd(
+        entry.provider, entry.id, (read, cached, written), tier, minute=int(time.time()) // 60
+    )
+
+
+@lru_cache(maxsize=1_024)
+def _listed_usd(
+    provider: str,
+    model: str,
+    tokens: tuple[int, int, int],
+    tier: str | None,
+    minute: int,
+) -> float | None:
+    """Return the cost by genai-prices, which is slow; the worst cases of many requests are equal.
+
+    Some prices depend on the time of day, by ``minute`` since 1970.
+    """
     from genai_prices import Usage as PricedUsage  # here, since it takes long to load
     from genai_prices import calc_price
 
+    read, cached, written = tokens
     priced = PricedUsage(input_tokens=read, cache_read_tokens=cached, output_tokens=written)
-    provider = GENAI_PRICES_PROVIDER.get(entry.provider, entry.provider)
-    calculate = partial(calc_price, priced, model_ref=entry.id, provider_id=provider)
+    calculate = partial(
+        calc_price,
+        priced,
+        model_ref=model,
+        provider_id=GENAI_PRICES_PROVIDER.get(provider, provider),
+        genai_request_timestamp=datetime.fromtimestamp(60 * minute, UTC),
+    )
     try:
         # Older versions of the package know no tiers.
         with contextlib.suppress(TypeError):
