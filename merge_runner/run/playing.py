@@ -49,12 +49,14 @@ class Endings:
         """Note the trials that wait for money."""
         if not self.suspended:
             return
+        cap = self.session.ledger.cap
+        more = f"raise {cap.source}" if cap else "renew the quota"
         waiting = dict.fromkeys(map(_played_as, self.session.todo), 0) | self.suspended
         self.session.fail(
             TrialSuspended.exit_code,
             f"{self.suspended.total()} trials wait for money{_unbalanced(waiting)}: "
-            f"{self.why_suspended}. Their replies stay stored: raise --max-cost, or the study's "
-            "budget, and run the same command again",
+            f"{self.why_suspended}. Their replies stay stored: {more}, and run the same command "
+            "again",
         )
 
     def note_failed(self) -> None:

@@ -52,7 +52,7 @@ async def test_the_cap_holds_over_all_runs_and_a_higher_one_goes_on(merge_runner
         assert run.summary["cost_usd"] == pytest.approx(bill.usd)
         assert run.summary["trials"]["suspended"] > 0
         assert f"{bill.usd:.2f} of {ROOM_FOR_SOME} over all runs" in run.err.splitlines()[-2]
-        assert "raise --max-cost, or the study's budget, and run the same command" in run.err
+        assert "raise --max-cost, and run the same command" in run.err
         # What is finished is balanced: no condition is far ahead of another one.
         query = "select condition, count(*) as n from trials group by all order by n"
         counts = await rows(merge_runner, query)
