@@ -195,9 +195,11 @@ async def unsent(
 def _has_replies(cache: ResponseCache, plan: Plan) -> bool:
     """Return whether a plan's models are recorded; True for damaged replies, or without a model."""
     models = {entry.id or UNNAMED for entry in plan.entries.values()}
+    if not models or any(call.request.model in models for call in cache.newest(1)):
+        return True  # without counting all replies
     _, counts = answer_counts(cache)
     are_damaged = cache.number > sum(answers.answers for answers in counts.values())
-    return any(template.model in models for template in counts) or are_damaged or not models
+    return any(template.model in models for template in counts) or are_damaged
 
 
 def _recorded_part(plan: Plan, recordings: Sequence[Path]) -> Plan:
