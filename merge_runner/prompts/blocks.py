@@ -16,10 +16,11 @@ import hashlib
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from itertools import dropwhile
 from statistics import fmean
 from string import Formatter
+from typing import NamedTuple
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
@@ -35,8 +36,7 @@ KMH_OF_MPS = 3.6
 MPH_OF_MPS = 3600 / 1609.344  # the international mile of 1959
 
 
-@dataclass(frozen=True, slots=True)
-class Situation:
+class Situation(NamedTuple):
     """Situation of a prompt; ``plan`` is the rest of the last valid plan, None before the first.
 
     ``first`` is true at the driver's first decision.
@@ -77,8 +77,21 @@ def _line(line: Callable[[Observation], str], now: Situation) -> str:
     return line(now.seen)
 
 
+def _constant(constant: Callable[[ScenarioConfig], str], now: Situation) -> str:
+    return constant(now.task)
+
+
+# Variables with one value in all prompts of a scenario.
+CONSTANTS: Mapping[str, Callable[[ScenarioConfig], str]] = {
+    "vehicle_length": lambda task: f"{task.vehicle_length_m:g}",
+    "memory_s": lambda task: f"{task.memory_s:g}",
+    "horizon_s": lambda task: f"{task.horizon_s:g}",
+    "step_s": lambda task: f"{task.action_s:g}",
+    "prompt_interval_s": lambda task: f"{1 / task.prompt_rate_hz:g}",
+    "plan_actions": lambda task: str(task.plan_actions),
+    "max_acceleration": lambda task: f"{task.max_acceleration_mps2:g}",
+}
 FIELDS: Mapping[str, Callable[[Situation], str]] = {
-    "vehicle_length": lambda now: f"{now.task.vehicle_length_m:g}",
     "own_speed": lambda now: decimal(now.seen.own_speed_mps),
     "other_speed": lambda now: now.of_other(now.seen.other_speed_mps),
     "own_speed_kmh": lambda now: decimal(now.seen.own_speed_mps * KMH_OF_MPS),
@@ -94,12 +107,7 @@ FIELDS: Mapping[str, Callable[[Situation], str]] = {
     "own_accelerations": _own_accelerations,
     "other_speeds": _other_speeds,
     "remaining_plan": _remaining_plan,
-    "memory_s": lambda now: f"{now.task.memory_s:g}",
-    "horizon_s": lambda now: f"{now.task.horizon_s:g}",
-    "step_s": lambda now: f"{now.task.action_s:g}",
-    "prompt_interval_s": lambda now: f"{1 / now.task.prompt_rate_hz:g}",
-    "plan_actions": lambda now: str(now.task.plan_actions),
-    "max_acceleration": lambda now: f"{now.task.max_acceleration_mps2:g}",
+    **{name: partial(_constant, constant) for name, constant in CONSTANTS.items()},
     **{name: partial(_line, line) for name, line in LINES.items()},
 }
 
@@ -321,9 +329,25 @@ def render_prompt(
     without a plan.
     """
     now = Situation(observation, scenario, remaining_plan, first)
-    parts = prompt.templates[observation.road]
-    text = "".join([text + FIELDS[name](now) if name else text for text, name in parts])
+    parts = _of_scenario(prompt, observation.road, scenario)
+    text = "".join([text + field(now) if field else text for text, field in parts])
     return text if observation.other_seen else _UNIT_OF_NOTHING.sub(r"\1", text)
+
+
+@lru_cache(maxsize=1_024)
+def _of_scenario(
+    prompt: Prompt, road: Road, scenario: ScenarioConfig
+) -> list[tuple[str, Callable[[Situation], str] | None]]:
+    """Return the template for a road with the scenario's constants, and functions as variables."""
+    parts, before = list[tuple[str, Callable[[Situation], str] | None]](), ""
+    for text, name in prompt.templates[road]:
+        before += text
+        if name and name in CONSTANTS:
+            before += CONSTANTS[name](scenario)
+        else:
+            parts.append((before, FIELDS[name] if name else None))
+            before = ""
+    return [*parts, (before, None)]
 
 
 def _template(blocks: Iterable[Block], road: Road) -> list[tuple[str, str | None]]:

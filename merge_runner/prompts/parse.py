@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from merge_runner.records import Tactical
 
@@ -81,8 +81,7 @@ _INVISIBLE = dict.fromkeys("\u200b\u200c\u200d\u2060\ufeff", "")
 _AS_ASCII = str.maketrans(_MINUSES | _INVISIBLE)
 
 
-@dataclass(frozen=True, slots=True)
-class ParsedReply:
+class ParsedReply(NamedTuple):
     """Parsed reply; ``plan`` is None if it is invalid, for the reason ``failure``."""
 
     plan: tuple[float, ...] | None
@@ -120,9 +119,10 @@ def _plan(places: Iterable[str], plan_actions: int) -> tuple[tuple[float, ...] |
         arrays = set(map(_entries, dict.fromkeys(_ARRAY.findall(_COMMENT.sub("", place)))))
         valid = []
         for array in arrays:
-            failure = _failure(array, plan_actions)
+            numbers = tuple([entry for entry in array if isinstance(entry, float)])
+            failure = _failure(array, numbers, plan_actions)
             if failure is None:
-                valid.append(tuple(map(float, array)))
+                valid.append(numbers)
             else:
                 failures.append((len(array) != plan_actions, _FAILURES.index(failure)))
         if valid:
@@ -132,9 +132,10 @@ def _plan(places: Iterable[str], plan_actions: int) -> tuple[tuple[float, ...] |
     return None, _FAILURES[min(failures)[1]]
 
 
-def _failure(array: tuple[float | str, ...], plan_actions: int) -> str | None:
-    """Return why an array is no valid plan; None for a valid one."""
-    numbers = [entry for entry in array if isinstance(entry, float)]
+def _failure(
+    array: tuple[float | str, ...], numbers: tuple[float, ...], plan_actions: int
+) -> str | None:
+    """Return why an array with these numbers is no valid plan; None for a valid one."""
     if len(array) == len(numbers) == plan_actions and -1 <= min(numbers) <= max(numbers) <= 1:
         return None
     words = [entry for entry in array if isinstance(entry, str)]

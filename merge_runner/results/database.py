@@ -30,7 +30,7 @@ SCHEMA = Path(__file__).with_name("schema.sql")
 LOCK_RETRY_S = 0.005  # a sweep leaves the file for a moment between two writes
 PATIENCE_S = 60.0
 ROWS_AT_ONCE = 100
-ROWS_OF_A_GROUP = 4_096
+ROWS_OF_A_GROUP = 2_048
 """Size of written row groups: each transaction rewrites a group in memory until it is full."""
 LOG = logging.getLogger(__name__)
 ResultT = TypeVar("ResultT")

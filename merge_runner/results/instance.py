@@ -95,7 +95,7 @@ def limit_memory(connection: duckdb.DuckDBPyConnection, longest: int = 0) -> Non
     """Limit DuckDB to little memory and one thread for short texts and few calls.
 
     The limit holds until the instance closes the database. ``longest`` is the length of the
-    longest text to store. A row group of such calls takes 64 MB, an audit of 200,000 calls 110 MB;
+    longest text to store. A row group of such calls takes 32 MB, an audit of 200,000 calls 110 MB;
     more memory would only cache the file.
     """
     [(stored, calls)] = connection.execute(SIZES).fetchall()

@@ -39,7 +39,7 @@ async def with_names(
             update={"id": served_id or await _served_name(name, entry, say=say)}
         )
         known: set[str] = set()
-        if options.replay:
+        if options.replay and not _is_newest(cache, entries[name].id, endpoints[name]):
             known = recorded_values(cache, "endpoint", model=entries[name].id)
         if known and endpoints[name] not in known:
             endpoints[name], *others = sorted(known)
@@ -51,6 +51,16 @@ async def with_names(
                 )
     arms = tuple(replace(arm, entries={n: entries[n] for n in arm.entries}) for arm in plan.arms)
     return plan.model_copy(update={"arms": arms, "entries": entries, "endpoints": endpoints})
+
+
+def _is_newest(cache: ResponseCache, model: str, endpoint: str) -> bool:
+    """Return whether the newest reply is of a model at an endpoint, and no recording is named.
+
+    Then the other replies need not be counted.
+    """
+    return not cache.recording[1] and any(
+        (call.request.model, call.request.endpoint) == (model, endpoint) for call in cache.newest(1)
+    )
 
 
 async def _served_name(name: str, entry: ModelEntry, *, say: Callable[[str], None]) -> str:

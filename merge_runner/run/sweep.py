@@ -32,7 +32,7 @@ from merge_runner.run.run_record import begin, check, end
 from merge_runner.run.session import Session, misses_of, open_session
 from merge_runner.run.summary import as_dict
 from merge_runner.run.trials import Player
-from merge_runner.run.writer import BATCH_BYTES, LIVE_BATCH_BYTES, Flusher
+from merge_runner.run.writer import Flusher
 
 if TYPE_CHECKING:
     from merge_runner.llm.batch.rounds import Rounds
@@ -113,8 +113,7 @@ async def run(
                 sweep_id = begin(session, store, commit, dirty=dirty)
             shown = show_progress(progress, db, sweep_id, quiet=options.quiet)
             await stack.enter_async_context(shown)
-            batch_bytes = BATCH_BYTES if options.replay else LIVE_BATCH_BYTES
-            flusher = Flusher(store, sweep_id, session.say, batch_bytes)
+            flusher = Flusher(store, sweep_id, session.say, is_live=not options.replay)
             is_writable, cancelled = await play_and_store(session, progress, flusher, stopping)
             progress.doing = "checking"
             write_snapshot(db, progress.snapshot(sweep_id))
@@ -196,9 +195,11 @@ async def unsent(
 def _has_replies(cache: ResponseCache, plan: Plan) -> bool:
     """Return whether a plan's models are recorded; True for damaged replies, or without a model."""
     models = {entry.id or UNNAMED for entry in plan.entries.values()}
+    if not models or any(call.request.model in models for call in cache.newest(1)):
+        return True  # without counting all replies
     _, counts = answer_counts(cache)
     are_damaged = cache.number > sum(answers.answers for answers in counts.values())
-    return any(template.model in models for template in counts) or are_damaged or not models
+    return any(template.model in models for template in counts) or are_damaged
 
 
 def _recorded_part(plan: Plan, recordings: Sequence[Path]) -> Plan:

@@ -19,6 +19,7 @@ from merge_runner.trial_records import TrialRecord, TrialSpec
 
 # Between two transactions other programs can open the file.
 EVERY_S, POLL_S = 1.0, 0.06
+REPLAY_EVERY_S = 5.0  # nothing is lost if it is killed, and few full transactions cost least
 # Trials in one transaction, which costs as much as storing dozens of them; and in memory while
 # storing fails, as when another program holds the file.
 BATCH = 512
@@ -35,7 +36,7 @@ AGAIN = (
 
 
 class Flusher:
-    """Buffer of ended trials, which are stored about once a second.
+    """Buffer of ended trials, which are stored about once a second, of a replay when it is full.
 
     While storing fails, trials beyond a batch are dropped and others are played; where storing is
     merely slow, new trials wait for it. ``dropped`` trials can be played again from the recorded
@@ -49,7 +50,8 @@ class Flusher:
         store: Store,
         sweep_id: str,
         say: Callable[[str], None],
-        batch_bytes: int = BATCH_BYTES,
+        *,
+        is_live: bool = True,
     ) -> None:
         self.differing: dict[TrialKey, list[str]] = {}
         self.dropped: list[TrialSpec] = []
@@ -58,7 +60,8 @@ class Flusher:
         self._store = store
         self._sweep_id = sweep_id
         self._say = say
-        self._batch_bytes = batch_bytes
+        self._batch_bytes = LIVE_BATCH_BYTES if is_live else BATCH_BYTES
+        self._every_s = EVERY_S if is_live else REPLAY_EVERY_S
         self._pending: list[tuple[TrialRecord, int]] = []  # with their bytes
         self._bytes = 0  # of all of them
         self._problem: StoreError | None = None
@@ -126,7 +129,7 @@ class Flusher:
                 async with asyncio.timeout(POLL_S):
                     await self._closing.wait()
             is_much = len(self._pending) >= BATCH or self._bytes >= self._batch_bytes
-            if self._pending and (is_much or clock_s() - flushed_s >= EVERY_S):
+            if self._pending and (is_much or clock_s() - flushed_s >= self._every_s):
                 flushed_s = clock_s()
                 await self._flush()
 

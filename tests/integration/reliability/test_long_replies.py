@@ -42,7 +42,7 @@ def test_a_recording_of_any_size_is_exported_in_the_same_order_and_with_the_same
     assert contents[0] == contents[1] == entries
 
 
-@pytest.mark.parametrize(("added", "fewest", "most"), [(20, 1, 9), (MANY_CALLS, 20, 30)])
+@pytest.mark.parametrize(("added", "fewest", "most"), [(20, 1, 18), (MANY_CALLS, 20, 30)])
 def test_small_groups_are_merged_a_few_at_a_time_to_ones_that_fit_into_memory(
     tmp_path, added, fewest, most
 ):

@@ -16,7 +16,7 @@ from merge_runner.errors import StoreError, StoreLocked
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.ledger import CallLabel, Ledger
 from merge_runner.results.store import Store
-from merge_runner.run import run_record, sweep, writer
+from merge_runner.run import run_record, writer
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.options import Options
 from merge_runner.run.plan import make_plan
@@ -65,7 +65,7 @@ async def test_a_live_run_stores_its_trials_in_smaller_transactions_than_a_repla
 
     monkeypatch.setattr(Store, "write", counted)
     monkeypatch.setattr(writer, "POLL_S", 1e9)  # all are stored when the run ends
-    monkeypatch.setattr(sweep, "LIVE_BATCH_BYTES", 1)
+    monkeypatch.setattr(writer, "LIVE_BATCH_BYTES", 1)
     await run(replace(options, db=options.db.with_name("again.duckdb"), replay=replay))
     assert [number for number in written if number] == batches
 

@@ -43,8 +43,8 @@ class Scripted:
         return [order for batch in self.written for order in batch]
 
 
-def flusher_of(store, say=lambda line: None):
-    return Flusher(store, "sweep", say)
+def flusher_of(store, say=lambda line: None, **options):
+    return Flusher(store, "sweep", say, **options)
 
 
 @pytest.mark.parametrize("error", [StoreLocked("somebody reads"), KeyError("a fault of ours")])
@@ -64,7 +64,7 @@ async def test_trials_wait_for_no_reader_and_no_flusher_that_is_gone_and_what_is
 
 async def test_long_replies_wait_and_are_written_in_parts_of_bounded_size():
     store = Scripted()
-    flusher = flusher_of(store)
+    flusher = flusher_of(store, is_live=False)
     most = MOST_PENDING_BYTES // (5 * MB) + 1
     for _ in range(most):
         await asyncio.wait_for(flusher.wait_for_capacity(), HANGS_S)
@@ -82,7 +82,7 @@ async def test_long_replies_wait_and_are_written_in_parts_of_bounded_size():
 async def test_trials_are_stored_in_few_transactions():
     store = Scripted()
     store.go_on.set()
-    flusher = flusher_of(store)
+    flusher = flusher_of(store, is_live=False)
     for _ in range(600):
         flusher.add(ended())
     await flusher.close()
@@ -92,7 +92,7 @@ async def test_trials_are_stored_in_few_transactions():
 async def test_live_trials_are_stored_in_short_transactions():
     store = Scripted()
     store.go_on.set()
-    flusher = Flusher(store, "sweep", print, LIVE_BATCH_BYTES)
+    flusher = flusher_of(store)
     for _ in range(5):
         flusher.add(ended(size=LIVE_BATCH_BYTES // 3))
     await flusher.close()
