@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import DriverContext, make_context
@@ -15,8 +16,7 @@ from merge_runner.records import NO_DECISION, ChatReply, Decision, Observation, 
 from merge_runner.trial_records import TrialSpec
 
 
-@dataclass(frozen=True, slots=True)
-class Question:
+class Question(NamedTuple):
     """Prompt for the model of a driver; ``decision`` makes the decision of prompt and reply.
 
     ``older`` is the prompt as earlier versions worded it for a driver without a valid plan: "this

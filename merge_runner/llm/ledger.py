@@ -16,7 +16,7 @@ import json
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from merge_runner.errors import CacheFailed, RecordingError, UsageError
 from merge_runner.llm.cache_file import FILE
@@ -56,8 +56,7 @@ WHERE scope = ? GROUP BY driver, outcome ORDER BY sum(usd) DESC
 """
 
 
-@dataclass(frozen=True, slots=True)
-class Cap:
+class Cap(NamedTuple):
     """Spending limit: ``usd`` over the ledgers named in ``scopes``, given by ``source``."""
 
     usd: float
@@ -65,8 +64,7 @@ class Cap:
     scopes: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class CallLabel:
+class CallLabel(NamedTuple):
     """Driver and slot of a call, and the worst case if its server keeps to the output cap."""
 
     driver: str = ""

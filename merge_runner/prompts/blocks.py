@@ -20,6 +20,7 @@ from functools import partial
 from itertools import dropwhile
 from statistics import fmean
 from string import Formatter
+from typing import NamedTuple
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
@@ -35,8 +36,7 @@ KMH_OF_MPS = 3.6
 MPH_OF_MPS = 3600 / 1609.344  # the international mile of 1959
 
 
-@dataclass(frozen=True, slots=True)
-class Situation:
+class Situation(NamedTuple):
     """Situation of a prompt; ``plan`` is the rest of the last valid plan, None before the first.
 
     ``first`` is true at the driver's first decision.

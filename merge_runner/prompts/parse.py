@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from merge_runner.records import Tactical
 
@@ -81,8 +81,7 @@ _INVISIBLE = dict.fromkeys("\u200b\u200c\u200d\u2060\ufeff", "")
 _AS_ASCII = str.maketrans(_MINUSES | _INVISIBLE)
 
 
-@dataclass(frozen=True, slots=True)
-class ParsedReply:
+class ParsedReply(NamedTuple):
     """Parsed reply; ``plan`` is None if it is invalid, for the reason ``failure``."""
 
     plan: tuple[float, ...] | None
