@@ -91,7 +91,7 @@ def store(folder: Path) -> dict[str, float]:
     rows = 0
     for number in range(BATCHES):
         batch = [
-            replace(record, spec=replace(record.spec, trial_id=f"{record.spec.trial_id}/{number}"))
+            record._replace(spec=replace(record.spec, trial_id=f"{record.spec.trial_id}/{number}"))
             for record in played
         ]
         made = [rows_of(record) for record in batch]

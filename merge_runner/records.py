@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime
 from functools import lru_cache
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, JsonValue
 
@@ -197,8 +197,7 @@ class ReplayMiss(CallFailed):
     exit_code = 4
 
 
-@dataclass(frozen=True, slots=True)
-class ChatReply:
+class ChatReply(NamedTuple):
     """Reply to a call: text, outcome and all attempts, the answered one last.
 
     The first ``cached_attempts`` were made before this run, or for another trial of it.

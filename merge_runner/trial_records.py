@@ -71,8 +71,7 @@ class StateRow(NamedTuple):
     acceleration_mps2: float
 
 
-@dataclass(frozen=True, slots=True)
-class DecisionRow:
+class DecisionRow(NamedTuple):
     """One decision of one driver, with its number and time in the trial.
 
     ``observed`` is the driver's observation under imperfect perception, None if it was noise-free.
@@ -85,8 +84,7 @@ class DecisionRow:
     observed: Observation | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class FailedCall:
+class FailedCall(NamedTuple):
     """Call without a reply, with the attempts of its ``CallFailed``.
 
     ``missed`` means that a replay had no recorded reply and made no attempt.
@@ -100,8 +98,7 @@ class FailedCall:
     missed: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class TrialRecord:
+class TrialRecord(NamedTuple):
     """Played trial with its trace."""
 
     spec: TrialSpec

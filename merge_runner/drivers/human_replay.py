@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import islice, pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import DriverContext
@@ -36,8 +36,7 @@ NOT_IMPORTED = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class HumanTrial:
+class HumanTrial(NamedTuple):
     """Human trial from the start of control on, with a sample every 0.05 s.
 
     ``number`` counts the trials of a ``pair``. Positions are travelled distances in m, speeds in

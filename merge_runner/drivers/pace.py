@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from merge_runner.config import ScenarioConfig, whole_steps
 from merge_runner.errors import UsageError
 
 
-@dataclass(frozen=True, slots=True)
-class Pace:
+class Pace(NamedTuple):
     """Decision timing in whole steps of the world.
 
     An action lasts ``action_steps`` steps. ``executed_actions`` of the ``plan_actions`` of a plan

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from merge_runner.llm.ledger import CallLabel
 from merge_runner.records import Attempt, CallFailed, ChatReply, ChatRequest, Usage
@@ -13,9 +13,10 @@ from merge_runner.records import Attempt, CallFailed, ChatReply, ChatRequest, Us
 if TYPE_CHECKING:
     from merge_runner.llm.batch.notes import Batch
 
+LONG_WAIT_S = 5.0  # a shorter wait is over before a note of it is read
 
-@dataclass(frozen=True, slots=True)
-class Wait:
+
+class Wait(NamedTuple):
     """A wait of a call, ``until`` a moment (UTC) or until something happens.
 
     ``blocked``: only the end of another call can end it. ``charged``: the reply may be billed

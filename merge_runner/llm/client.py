@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import closing, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from typing import TYPE_CHECKING
@@ -17,13 +17,13 @@ from merge_runner.errors import MergeRunnerError, RecordingError, SweepStopped
 from merge_runner.llm.attempts import Meter, record
 from merge_runner.llm.budget import Budget, Reservation
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.call import Call, Calls, Wait
+from merge_runner.llm.call import LONG_WAIT_S, Call, Calls, Wait
 from merge_runner.llm.delays import TryAgain, next_wait_s
 from merge_runner.llm.endpoint_state import EndpointState
 from merge_runner.llm.http_outcome import AttemptOutcome
 from merge_runner.llm.ledger import CallLabel
 from merge_runner.llm.prices import attempt_usd, worst_case
-from merge_runner.llm.probe import LONG_WAIT_S, Probe
+from merge_runner.llm.probe import Probe
 from merge_runner.llm.recorded import RecordedReplies
 from merge_runner.llm.sender import DirectSender
 from merge_runner.llm.store import Attempts, CachedCall
@@ -118,7 +118,7 @@ class LlmClient:
             elif call.wait is not None and not call.wait.charged:
                 call.give_up()  # it would take money for a trial that has ended
         # The attempts are counted once, for the first trial that asked.
-        return replace(reply, cached_attempts=len(reply.attempts)) if is_shared else reply
+        return reply._replace(cached_attempts=len(reply.attempts)) if is_shared else reply
 
     def _start(self, request: ChatRequest, order: int, earlier: Attempts | None) -> Call:
         entry = self.endpoint.entry
@@ -212,7 +212,7 @@ class LlmClient:
             sender = self.batch
         label, key = call.label, call.request.key
         if sender.price_factor != 1.0:
-            label = replace(label, worst_usd=label.worst_usd * sender.price_factor)
+            label = label._replace(worst_usd=label.worst_usd * sender.price_factor)
         if self.calls.stopping or not (call.trials or call.pending_batch):
             raise self.calls.given_up(call)
         if call.pending_batch:

@@ -8,9 +8,9 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.delays import server_delay_s
@@ -156,8 +156,7 @@ class TransportFailure(MergeRunnerError):
         self.reason = reason
 
 
-@dataclass(frozen=True, slots=True)
-class AttemptOutcome:
+class AttemptOutcome(NamedTuple):
     """Outcome of an attempt, by its ``name`` in the table of calls, and the action that follows.
 
     ``accept`` it as the answer, ``retry`` after ``delay_s`` (``pause``: all calls to the endpoint
@@ -169,7 +168,7 @@ class AttemptOutcome:
     action: Action
     name: str
     message: str | None = None
-    reading: Reading = Reading("error")  # noqa: RUF009 # frozen
+    reading: Reading = Reading("error")
     delay_s: float | None = None
     pause: bool = False
     raw: RawReply | None = None
@@ -202,7 +201,7 @@ def judge(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
     reading = read_reply(wire, body)
     if raw.status != 200:
         reading = Reading("error", usage=reading.usage)  # usage is billed
-        return replace(judge_error(raw.error, wire), reading=reading, raw=raw)
+        return judge_error(raw.error, wire)._replace(reading=reading, raw=raw)
     if reading.outcome not in ("error", "empty"):
         return AttemptOutcome("accept", reading.outcome, reading=reading, raw=raw)
     has_error = is_error(body.get("error")) or is_error(at(body, "choices.0.error"))
@@ -213,9 +212,9 @@ def judge(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
     # Also an error in another format's form, or in MiniMax's.
     failed = has_error or as_dict(body.get("base_resp")).get("status_code")
     if reading.outcome == "error" or (is_nothing and failed):
-        error = replace(raw.error, status=status_within(raw.error))
-        reading = replace(reading, outcome="error")
-        return replace(judge_error(error, wire), reading=reading, raw=raw)
+        error = raw.error._replace(status=status_within(raw.error))
+        reading = reading._replace(outcome="error")
+        return judge_error(error, wire)._replace(reading=reading, raw=raw)
     if is_nothing:
         why = f"the body has nothing of a reply: {raw.excerpt}"
         return AttemptOutcome("retry", "bad_body", why, reading, raw=raw)

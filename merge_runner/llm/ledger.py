@@ -17,7 +17,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, NamedTuple
 
 from merge_runner.errors import CacheFailed, RecordingError, UsageError
 from merge_runner.llm.cache_file import FILE
@@ -57,8 +57,7 @@ WHERE scope = ? GROUP BY driver, outcome ORDER BY sum(usd) DESC
 """
 
 
-@dataclass(frozen=True, slots=True)
-class Cap:
+class Cap(NamedTuple):
     """Spending limit of a ledger, ``usd``, as ``source`` sets it; ``others`` share it."""
 
     usd: float
@@ -66,8 +65,7 @@ class Cap:
     others: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class CallLabel:
+class CallLabel(NamedTuple):
     """Driver and slot of a call, and the worst case if its server keeps to the output cap."""
 
     driver: str = ""

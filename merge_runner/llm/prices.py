@@ -10,7 +10,6 @@ from decimal import Decimal
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING
 
-from merge_runner.llm.http_outcome import may_be_charged
 from merge_runner.providers import ModelEntry, Price
 from merge_runner.records import Usage
 
@@ -90,6 +89,8 @@ def attempt_usd(
 
     Output beyond the cap is billed even where the server does not report the input.
     """
+    from merge_runner.llm.http_outcome import may_be_charged  # here, since no replay needs it
+
     outcome, entry = sent.outcome, endpoint.entry
     raw, usage = outcome.raw, outcome.reading.usage
     if entry.price == "free":

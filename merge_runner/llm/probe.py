@@ -10,11 +10,8 @@ from datetime import UTC, datetime, timedelta
 
 from merge_runner.errors import SweepStopped
 from merge_runner.llm.attempts import Meter
-from merge_runner.llm.call import Call, Calls, Wait
+from merge_runner.llm.call import LONG_WAIT_S, Call, Calls, Wait
 from merge_runner.llm.endpoint_state import EndpointState
-
-# A shorter wait is over before a note of it is read.
-LONG_WAIT_S = 5.0
 
 
 @dataclass(slots=True)

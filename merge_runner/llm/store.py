@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import diskcache
 from diskcache.core import MODE_RAW
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from merge_runner.errors import CacheFailed, MergeRunnerError, RecordingError, UsageError
 from merge_runner.llm.cache_file import FAILURES, FILE, NEW_CACHE, close_texts, open_texts, prepare
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 CHECKSUM_LENGTH = 32
 Attempts = tuple[Attempt, ...]
-ATTEMPTS = TypeAdapter(Attempts)
+ATTEMPTS = TypeAdapter(Attempts, config=ConfigDict(defer_build=True))  # few runs need it
 # Prefixes of keys that are no call keys.
 UNANSWERED, _DAMAGED = "attempts ", "damaged "
 UNSEEN = "the run ended before a reply was seen; it may have been charged"

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from functools import cache
 from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any, TextIO
+from typing import Any, NamedTuple, TextIO
 
 import duckdb
 
@@ -75,8 +74,7 @@ LEVEL_MEANING = "the level of a factor of the study"  # of columns that no other
 HEADINGS = ["table", "column", "type", "meaning"]
 
 
-@dataclass(frozen=True, slots=True)
-class SchemaColumn:
+class SchemaColumn(NamedTuple):
     """Column with its type and comment; the end of its name is the unit."""
 
     name: str
@@ -84,8 +82,7 @@ class SchemaColumn:
     comment: str
 
 
-@dataclass(frozen=True, slots=True)
-class SchemaTable:
+class SchemaTable(NamedTuple):
     """Table or view with its columns."""
 
     name: str

@@ -6,10 +6,11 @@ import json
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from itertools import zip_longest
 from operator import attrgetter
 from pathlib import Path
+from typing import NamedTuple
 
 from merge_runner.llm.store import CachedCall
 from merge_runner.records import ChatRequest
@@ -28,8 +29,7 @@ def described(files: Sequence[Path], entries: Iterable[CachedCall]) -> str:
     return one_line(f"{named} holds {counts or 'no call at all'}")
 
 
-@dataclass(frozen=True, slots=True)
-class Miss:
+class Miss(NamedTuple):
     """Call without a recorded reply, and the trial that needed it."""
 
     trial_id: str

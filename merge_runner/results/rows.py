@@ -7,7 +7,7 @@ import json
 import re
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from datetime import datetime
 from itertools import chain
 from operator import attrgetter, itemgetter
@@ -149,8 +149,7 @@ class Difference(NamedTuple):
     text: str
 
 
-@dataclass(frozen=True, slots=True)
-class Stored:
+class Stored(NamedTuple):
     """Rows of one table by trial, with its columns."""
 
     table: str

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from itertools import chain
 from statistics import median
 
-from merge_runner.llm.batch.providers import batch_terms
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.prices import cost_usd
 from merge_runner.llm.templates import AnswerCounts, answer_counts, count_by_template
@@ -223,7 +222,11 @@ def _usage(plan: Plan, arm: Arm, name: str, facts: Mapping[str, Usage | None]) -
 
 
 def _price_factor(entry: ModelEntry, batch: bool) -> float:
-    terms = batch_terms(entry) if batch else None
+    if not batch:
+        return 1.0
+    from merge_runner.llm.batch.providers import batch_terms  # here, since few runs need it
+
+    terms = batch_terms(entry)
     return terms.price_factor if terms else 1.0
 
 

@@ -10,9 +10,7 @@ from datetime import UTC, datetime, timedelta
 from merge_runner.driver_names import driver_name
 from merge_runner.errors import ProviderDown, UsageError
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.http_outcome import TransportFailure
-from merge_runner.llm.probe import LONG_WAIT_S
-from merge_runner.llm.rejections import if_nobody, set_base_url
+from merge_runner.llm.call import LONG_WAIT_S
 from merge_runner.llm.templates import recorded_values
 from merge_runner.providers import PROVIDERS, UNNAMED, ModelEntry, model_id, resolve_endpoint
 from merge_runner.run.options import Options
@@ -65,8 +63,10 @@ def _is_newest(cache: ResponseCache, model: str, endpoint: str) -> bool:
 
 async def _served_name(name: str, entry: ModelEntry, *, say: Callable[[str], None]) -> str:
     """Return the one model that a server lists; raises ProviderDown and UsageError."""
-    # Imports httpx, which no replay needs.
+    # Imported here, since no replay needs them, and httpx takes long to load.
     from merge_runner.llm.http import LIST_TIMEOUT_S, listed_models
+    from merge_runner.llm.http_outcome import TransportFailure
+    from merge_runner.llm.rejections import if_nobody, set_base_url
 
     endpoint = resolve_endpoint(name, entry)
     driver = driver_name(name, endpoint.identity)

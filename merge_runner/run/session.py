@@ -18,7 +18,6 @@ from merge_runner.results.store import Store
 from merge_runner.run.options import Options
 from merge_runner.run.plan import Plan
 from merge_runner.run.served_names import with_names
-from merge_runner.run.stored_replay import check_programs
 from merge_runner.trial_records import TrialRecord, TrialSpec
 
 
@@ -93,7 +92,10 @@ async def open_session(
         with unreadable_is_usage():
             ended = set() if options.replay else Store(options.db).ended_trials(specs)
             stored = [spec for key, spec in specs.items() if key in ended]
-            check_programs(options.db, plan, stored)
+            if stored:
+                from merge_runner.run.stored_replay import check_programs
+
+                check_programs(options.db, plan, stored)
         todo = [spec for key, spec in specs.items() if key not in ended]
         live = bool(todo) and not options.sends_nothing
         if live and options.dask is None:

@@ -124,7 +124,7 @@ def check_programs(path: Path, plan: Plan, stored: Sequence[TrialSpec]) -> None:
                 step = states.names.index("step")
                 last = max((row[step] for row in driven), default=-1)
                 known = [row for row in states.rows.get(key, ()) if row[step] <= last]
-                states = replace(states, rows={key: known})
+                states = states._replace(rows={key: known})
             differences = states.differences(key, driven, tolerance=TOLERANCE)
             if difference := next(iter(differences), None):
                 raise UsageError(

@@ -29,8 +29,8 @@ def hostile_trial():
     said = {1: Said(failure="no_array")}
     drive = Drive("<b>o3</b>", "baseline", "L_4_0", 1, (0.4, 0.4), (-0.4, -0.4), said)
     record = played(drive)
-    decisions = [replace(row, decision=_hostile(row.decision)) for row in record.decisions]
-    return replace(record, decisions=tuple(decisions))
+    decisions = [row._replace(decision=_hostile(row.decision)) for row in record.decisions]
+    return record._replace(decisions=tuple(decisions))
 
 
 def _hostile(decision):
@@ -41,5 +41,5 @@ def _hostile(decision):
         decision,
         rationale=HOSTILE,
         prompt=f"You drive a car.\n\n{HOSTILE}",
-        reply=replace(reply, attempts=tuple(attempts)),
+        reply=reply._replace(attempts=tuple(attempts)),
     )

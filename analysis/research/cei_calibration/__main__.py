@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -91,7 +91,7 @@ def fit(db: DbOption = DEFAULT_DB) -> None:
 
 
 def _line(thresholds: ThresholdSet, between: str = ", ") -> str:
-    return between.join(f"{name} = {value:.4f}" for name, value in asdict(thresholds).items())
+    return between.join(f"{name} = {value:.4f}" for name, value in thresholds._asdict().items())
 
 
 def _drivers(one: Fit) -> str:

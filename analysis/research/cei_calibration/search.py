@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -134,7 +134,7 @@ def search(
     All candidates of a generation play the same trials; the best third makes the next one.
     """
     random = np.random.default_rng(seed)
-    mean, spread = np.array(astuple(start)), np.array(astuple(STEPS))
+    mean, spread = np.array(start), np.array(STEPS)
     for number in range(generations):
         candidates = mean + spread * random.standard_normal((size, mean.size))
         candidates[0] = mean

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, fields
 from typing import TYPE_CHECKING
 
 from merge_runner.config import Resistance, whole_steps
@@ -43,7 +42,7 @@ def thresholds_of(context: DriverContext) -> ThresholdSet:
     """Return the thresholds that a study sets, or those calibrated for its resistance."""
     if context.parameters[SET] == BY_RESISTANCE:
         return SETS[USUAL_SETS[context.scenario.resistance]]
-    return ThresholdSet(**{f.name: context.number(f.name) for f in fields(ThresholdSet)})
+    return ThresholdSet(*map(context.number, ThresholdSet._fields))
 
 
 def check(parameters: Mapping[str, Parameter]) -> None:
@@ -75,7 +74,7 @@ PROGRAMS.register(
         {SET: BY_RESISTANCE, PAIR: 0},
         1 / TICK_S,
         settable=True,
-        sets={BY_RESISTANCE: {}, **{name: asdict(values) for name, values in SETS.items()}},
+        sets={BY_RESISTANCE: {}, **{name: values._asdict() for name, values in SETS.items()}},
         check=check,
         check_clock=check_clock,
         chance=True,

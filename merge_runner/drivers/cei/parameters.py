@@ -7,7 +7,6 @@ published outcomes (docs/reference-drivers.md).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import sqrt
 from typing import NamedTuple
 
@@ -32,8 +31,7 @@ LOWEST_THRESHOLD, HIGHEST_THRESHOLD = 0.05, 1.0
 TO_LOWER, TO_UPPER = 0.8, 0.6
 
 
-@dataclass(frozen=True, slots=True)
-class Habits:
+class Habits(NamedTuple):
     """Constants that all drivers share.
 
     ``comfortable_mps2`` is the expected acceleration of the other; after ``saturation_s`` of low
@@ -72,8 +70,7 @@ class Base(NamedTuple):
     upper: float
 
 
-@dataclass(frozen=True, slots=True)
-class ThresholdSet:
+class ThresholdSet(NamedTuple):
     """Risk thresholds of all drivers: ten numbers.
 
     A driver's thresholds are ``mean - spread * z`` of its offset z, and change with its headway H

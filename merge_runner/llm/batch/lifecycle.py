@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Awaitable, Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
 from typing import TypeVar
@@ -163,7 +163,7 @@ class Lifecycle:
         async for key, raw in service.results(status.paths or []):
             outcome = no_result("expired", "it was not asked in time", charged=False)
             if raw:  # a rate limit for batches pauses no normal request
-                outcome = replace(judge(raw, service.wire), pause=False, delay_s=None)
+                outcome = judge(raw, service.wire)._replace(pause=False, delay_s=None)
             broken += not key
             if key in note.lines:  # others are of other batches; the first of two counts
                 batch.results.setdefault(key, outcome)

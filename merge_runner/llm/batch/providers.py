@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 from urllib.parse import urlsplit
 from uuid import uuid4
@@ -74,7 +73,7 @@ class OpenAIBatches(BatchService):
         answered = as_count(as_dict(batch.get("request_counts")).get("completed")) or 0
         error, errors = at(batch, "errors.data.0"), batch.get("errors")
         why = read_error(400, {}, json.dumps(errors) if errors else "", {"error": error})
-        why = replace(why, status=status_within(why) if why.names else 400)
+        why = why._replace(status=status_within(why) if why.names else 400)
         failure = self._failure_of(why) if word == "FAILED" else None
         if word not in ("COMPLETED", "EXPIRED", "CANCELLED"):
             return BatchStatus(failure=failure)

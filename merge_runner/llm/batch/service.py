@@ -7,7 +7,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 from urllib.parse import quote
 
 from merge_runner.errors import MergeRunnerError
@@ -55,8 +55,7 @@ class BatchFailed(MergeRunnerError):
         self.sent = sent
 
 
-@dataclass(frozen=True, slots=True)
-class BatchStatus:
+class BatchStatus(NamedTuple):
     """Status of a batch.
 
     One that has ended, expired or was cancelled has at least ``results`` results at ``paths``:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from merge_runner.llm.formats.wire import as_dict, as_dicts, as_text, at
 
@@ -33,8 +32,7 @@ SHORTER = re.compile(r"per[-_ ]?(min|sec|hour)|\b[rt]pm\b", re.IGNORECASE)
 DURATION = re.compile(r"(\d+(?:\.\d+)?)s")
 
 
-@dataclass(frozen=True, slots=True)
-class ServerError:
+class ServerError(NamedTuple):
     """An error in one shape: servers send nested, flat, listed and string errors.
 
     ``status`` is the reply's status, or the equivalent of an error within a 200. ``names`` are its

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from pydantic import JsonValue
 
@@ -43,8 +43,7 @@ class WireRequest:
     headers: dict[str, str] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True)
-class Reading:
+class Reading(NamedTuple):
     """Content of a JSON body of status 200.
 
     ``outcome`` is ``ok``, ``refusal``, ``truncated``, ``empty``, or ``error`` where the body
@@ -57,7 +56,7 @@ class Reading:
     text: str = ""
     finish_reason: str | None = None
     model_served: str | None = None
-    usage: Usage = field(default_factory=Usage)
+    usage: Usage = Usage()
     reasoning: str = ""
     service_tier: str | None = None
 
@@ -111,8 +110,7 @@ def read_reply(wire: WireFormat, payload: dict[str, Any]) -> Reading:
     thoughts, answer, cut = split_reasoning(reading.text)
     if not thoughts and answer == reading.text:
         return reading
-    return replace(
-        reading,
+    return reading._replace(
         outcome=outcome_of(answer, truncated=cut or reading.outcome == "truncated"),
         text=answer,
         reasoning=reading.reasoning + thoughts,

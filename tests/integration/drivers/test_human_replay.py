@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import duckdb
@@ -173,7 +172,7 @@ def test_what_a_vehicle_cannot_do_is_not_replayed(db, plan_of):
     assert humans.usable(config, "L_4_0", "all")
     assert not humans.usable(weak, "L_4_0", "all")
     (first, *others) = humans.trials
-    assert ImportedHumans((replace(first, pair="pair9"), *others)).digest != humans.digest
+    assert ImportedHumans((first._replace(pair="pair9"), *others)).digest != humans.digest
 
 
 async def test_a_sweep_of_them_is_stored_audited_and_shown_with_a_caution(

@@ -94,7 +94,7 @@ def test_a_failed_trial_keeps_the_factor_levels_of_another_study_when_it_is_repl
     ours = replace(record.spec, factors=levels)
     store.write("s1", [TrialRecord(ours, "failed", None, 1.0, "it broke", (), ())], patience_s=1)
     theirs = replace(record.spec, factors=(("hurry", "no"), ("speed", "low")))
-    store.write("s1", [replace(record, spec=theirs)], patience_s=1)
+    store.write("s1", [record._replace(spec=theirs)], patience_s=1)
     stored = query(path, "select factor, value, status from trial_factors join trials using "
                          "(trial_id, spec_hash) order by all")[1]  # fmt: skip
     expected = [("hurry", "no"), ("mood", "calm"), ("speed", "low")]
@@ -104,11 +104,11 @@ def test_a_failed_trial_keeps_the_factor_levels_of_another_study_when_it_is_repl
 def test_a_trial_that_ends_otherwise_than_the_stored_one_is_named_and_not_stored(store, path):
     record = played()
     store.write("s1", [record], patience_s=1)
-    other = replace(played("L_4_8"), spec=record.spec)
+    other = played("L_4_8")._replace(spec=record.spec)
     assert store.write("s1", [other], patience_s=1).keys() == {record.spec.key}
     plan = record.decisions[3].decision
-    swerve = replace(record.decisions[3], decision=replace(plan, applied=(0.5,) * 5))
-    decided = replace(record, decisions=(*record.decisions[:3], swerve, *record.decisions[4:]))
+    swerve = record.decisions[3]._replace(decision=replace(plan, applied=(0.5,) * 5))
+    decided = record._replace(decisions=(*record.decisions[:3], swerve, *record.decisions[4:]))
     assert store.write("s1", [decided], patience_s=1) == {record.spec.key: ["decisions.applied"]}
     assert query(path, "select count(*) from states")[1] == [(len(record.states),)]
 
@@ -129,7 +129,7 @@ def test_two_specs_of_one_trial_stay_apart_and_a_changed_condition_needs_another
     named = keyed(other) | {(one.spec.trial_id, "x"): one.spec}
     assert store.ended_trials(named) == {(one.spec.trial_id, "g")}
     assert results_digest(path)[1] == 2
-    changed = [replace(record, merged_first=None) for record in (one, other)]
+    changed = [record._replace(merged_first=None) for record in (one, other)]
     assert store.add_recorded(changed, {}) == (0, 0, [one.spec.trial_id] * 2)
     with duckdb.connect(str(path)) as connection:
         connection.execute("UPDATE trials SET projected_headway_m = 3")

@@ -52,7 +52,7 @@ def test_a_trial_is_stored_as_its_record_says_and_its_spec_too(path):
 
 def test_importing_twice_or_beside_a_sweep_leaves_the_database_as_it_was(path):
     record = trial_record(parse_csv(LEFT.csv()), 4, 1)
-    llm = replace(record, spec=replace(record.spec, spec_hash="another", source="llm"))
+    llm = record._replace(spec=replace(record.spec, spec_hash="another", source="llm"))
     Store(path).add_recorded([llm], {})
     files = {f"experiment_{n}_iter_{m}.csv": LEFT.csv() for n in (4, 5) for m in (0, 1)}
     assert imported(path, files).added == 4

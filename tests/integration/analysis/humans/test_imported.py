@@ -79,7 +79,7 @@ def stored(tmp_path):
             records.append(TrialRecord(spec, row.status, first, 5.0, None, states, ()))
         path = tmp_path / "merge.duckdb"
         model = replace(spec, trial_id="o3/1", source="llm", variant="baseline", pair=None)
-        Store(path).add_recorded([*records, replace(records[-1], spec=model)], {})
+        Store(path).add_recorded([*records, records[-1]._replace(spec=model)], {})
         return path
 
     return write

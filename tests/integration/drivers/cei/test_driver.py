@@ -1,7 +1,5 @@
 """The driver cei in a trial: what it sees, what a study can set, and one trial as it went."""
 
-from dataclasses import asdict
-
 import numpy as np
 import pytest
 
@@ -92,7 +90,7 @@ def test_a_driver_starts_below_the_speed_it_desires_by_the_error_of_the_cruise_c
 
 
 def test_a_threshold_can_be_set_over_those_of_a_set():
-    wanted = asdict(SETS["F1"]) | {"upper_mean": 0.5}
+    wanted = SETS["F1"]._asdict() | {"upper_mean": 0.5}
     assert cei(set="F1", upper_mean=0.5).values.items() >= wanted.items()
 
 

@@ -3,7 +3,7 @@
 import re
 import subprocess
 import sys
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import pytest
 from scipy.stats import spearmanr
@@ -105,10 +105,10 @@ def test_a_miss_by_its_tolerance_costs_one_and_a_number_without_a_fit_much():
 
 
 def test_a_search_looks_only_for_thresholds_that_a_study_may_set():
-    edge = replace(SETS["K0"], lower_spread=0.0, upper_spread=0.0, upper_mean=1.0)
+    edge = SETS["K0"]._replace(lower_spread=0.0, upper_spread=0.0, upper_mean=1.0)
     small = {"generations": 1, "size": 6, "seed": 1, "trials_of_a_pair": 1}
     for found in search(edge, experiment(), targets(), **small):
-        check({"pair": 0, **asdict(found.thresholds)})
+        check({"pair": 0, **found.thresholds._asdict()})
 
 
 @pytest.mark.parametrize("name", SETS)
