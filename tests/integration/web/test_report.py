@@ -76,6 +76,14 @@ def test_a_report_begins_with_the_description_the_design_the_prompts_and_the_fac
     assert "vehicle_length_m = 8.0" in text
 
 
+def test_figures_that_show_the_same_are_not_drawn(tmp_path):
+    study = StudyResults(write_study(tmp_path / "t.duckdb", yielding("o3", reps=1)))
+    said = []
+    (out,) = write_report(study, tmp_path / "report.html", None, said.append)
+    assert said[1:] == ["drawing figure2", "drawing first-action"]
+    assert len(Page(out.read_text()).sources) == 2
+
+
 def asking(folder, said, *, variant="baseline"):
     """A study of o3 in which the first six trials had this said at their first decision."""
     drives = [replace(d, said={0: said}) for d in yielding("o3", variant, reps=1)[:6]]

@@ -21,7 +21,7 @@ from merge_runner_analysis.tables.model import from_text
 from merge_runner_analysis.web.answers import answer
 from merge_runner_analysis.wording import MEASURES, by_group, verdict_word
 from tests.support import program
-from tests.support.serving import Page, client_of, in_process, listed, never
+from tests.support.serving import Page, client_of, in_process, listed, never, words_of
 from tests.support.studies import Said, changed, write_study, yielding
 
 WORST = "L_0_-8"
@@ -120,7 +120,10 @@ def test_a_drivers_page_has_the_numbers_of_the_table_with_the_trials_behind_them
     assert listed(client.get(link).text) == int(n) == own["headway"]["n"]
     for link, count in page.to("/trials?"):
         assert not count.isdigit() or listed(client.get(link).text) == int(count), link
-    assert "990 trials" in client.get("/drivers/human").text
+    peoples = client.get("/drivers/human").text
+    assert "990 trials" in peoples
+    # Their published numbers are of all situations, whichever is chosen.
+    assert words_of(client.get("/drivers/human?condition=L_4_8").text) == words_of(peoples)
     assert client.get("/drivers/nobody").status_code == 404
     for wrong in ("variant=A9", "condition=nowhere", "sweep=none", "model=nobody"):
         assert client.get(f"/?{wrong}").status_code == 404
@@ -253,3 +256,12 @@ def test_the_study_begins_with_its_description_and_says_what_to_type_and_counts_
     # They would hold up the first page by a second; the worker imports them beside it.
     code = "import sys, merge_runner_analysis.web.app; sys.exit('scipy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_the_emulators_lot_is_said_where_it_meets_itself(tmp_path):
+    db = tmp_path / "t.duckdb"
+    write_study(db, [*yielding("emulator", reps=1), *yielding("dear", reps=1)])
+    changed(db, "UPDATE trials SET model_left = 'emulator' WHERE model_left = 'dear'")
+    rows = words_of(client_of(db).get("/").text).split("who goes first is drawn by lot")
+    assert len(rows) == 2
+    assert rows[0].rstrip().endswith(" emulator 11 trials")
