@@ -138,8 +138,11 @@ class Flusher:
         if self.broken:
             return False
         sizes = accumulate(size for _, size in self._pending[:BATCH])
+        # The last batch may be larger, rather than leave few trials to a further transaction.
+        is_last = self._closing.is_set() and self._bytes <= 1.25 * self._batch_bytes
+        most_bytes = self._bytes if is_last else self._batch_bytes
         # At least one: a single trial may be larger than a batch should be.
-        number = max(1, sum(size <= self._batch_bytes for size in sizes))
+        number = max(1, sum(size <= most_bytes for size in sizes))
         # It stays in front until it is stored: others are added behind it meanwhile.
         batch = [record for record, _ in self._pending[:number]]
         # In a thread, since DuckDB waits for the file's lock and for the disk.

@@ -96,7 +96,7 @@ async def test_live_trials_are_stored_in_short_transactions():
     for _ in range(5):
         flusher.add(ended(size=LIVE_BATCH_BYTES // 3))
     await flusher.close()
-    assert [*map(len, store.written)] == [2, 2, 1]
+    assert [*map(len, store.written)] == [2, 3]  # the last may be a quarter larger
 
 
 def ended(order=0, status="finished", size=0):
