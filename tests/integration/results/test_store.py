@@ -231,7 +231,7 @@ async def test_trials_wait_in_memory_while_the_database_is_locked(store, path, h
 
 
 def test_rows_are_converted_before_the_database_is_locked(store, holder):
-    unfit = replace(played(), status="failed", error="half of a pair: \ud800")
+    unfit = played()._replace(status="failed", error="half of a pair: \ud800")
     with holder(), pytest.raises(StoreError, match=r"cannot be used: .* surrogate"):
         store.write("s1", [played(), unfit], patience_s=0)
 
