@@ -16,6 +16,7 @@ from datetime import UTC, datetime, timedelta
 from functools import partial
 from typing import TYPE_CHECKING
 
+from merge_runner.drivers.language_model import Question
 from merge_runner.errors import MergeRunnerError, RecordingError, SweepStopped
 from merge_runner.llm.attempts import Meter, record
 from merge_runner.llm.budget import Budget, Reservation
@@ -30,7 +31,7 @@ from merge_runner.llm.probe import Probe
 from merge_runner.llm.recorded import RecordedReplies
 from merge_runner.llm.sender import DirectSender
 from merge_runner.llm.store import Attempts, CachedCall
-from merge_runner.records import Attempt, CallFailed, ChatReply, ChatRequest, Slot
+from merge_runner.records import Attempt, CallFailed, ChatReply, ChatRequest, Decision
 
 if TYPE_CHECKING:
     from merge_runner.llm.batch.rounds import BatchSender
@@ -67,17 +68,17 @@ class LlmClient:
         )
         self.probe = Probe(endpoint, self.calls, self.meter)
 
-    async def ask(self, prompt: str, slot: Slot, *, order: int = 0) -> ChatReply:
-        """Return the model's reply for a slot; lower ``order`` is served first.
+    async def answer(self, question: Question, *, order: int = 0) -> Decision:
+        """Return the decision of the model's reply; lower ``order`` is served first.
 
         Raises CallFailed, TrialSuspended, SweepStopped or UsageError.
         """
-        request = self.replies.request(prompt, slot)
+        prompt, request = self.replies.request_of(question)
         reply, attempts = None, None
         with suppress(RecordingError):  # damaged: no reply, and attempts stays None
             stored, attempts = self.cache.look_up(request.key, request)
             if stored:
-                reply = self.replies.read(stored, len(stored.attempts))
+                reply = self.replies.read(stored)
         if reply is None:
             reply = await self._join_or_start(request, order, attempts)
         self.replies.count_reply(reply, shared=request.key in self.calls.answered)
@@ -86,9 +87,10 @@ class LlmClient:
             entry = self.endpoint.entry
             raise SweepStopped(
                 f"{self.endpoint.driver}: {served} answered where {entry.id} was asked for, at "
-                f"{slot}: leave --strict-model out, or name it in `aliases` of {entry.place}"
+                f"{question.slot}: leave --strict-model out, or name it in `aliases` of "
+                f"{entry.place}"
             )
-        return reply
+        return question.decision(prompt, reply)
 
     async def _join_or_start(
         self, request: ChatRequest, order: int, attempts: Attempts | None
@@ -246,6 +248,6 @@ class LlmClient:
         self.calls.answered.add(key)  # before others can find the reply in the cache
         kept = await reservation.book(attempt, partial(self.cache.keep, answered))
         if kept is not answered:  # an import has stored another reply first, which is used
-            return self.replies.read(kept, len(kept.attempts))
+            return self.replies.read(kept)
         text = outcome.reading.text
         return ChatReply(text, attempt.outcome, call.request, attempts, call.earlier_attempts)
