@@ -29,7 +29,7 @@ def ledger(
     Example: merge-runner ledger --cache cache/responses
     """
     from merge_runner.llm.cache import ResponseCache
-    from merge_runner.llm.cache_file import require
+    from merge_runner.llm.cache_format import require
     from merge_runner.llm.durable import LIVE
     from merge_runner.llm.ledger import APART, Ledger, reasons, scopes
     from merge_runner.run.summary import as_table

@@ -139,16 +139,12 @@ class Program:
 
     def make(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> Driver:
         """Return the driver of one side of a trial."""
-        return self.driver(self.context(scenario, spec, side))
+        pace = program_pace(scenario, self.rate_hz)
+        return self.driver(make_context(scenario, spec, side, pace, self.values, self.data))
 
     def replaying(self, connection: DuckDBPyConnection | None) -> Program:
         """Return this program with the human trials of a database, if it replays some."""
         return self if self.data is None else replace(self, data=self.data.read(connection))
-
-    def context(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> DriverContext:
-        """Return the driver's context."""
-        pace = program_pace(scenario, self.rate_hz)
-        return make_context(scenario, spec, side, pace, self.values, self.data)
 
     def in_spec(self, name: str) -> dict[str, object]:
         """Return its entry in the spec of a trial."""

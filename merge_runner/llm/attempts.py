@@ -53,17 +53,18 @@ class Meter:
 
 def record(
     call: Call,
+    number: int,
     sent: Sent,
     usd: float | None,
     reservation: Reservation,
     endpoint: EndpointState,
     meter: Meter,
 ) -> Attempt:
-    """Record and count the attempt of a call that has just ended."""
+    """Record and count attempt ``number`` of a call, which has just ended."""
     outcome = sent.outcome
     raw, reading = outcome.raw, outcome.reading
     attempt = Attempt(
-        number=len(call.attempts) + 1,
+        number=number,
         outcome=outcome.name,
         http_status=raw.status if raw else None,
         model_served=reading.model_served,

@@ -1,4 +1,4 @@
-"""Cache folder: list, import and quarantine recorded calls."""
+"""Cache folder: list, import and quarantine recorded calls; store other texts."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from itertools import islice
 from pathlib import Path
 
 from merge_runner.errors import RecordingError
-from merge_runner.llm.cache_file import FAILURES, FOREIGN_KEY
+from merge_runner.llm.cache_format import FAILURES, FOREIGN_KEY
 from merge_runner.llm.durable import Execute, Operation
 from merge_runner.llm.store import (
     ATTEMPTS,
@@ -21,6 +21,7 @@ from merge_runner.llm.store import (
     CachedCall,
     CallStore,
     attempts_of,
+    checksum,
     text_of,
     verified,
 )
@@ -46,7 +47,7 @@ _CALL = "SELECT key, raw, mode, filename, value FROM Cache WHERE rowid = ?"
 
 
 class ResponseCache(CallStore):
-    """Calls of a cache folder and of a recording."""
+    """Calls of a cache folder and of a recording, and other texts in the folder."""
 
     def put_now(
         self,
@@ -74,6 +75,14 @@ class ResponseCache(CallStore):
             added += sum(map(operator.is_, self.put_now(batch), batch))
             seen += len(batch)
         return added, seen - added
+
+    def replace(self, name: str, text: str, _: Execute) -> None:
+        """Store a text with its checksum; its name is no call key. Runs in a transaction."""
+        self.texts.set(name, checksum(text) + text)
+
+    def remove(self, name: str, _: Execute) -> None:
+        """Delete the text under a name that is no call key. Runs in a transaction."""
+        self.texts.delete(name)
 
     def keep_attempts(self, key: str, attempts: Attempts, execute: Execute) -> None:
         """Store the attempts of a call that has no answer yet. Runs in a transaction."""

@@ -36,11 +36,11 @@ class Call:
     ``label`` names it and bounds the cost of an attempt, ``worst`` bounds its tokens. ``left_s``
     remains for its attempts and the waits between them; waits for the rate limiter do not count.
     ``attempts`` has all attempts, the first ``earlier_attempts`` by earlier runs. ``wait`` is None
-    while it is in flight or being saved. ``task`` makes the call. ``trials`` has the orders of the
-    trials that wait for it, ``order`` is the lowest of them. While ``is_probe``, other calls wait
-    for it. ``bypass_batch`` is set after a batch without a result for it; ``pending_batch`` is the
-    batch of an earlier run in which it waits. ``damaged``: the cache has a reply to it, or earlier
-    attempts, that cannot be used.
+    while it waits only for a reply or for the disk. ``task`` makes the call. ``trials`` has the
+    orders of the trials that wait for it, ``order`` is the lowest of them. While ``is_probe``,
+    other calls wait for it. ``bypass_batch`` is set after a batch without a result for it;
+    ``pending_batch`` is the batch of an earlier run in which it waits. ``damaged``: the cache has a
+    reply to it, or earlier attempts, that cannot be used.
     """
 
     request: ChatRequest

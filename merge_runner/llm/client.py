@@ -1,7 +1,10 @@
 """Client for one model: returns the recorded reply to a prompt, or calls the API.
 
-A call is: look up, admit, reserve, send, judge, finish. Its sender waits for the rate limiter and
-makes the reservation durable.
+A stored reply is read from the cache. Otherwise the request joins the call under way for its key,
+or starts a new call: it waits for admission, quarantines damaged entries, waits for the probe, and
+repeats attempts until the model answers. The client reserves money for an attempt. A sender waits
+for the rate limiter, makes the reservation durable, sends the request and judges the reply. The
+client then books reply and cost.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ from datetime import UTC, datetime, timedelta
 from functools import partial
 from typing import TYPE_CHECKING
 
+from merge_runner.drivers.language_model import Question
 from merge_runner.errors import MergeRunnerError, RecordingError, SweepStopped
 from merge_runner.llm.attempts import Meter, record
 from merge_runner.llm.budget import Budget, Reservation
@@ -27,7 +31,7 @@ from merge_runner.llm.probe import Probe
 from merge_runner.llm.recorded import RecordedReplies
 from merge_runner.llm.sender import DirectSender
 from merge_runner.llm.store import Attempts, CachedCall
-from merge_runner.records import Attempt, CallFailed, ChatReply, ChatRequest, Slot
+from merge_runner.records import Attempt, CallFailed, ChatReply, ChatRequest, Decision
 
 if TYPE_CHECKING:
     from merge_runner.llm.batch.rounds import BatchSender
@@ -52,6 +56,7 @@ class LlmClient:
     batch: BatchSender | None = None
     strict: bool = False
     calls: Calls = field(default_factory=Calls)
+    meter: Meter = field(default_factory=Meter)
     replies: RecordedReplies = field(init=False)
     probe: Probe = field(init=False)
 
@@ -59,39 +64,35 @@ class LlmClient:
         """Make the parts that all calls share."""
         endpoint, entry = self.endpoint, self.endpoint.entry
         self.replies = RecordedReplies(
-            endpoint.name, entry, endpoint.identity, endpoint.wire, self.cache
+            endpoint.name, entry, endpoint.identity, endpoint.wire, self.cache, self.meter
         )
         self.probe = Probe(endpoint, self.calls, self.meter)
 
-    @property
-    def meter(self) -> Meter:
-        """Counts of this model's calls."""
-        return self.replies.meter
-
-    async def ask(self, prompt: str, slot: Slot, *, order: int = 0) -> ChatReply:
-        """Return the model's reply for a slot; lower ``order`` is served first.
+    async def answer(self, question: Question, *, order: int = 0) -> Decision:
+        """Return the decision of the model's reply; lower ``order`` is served first.
 
         Raises CallFailed, TrialSuspended, SweepStopped or UsageError.
         """
-        request = self.replies.request(prompt, slot)
+        prompt, request = self.replies.request_of(question)
         reply, attempts = None, None
         with suppress(RecordingError):  # damaged: no reply, and attempts stays None
             stored, attempts = self.cache.look_up(request.key, request)
             if stored:
-                reply = self.replies.read(stored, len(stored.attempts))
+                reply = self.replies.read(stored)
         if reply is None:
-            reply = await self._shared(request, order, attempts)
+            reply = await self._join_or_start(request, order, attempts)
         self.replies.count_reply(reply, shared=request.key in self.calls.answered)
         served = reply.attempts[-1].model_served
         if self.strict and served not in self.replies.own_names:
             entry = self.endpoint.entry
             raise SweepStopped(
                 f"{self.endpoint.driver}: {served} answered where {entry.id} was asked for, at "
-                f"{slot}: leave --strict-model out, or name it in `aliases` of {entry.place}"
+                f"{question.slot}: leave --strict-model out, or name it in `aliases` of "
+                f"{entry.place}"
             )
-        return reply
+        return question.decision(prompt, reply)
 
-    async def _shared(
+    async def _join_or_start(
         self, request: ChatRequest, order: int, attempts: Attempts | None
     ) -> ChatReply:
         """Return the reply to a request, from the call under way for it or from a new call."""
@@ -126,7 +127,7 @@ class LlmClient:
         label = CallLabel(self.endpoint.driver, str(request.slot), usd)
         call = Call(request, order, label, worst, entry.deadline_s, damaged=earlier is None)
         call.attempts, call.earlier_attempts = [*(earlier or ())], len(earlier or ())
-        call.task = asyncio.create_task(self._call(call))
+        call.task = asyncio.create_task(self._run(call))
         self.calls.under_way[request.key] = call
 
         def forget(done: asyncio.Task[ChatReply]) -> None:
@@ -138,13 +139,14 @@ class LlmClient:
         call.task.add_done_callback(forget)
         return call
 
-    async def _call(self, call: Call) -> ChatReply:
+    async def _run(self, call: Call) -> ChatReply:
         """Admit a call's trial and make attempts; the first normal call of a run is a probe."""
         if self.batch is not None:
             call.pending_batch = self.batch.rounds.pending.get(call.request.key)
         if call.pending_batch:
             self.budget.readmit(call.order)
-        if call.order not in self.budget.expected_usd:
+        has_cap = self.budget.ledger.cap is not None
+        if has_cap and call.order not in self.budget.expected_usd:
             self.calls.wait(call, Wait(NO_ROOM, blocked=True))
             await self.budget.admit(call.trials)
             call.wait = None
@@ -154,8 +156,8 @@ class LlmClient:
             self.batch.resume(call)
         elif not self.endpoint.verified:
             async with self.probe.turn(call):
-                return await self._attempts(call)
-        return await self._attempts(call)
+                return await self._until_answered(call)
+        return await self._until_answered(call)
 
     async def _quarantine(self, call: Call) -> None:
         key = call.request.key
@@ -168,8 +170,8 @@ class LlmClient:
         _, earlier = self.cache.look_up(key)
         call.attempts, call.earlier_attempts = [*earlier], len(earlier)
 
-    async def _attempts(self, call: Call) -> ChatReply:
-        """Make attempts, with backoff, until one brings an answer."""
+    async def _until_answered(self, call: Call) -> ChatReply:
+        """Repeat attempts, with backoff, until the model answers or the deadline would pass."""
         try:
             return await self._attempt(call)
         except TryAgain as exc:
@@ -220,10 +222,11 @@ class LlmClient:
         else:
             call.wait = Wait(NO_MONEY, blocked=True)
             reservation = await self.budget.reserve(call.trials, key, label, is_probe=call.is_probe)
+        number = len(call.attempts) + 1
         with closing(reservation):
-            sent = await sender.send(call, reservation)
+            sent = await sender.send(call, number, reservation)
             usd = attempt_usd(sent, call.worst, self.endpoint, sender.price_factor)
-            attempt = record(call, sent, usd, reservation, self.endpoint, self.replies.meter)
+            attempt = record(call, number, sent, usd, reservation, self.endpoint, self.meter)
             error = sent.error or self.endpoint.error_of(call, sent.outcome)
             return await self._finish(call, reservation, attempt, sent.outcome, error)
 
@@ -245,6 +248,6 @@ class LlmClient:
         self.calls.answered.add(key)  # before others can find the reply in the cache
         kept = await reservation.book(attempt, partial(self.cache.keep, answered))
         if kept is not answered:  # an import has stored another reply first, which is used
-            return self.replies.read(kept, len(kept.attempts))
+            return self.replies.read(kept)
         text = outcome.reading.text
         return ChatReply(text, attempt.outcome, call.request, attempts, call.earlier_attempts)

@@ -20,7 +20,7 @@ from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
 from merge_runner.errors import CacheFailed, RecordingError, UsageError
-from merge_runner.llm.cache_file import FILE
+from merge_runner.llm.cache_format import FILE
 from merge_runner.llm.durable import Execute
 from merge_runner.llm.store import CacheFile
 from merge_runner.records import Attempt

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 # Provider names of genai-prices where they differ from the registry's.
 GENAI_PRICES_PROVIDER = {"gemini": "google"}
 PER_MILLION = Decimal(1_000_000)
+BYTES_A_TOKEN = 4  # about, in English
 # Billed above the normal price, at OpenAI about twice.
 DEARER_TIERS = frozenset({"priority"})
 
@@ -113,8 +114,10 @@ def attempt_usd(
 
 
 def worst_case(entry: ModelEntry, body: str) -> tuple[Usage, float]:
-    """Return an upper bound of the tokens of a request, and their cost in USD."""
-    # No tokeniser makes more tokens than bytes.
+    """Return an upper bound of the tokens of a request, and their cost in USD.
+
+    The input tokens are the request's bytes: no tokeniser makes more.
+    """
     worst = Usage(input_tokens=len(body.encode()), output_tokens=entry.max_output_tokens)
     tier = entry.parameters.get("service_tier")
     in_tier_usd = cost_usd(entry, worst, tier) if isinstance(tier, str) else None

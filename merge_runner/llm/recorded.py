@@ -61,29 +61,33 @@ class RecordedReplies:
 
     def answer(self, question: Question) -> Decision:
         """Return the decision of the recorded reply; raise ReplayMiss or CallFailed."""
-        prompt = self.prompt(question)
-        request = self.request(prompt, question.slot)
+        prompt, request = self.request_of(question)
         try:
             stored = self.calls.get(request.key, request)
         except RecordingError as exc:
             raise CallFailed(f"{self.name}: call {request.key}: {exc}", request) from exc
         if stored is None:
             raise ReplayMiss("no recorded reply", request)
-        reply = self.read(stored, len(stored.attempts))
+        reply = self.read(stored)
         self.count_reply(reply)
         return question.decision(prompt, reply)
 
-    def prompt(self, question: Question) -> str:
-        """Return the prompt of a question, or its older wording if only that is recorded."""
-        prompt, older, slot = question.prompt, question.older, question.slot
-        if older is None or self.has_asked(prompt, slot) or not self.has_asked(older, slot):
-            return prompt
-        return older
+    def request_of(self, question: Question) -> tuple[str, ChatRequest]:
+        """Return the prompt of a question, or its older wording if only that is recorded.
 
-    def has_asked(self, prompt: str, slot: Slot) -> bool:
+        The second result is the request with this prompt.
+        """
+        prompt, older = question.prompt, question.older
+        request = self.request(prompt, question.slot)
+        if older is not None and not self._is_recorded(request):
+            older_request = self.request(older, question.slot)
+            if self._is_recorded(older_request):
+                return older, older_request
+        return prompt, request
+
+    def _is_recorded(self, request: ChatRequest) -> bool:
         """Return whether a reply is recorded, also a damaged or invalid one."""
         try:
-            request = self.request(prompt, slot)
             return self.calls.get(request.key, request) is not None
         except (RecordingError, CallFailed):
             return True
@@ -101,7 +105,7 @@ class RecordedReplies:
             slot=slot,
         )
 
-    def read(self, stored: CachedCall, cached_attempts: int) -> ChatReply:
+    def read(self, stored: CachedCall) -> ChatReply:
         """Read a recorded reply by the present rules, not by its run's, as an audit does."""
         attempts, last = stored.attempts, stored.attempts[-1]
         payload = reply_object(last.reply or "{}") if last.http_status == 200 else {}
@@ -110,7 +114,7 @@ class RecordedReplies:
         if payload and reading.outcome in ANSWERS and differs:
             last = replace(last, outcome=reading.outcome, usage=reading.usage)
             attempts = (*attempts[:-1], last)
-        return ChatReply(reading.text, last.outcome, stored.request, attempts, cached_attempts)
+        return ChatReply(reading.text, last.outcome, stored.request, attempts, len(attempts))
 
     def count_reply(self, reply: ChatReply, *, shared: bool = False) -> None:
         """Count a reply that a trial uses, and its model where another one was asked for.

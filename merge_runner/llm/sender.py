@@ -14,6 +14,7 @@ from merge_runner.llm.delays import backoff_s
 from merge_runner.llm.formats.wire import WireFormat
 from merge_runner.llm.http_outcome import AttemptOutcome, TransportFailure, judge
 from merge_runner.llm.limiter import Limiter
+from merge_runner.llm.prices import BYTES_A_TOKEN
 from merge_runner.providers import ModelEntry
 
 if TYPE_CHECKING:
@@ -40,18 +41,19 @@ class DirectSender:
     limiter: Limiter
     price_factor: float = 1.0
 
-    async def send(self, call: Call, reservation: Reservation) -> Sent:
-        """Wait for a turn, begin the reservation, send the next attempt, and return its outcome.
+    async def send(self, call: Call, number: int, reservation: Reservation) -> Sent:
+        """Wait for a turn, begin the reservation, send attempt ``number``, and judge its reply.
 
         Raises TrialSuspended where the money cannot be reserved.
         """
         # The wait comes first: a turn must be used at once, or the limits do not hold.
         call.wait = Wait("for a turn under the rate limits")
-        # Providers count a request when they admit it: about four bytes a token, and the whole cap.
-        estimate = (call.worst.input_tokens or 0) // 4 + self.entry.max_output_tokens
+        # Providers count a request when they admit it, with the whole cap. In the worst case a byte
+        # is a token.
+        input_tokens = (call.worst.input_tokens or 0) // BYTES_A_TOKEN
+        estimate = input_tokens + self.entry.max_output_tokens
         correct = await self.limiter.acquire(estimate, order=call.order)
         call.wait = None
-        number = len(call.attempts) + 1
         await reservation.begin(number)
         began, clock_s = datetime.now(UTC), asyncio.get_running_loop().time
         began_s, timeout_s = clock_s(), min(self.entry.timeout_s, call.left_s)

@@ -25,8 +25,8 @@ import diskcache
 from diskcache.core import MODE_RAW
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
-from merge_runner.errors import CacheFailed, MergeRunnerError, RecordingError, UsageError
-from merge_runner.llm.cache_file import FAILURES, FILE, NEW_CACHE, close_texts, open_texts, prepare
+from merge_runner.errors import CacheFailed, MergeRunnerError, RecordingError
+from merge_runner.llm.cache_format import FAILURES, FILE, close_texts, open_texts, prepare, unusable
 from merge_runner.llm.durable import Execute, GroupWriter, ModelLocks, Operation, Rows, connect
 from merge_runner.records import DAMAGED, Attempt, ChatRequest, check_call
 
@@ -111,7 +111,7 @@ class CacheFile:
             self._one_query = Lock()
             self.reading = connect(folder / FILE)
         except FAILURES as exc:
-            raise self._unusable(exc) from exc
+            raise unusable(self.folder, exc) from exc
         if read_only:
             self.texts = None
 
@@ -126,7 +126,7 @@ class CacheFile:
         try:
             return open_texts(self.folder)
         except FAILURES as exc:
-            raise self._unusable(exc) from exc
+            raise unusable(self.folder, exc) from exc
 
     def rows(self, sql: str, *values: object, execute: Execute | None = None) -> Rows:
         """Return the rows of a query; with ``execute``, as its transaction sees them.
@@ -179,9 +179,6 @@ class CacheFile:
         """Close the writing thread's connection: a finished thread does not close it."""
         if (texts := vars(self).get("texts")) is not None:
             texts.close()
-
-    def _unusable(self, why: BaseException) -> UsageError:
-        return UsageError(f"the cache {self.folder} cannot be used: {why}. {NEW_CACHE}")
 
     def failure(self, done: str, why: BaseException) -> CacheFailed | RecordingError:
         """Return the error for a folder that cannot be read or written, or for invalid text."""
@@ -268,14 +265,6 @@ class CallStore(CacheFile):
         rows = self.rows(_GET, name)
         return text_of(*rows[0]) if rows else None
 
-    def replace(self, name: str, text: str, _: Execute) -> None:
-        """Store a text with its checksum; its name is no call key. Runs in a transaction."""
-        self.texts.set(name, _checksum(text) + text)
-
-    def remove(self, name: str, _: Execute) -> None:
-        """Delete the text under a name that is no call key. Runs in a transaction."""
-        self.texts.delete(name)
-
     def names(self, prefix: str) -> list[str]:
         """Return the names with a prefix; none is a call key."""
         rows = self.rows(_KEYS, prefix, prefix + chr(0x10FFFF))
@@ -287,7 +276,7 @@ class CallStore(CacheFile):
         A damaged one is quarantined.
         """
         key, content = entry.request.key, entry.to_json()
-        text = _checksum(content) + content
+        text = checksum(content) + content
         if not execute(_ADD, (key, text)).rowcount:
             try:
                 (row,) = self.rows(_GET, key, execute=execute)  # it may be of this transaction
@@ -336,7 +325,8 @@ def verified(key: str, text: str, request: ChatRequest | None = None) -> CachedC
     return entry
 
 
-def _checksum(text: str) -> str:
+def checksum(text: str) -> str:
+    """Return what stands before a text in its row."""
     return hashlib.sha256(text.encode()).hexdigest()[:CHECKSUM_LENGTH]
 
 
@@ -352,6 +342,6 @@ def text_of(mode: object, filename: object, value: object) -> str:
     if not isinstance(value, str):
         raise RecordingError("the recorded reply is damaged: it is no text")
     content = value[CHECKSUM_LENGTH:]
-    if value[:CHECKSUM_LENGTH] != _checksum(content):
+    if value[:CHECKSUM_LENGTH] != checksum(content):
         raise RecordingError("the recorded reply is damaged: its checksum is wrong")
     return content

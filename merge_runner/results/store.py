@@ -53,7 +53,9 @@ WHERE database_name = current_database()
 """
 # Factor levels are no results: another study may have others for the same trial.
 RESULTS = [table for table in KEY_COLUMNS if table != FACTOR_TABLE]
-# Columns that depend on the run: whether it made an attempt itself, and when.
+# Columns in which two runs of a trial may differ: whether a run made an attempt itself, and when.
+# Cost and batch are the same, since both runs have them from the cache. In an audit of the database
+# more columns may differ (run/stored_replay.NOT_REPLAYED).
 RUN_COLUMNS = frozenset({"cached", "started_at", "latency_s"})
 # The first and the third column order the rows of a trial. Digests call the source of a first
 # decision 'seat', as schema 9 did, so that they stay the same.

@@ -10,7 +10,7 @@ from itertools import chain
 from statistics import median
 
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.prices import cost_usd
+from merge_runner.llm.prices import BYTES_A_TOKEN, cost_usd
 from merge_runner.llm.templates import AnswerCounts, answer_counts, count_by_template
 from merge_runner.prompts.blocks import render_prompt
 from merge_runner.providers import ModelEntry
@@ -23,7 +23,6 @@ from merge_runner.study.arms import Arm
 
 # A request's JSON around the prompt (1.10 of the baseline's), and prompts with longer numbers.
 PROMPT_MARGIN = 1.25
-BYTES_A_TOKEN = 4  # about, in English
 # Trials that turn out longer, and attempts that are charged but bring no answer.
 TRIAL_MARGIN = 1.5
 # Latencies come from each model's last ENOUGH calls among the MOST_READ newest of all.

@@ -169,14 +169,12 @@ class LocalRunner:
         client, side = self.clients[question.model], question.slot.side
         self._open_questions[order] += 1
         try:
-            prompt = client.replies.prompt(question)
-            reply = await client.ask(prompt, question.slot, order=order)
+            decision = await client.answer(question, order=order)
         except CallFailed as failure:
             trial.fail(side, failure)
             return None
         finally:
             self._open_questions[order] -= 1
-        decision = question.decision(prompt, reply)
         if question.model not in self.first.valid:
             self.first.count_decision(question.model, decision)
         return side, decision

@@ -14,7 +14,7 @@ from merge_runner.run.interrupt import GO_ON, INTERRUPTED, Stopping
 from merge_runner.run.progress import REASONS_SHOWN, Progress
 from merge_runner.run.replay import Replay
 from merge_runner.run.session import Session, misses_of
-from merge_runner.run.writer import AGAIN, BATCH, Flusher
+from merge_runner.run.writer import AGAIN, BATCH, TrialWriter
 from merge_runner.text_safety import first_of
 from merge_runner.trial_records import TrialRecord, TrialSpec
 
@@ -27,7 +27,7 @@ class Endings:
 
     session: Session
     progress: Progress
-    flusher: Flusher
+    writer: TrialWriter
     misses: list[Miss] = field(default_factory=list)
     suspended: Counter[str] = field(default_factory=Counter)  # by drivers and prompt
     why_suspended: str = ""
@@ -43,7 +43,7 @@ class Endings:
         counts[record.status] += 1
         self.progress.trials.done[spec.arm] += 1
         self.misses += misses_of(record)
-        self.flusher.add(record)
+        self.writer.add(record)
 
     def note_suspended(self) -> None:
         """Note the trials that wait for money."""
@@ -68,21 +68,21 @@ class Endings:
 
 
 async def play_and_store(
-    session: Session, progress: Progress, flusher: Flusher, stopping: Stopping
+    session: Session, progress: Progress, writer: TrialWriter, stopping: Stopping
 ) -> tuple[bool, bool]:
     """Play and store the missing trials; problems are noted in the session.
 
     Returns whether the database can be written, and whether the task was cancelled. It cannot if
     Ctrl-C ends the wait for another program that holds it.
     """
-    endings = Endings(session, progress, flusher)
-    progress.trials.unstored = lambda: flusher.problem
+    endings = Endings(session, progress, writer)
+    progress.trials.unstored = lambda: writer.problem
     try:
         cancelled = await _play(endings, stopping)
         endings.note_suspended()
     finally:
         progress.ended_at = datetime.now(UTC)
-        is_writable = await _store_rest(session, flusher, stopping)
+        is_writable = await _store_rest(session, writer, stopping)
     endings.note_failed()
     return is_writable, cancelled
 
@@ -92,11 +92,11 @@ async def _play(endings: Endings, stopping: Stopping) -> bool:
 
     Two tasks, since Ctrl-C stops the trials but lets the calls that are paid for end.
     """
-    session, flusher, player = endings.session, endings.flusher, endings.progress.runner
+    session, writer, player = endings.session, endings.writer, endings.progress.runner
     work = asyncio.create_task(
-        player.play(session.todo, endings.add, capacity=flusher.wait_for_capacity)
+        player.play(session.todo, endings.add, capacity=writer.wait_for_capacity)
     )
-    flusher.on_break = work.cancel  # no money is spent on what cannot be stored
+    writer.on_break = work.cancel  # no money is spent on what cannot be stored
 
     async def drained() -> None:
         await asyncio.wait([work])
@@ -121,48 +121,48 @@ async def _play(endings: Endings, stopping: Stopping) -> bool:
         await asyncio.wait([work])
     if not work.cancelled():
         session.fail_by(work.exception())
-    elif not flusher.broken:  # whose error is noted when the rest is stored
+    elif not writer.broken:  # whose error is noted when the rest is stored
         session.fail(INTERRUPTED, f"Interrupted. {GO_ON}")
     return cancelled
 
 
-async def _store_rest(session: Session, flusher: Flusher, stopping: Stopping) -> bool:
+async def _store_rest(session: Session, writer: TrialWriter, stopping: Stopping) -> bool:
     """Store the remaining trials; return whether the database can be written."""
-    closing = asyncio.create_task(_store_all(session, flusher))
+    closing = asyncio.create_task(_store_all(session, writer))
     with stopping(None, closing.cancel):
         try:
             await asyncio.wait([closing])
         finally:
             closing.cancel()
     if closing.cancelled():
-        why = f": {flusher.problem}. {AGAIN}" if flusher.problem else ". " + GO_ON
+        why = f": {writer.problem}. {AGAIN}" if writer.problem else ". " + GO_ON
         session.fail(INTERRUPTED, f"Interrupted{why}")
         return False
     session.fail_by(closing.exception())
-    if flusher.differing:
-        differing = [*flusher.differing.items()][:SHOWN]
+    if writer.differing:
+        differing = [*writer.differing.items()][:SHOWN]
         shown = [f"{trial_id} ({', '.join(columns)})" for (trial_id, _), columns in differing]
         session.fail(
             StoreError.exit_code,
-            f"{len(flusher.differing)} trials are stored otherwise in {session.options.db}, "
+            f"{len(writer.differing)} trials are stored otherwise in {session.options.db}, "
             f"which is left as it is: {'; '.join(shown)}. Replay into another --db.",
         )
-    return closing.exception() is None or flusher.broken  # what breaks is not the database
+    return closing.exception() is None or writer.broken  # what breaks is not the database
 
 
-async def _store_all(session: Session, flusher: Flusher) -> None:
+async def _store_all(session: Session, writer: TrialWriter) -> None:
     """Store the trials in memory, and replay the dropped ones, without a call."""
-    await flusher.close()
-    if flusher.dropped:
+    await writer.close()
+    if writer.dropped:
         session.say(
-            f"{len(flusher.dropped)} trials that are not stored yet are played again from the "
+            f"{len(writer.dropped)} trials that are not stored yet are played again from the "
             "recorded replies, without a call; Ctrl-C leaves them to the next run"
         )
-    while flusher.dropped:
-        again, flusher.dropped = flusher.dropped[:BATCH], flusher.dropped[BATCH:]
+    while writer.dropped:
+        again, writer.dropped = writer.dropped[:BATCH], writer.dropped[BATCH:]
         replay = Replay(session.plan, session.cache)
-        await replay.play(again, lambda _, record: flusher.add(record))
-        await flusher.close()
+        await replay.play(again, lambda _, record: writer.add(record))
+        await writer.close()
 
 
 def _played_as(spec: TrialSpec) -> str:

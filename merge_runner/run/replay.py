@@ -6,10 +6,8 @@ import asyncio
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from merge_runner.drivers.language_model import Question
 from merge_runner.llm.call import Wait
 from merge_runner.llm.recorded import RecordedCalls, RecordedReplies
-from merge_runner.records import Decision
 from merge_runner.run.guard import FirstDecisions
 from merge_runner.run.plan import Plan
 from merge_runner.run.trials import Capacity, TrialMaker
@@ -46,7 +44,10 @@ class Replay:
     def play_one(self, spec: TrialSpec) -> TrialRecord:
         """Play a trial."""
         played = self._ahead.pop(spec.order, None)
-        return played or play_trial(self._trials.make(spec), self._answer)
+        return played or play_trial(
+            self._trials.make(spec),
+            lambda question: self._models[question.model].answer(question),
+        )
 
     async def look_ahead(self, specs: Sequence[TrialSpec]) -> list[TrialRecord]:
         """Play trials until one has a recorded reply. Return the trials if none has, else none.
@@ -77,6 +78,3 @@ class Replay:
 
     async def drain(self) -> None:
         """Do nothing: no call is in flight."""
-
-    def _answer(self, question: Question) -> Decision:
-        return self._models[question.model].answer(question)

@@ -48,8 +48,8 @@ from merge_runner.trial_records import TrialRecord, TrialSpec
 
 TOLERANCE = 1e-9
 """Numbers may differ by this much, as between the arithmetic of two machines."""
-# The columns that no replay gives; docs/recordings.md lists them. A cache has the columns of
-# ``calls``, except ``cached``.
+# The columns that no replay gives; docs/recordings.md lists them. Replies in the database are read
+# anew, without times, cost and batch. A cache has these columns of ``calls``, except ``cached``.
 NOT_REPLAYED = (
     "calls.cached",
     "calls.started_at",

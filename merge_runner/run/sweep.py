@@ -32,7 +32,7 @@ from merge_runner.run.run_record import begin, check, end
 from merge_runner.run.session import Session, misses_of, open_session
 from merge_runner.run.summary import as_dict
 from merge_runner.run.trials import Player
-from merge_runner.run.writer import Flusher
+from merge_runner.run.writer import TrialWriter
 
 if TYPE_CHECKING:
     from merge_runner.llm.batch.rounds import Rounds
@@ -113,8 +113,8 @@ async def run(
                 sweep_id = begin(session, store, commit, dirty=dirty)
             shown = show_progress(progress, db, sweep_id, quiet=options.quiet)
             await stack.enter_async_context(shown)
-            flusher = Flusher(store, sweep_id, session.say, is_live=not options.replay)
-            is_writable, cancelled = await play_and_store(session, progress, flusher, stopping)
+            writer = TrialWriter(store, sweep_id, session.say, is_live=not options.replay)
+            is_writable, cancelled = await play_and_store(session, progress, writer, stopping)
             progress.doing = "checking"
             write_snapshot(db, progress.snapshot(sweep_id))
             if is_writable:

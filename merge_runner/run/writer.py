@@ -35,8 +35,8 @@ AGAIN = (
 )
 
 
-class Flusher:
-    """Buffer of ended trials, which are stored about once a second, of a replay when it is full.
+class TrialWriter:
+    """Writer of ended trials, in batches: about once a second, in a replay when a batch is full.
 
     While storing fails, trials beyond a batch are dropped and others are played; where storing is
     merely slow, new trials wait for it. ``dropped`` trials can be played again from the recorded

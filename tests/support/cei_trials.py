@@ -33,7 +33,7 @@ def played(condition, repetition, task, program):
 def simulated(condition, repetition, task):
     """The same trial for the batch: same seeds, same pair."""
     one = spec(condition, repetition)
-    left, right = (PROGRAMS["cei"].context(task, one, side).seed for side in SIDES)
+    left, right = (PROGRAMS["cei"].make(task, one, side).context.seed for side in SIDES)
     offsets = offsets_of(0, repetition)
     drivers = SETS["K0"].base(offsets.left), SETS["K0"].base(offsets.right)
     return Trial(CONDITIONS[condition], drivers, (left, right))

@@ -6,6 +6,7 @@ import sqlite3
 
 import pytest
 
+from merge_runner.drivers.language_model import Question
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.call import Calls
@@ -62,6 +63,12 @@ def error(status, message="m", code=None, **headers):
 
 def slot(repetition=1, side="left", decision=0):
     return Slot("A1", repetition, side, decision, 0)
+
+
+async def reply_to(client, prompt, slot, *, order=0):
+    """The reply by which a question would be decided."""
+    question = Question(client.endpoint.name, slot, prompt, None, lambda _, reply: reply)
+    return await client.answer(question, order=order)
 
 
 async def ticks(count=20):

@@ -26,10 +26,10 @@ def play(programs, condition, repetition=1, *, scenario, seeds=None):
     """A trial of these programs by side; ``seeds`` by side in place of the slot's."""
     trial, drivers = spec(condition, repetition), {}
     for side, program in programs.items():
-        context = program.context(scenario, trial, side)
+        drivers[side] = driver = program.make(scenario, trial, side)
         if seeds is not None:
-            context = replace(context, seed=seeds[side], other_seed=seeds[OTHER[side]])
-        drivers[side] = program.driver(context)
+            seeded = replace(driver.context, seed=seeds[side], other_seed=seeds[OTHER[side]])
+            drivers[side] = program.driver(seeded)
     return play_trial(Trial(trial, scenario, drivers), ask_nobody)
 
 

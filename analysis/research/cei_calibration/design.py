@@ -65,4 +65,4 @@ def _seed(
         order=0,
         kinematics=HUMAN_CONDITIONS[condition],
     )
-    return PROGRAMS["cei"].context(scenario, spec, side).seed
+    return PROGRAMS["cei"].make(scenario, spec, side).context.seed

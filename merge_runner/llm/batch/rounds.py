@@ -184,10 +184,9 @@ class BatchSender:
             call.attempts = [a for a in call.attempts if a.number < end]
             call.earlier_attempts = len(call.attempts)
 
-    async def send(self, call: Call, reservation: Reservation) -> Sent:
-        """Wait for the outcome of a call in its batch or in the next round."""
+    async def send(self, call: Call, number: int, reservation: Reservation) -> Sent:
+        """Wait for the outcome of attempt ``number`` in its batch or in the next round."""
         call.wait = Wait(f"for batches of {self.model}", blocked=True, charged=True)
-        number = len(call.attempts) + 1
         outcome, batch = await self.rounds.outcome_of(
             call.request, number, reservation, self.model, call.pending_batch
         )

@@ -20,7 +20,7 @@ from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.prices import cost_usd
 from merge_runner.providers import Endpoint, ModelEntry, Price
 from merge_runner.records import Slot, Usage, canonical_json
-from tests.support.clients import budget_of, client_of
+from tests.support.clients import budget_of, client_of, reply_to
 from tests.support.harness import each
 from tests.support.mock_server import FaultPlan
 from tests.support.scenarios import GEMINI, MODELS, OPENAI, SCENARIOS, ScenarioPlan, playing
@@ -104,7 +104,7 @@ async def asked(cache, till, faults, *, cap, name, calls=CALLS, verified=True):
 
         async def ask(number):
             with contextlib.suppress(MergeRunnerError):
-                await client.ask(PROMPT, Slot("N_0_0", number, "left", 0, 0), order=number)
+                await reply_to(client, PROMPT, Slot("N_0_0", number, "left", 0, 0), order=number)
             client.budget.leave(number)
 
         try:

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from merge_runner.errors import MergeRunnerError, RecordingError, UsageError
 from merge_runner.llm import templates
 from merge_runner.llm.cache import ResponseCache, import_folder
-from merge_runner.llm.cache_file import CREATE_TABLES, TextDisk
+from merge_runner.llm.cache_format import CREATE_TABLES, TextDisk
 from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.store import CachedCall
 from merge_runner.records import Attempt, ChatRequest, Slot, Usage, make_request

@@ -13,7 +13,7 @@ from merge_runner.llm.delays import FIRST_BACKOFF_S, LONGEST_BACKOFF_S, backoff_
 from merge_runner.llm.http import HttpTransport
 from merge_runner.providers import Endpoint, ModelEntry
 from merge_runner.records import CallFailed, Slot
-from tests.support.clients import client_of
+from tests.support.clients import client_of, reply_to
 from tests.support.scenarios import CASES, MODELS, OPENAI, ScenarioPlan, playing
 from tests.support.virtual_time import in_virtual_time, now_s
 
@@ -50,7 +50,7 @@ def always(case, **changes):
 
 
 def ask(client):
-    return client.ask("prompt", Slot("N_0_0", 1, "left", 0, 0))
+    return reply_to(client, "prompt", Slot("N_0_0", 1, "left", 0, 0))
 
 
 def cases(kind, formats=slice(None)):

@@ -21,7 +21,7 @@ from merge_runner.results.database import Buffer, append, in_thread, open_databa
 from merge_runner.results.instance import Instance
 from merge_runner.results.store import Store, query, results_digest
 from merge_runner.results.sweeps import sweeps_to_export
-from merge_runner.run.writer import Flusher
+from merge_runner.run.writer import TrialWriter
 from merge_runner.trial import Trial, play_trial
 from merge_runner.trial_records import TrialRecord
 from tests.support.driven_trials import ask_nobody
@@ -218,7 +218,7 @@ def holder(path):
 
 async def test_trials_wait_in_memory_while_the_database_is_locked(store, path, holder):
     said = []
-    waiting = Flusher(store, "s1", said.append)
+    waiting = TrialWriter(store, "s1", said.append)
     waiting.add(await asyncio.to_thread(played))
     with holder() as process:
         closing = asyncio.create_task(waiting.close())

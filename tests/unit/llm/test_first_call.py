@@ -10,7 +10,7 @@ from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.http_outcome import TransportFailure
 from merge_runner.records import CallFailed
 from tests.support.cases import cases
-from tests.support.clients import PRICE, answer, begun, error, raw, slot, ticks
+from tests.support.clients import PRICE, answer, begun, error, raw, reply_to, slot, ticks
 from tests.support.virtual_time import now_s
 
 pytestmark = pytest.mark.usefixtures("virtual_time")
@@ -40,7 +40,7 @@ def reply_of(case):
 
 
 def ask_all(client, number=5):
-    return [asyncio.create_task(client.ask("prompt", slot(n))) for n in range(1, number + 1)]
+    return [asyncio.create_task(reply_to(client, "prompt", slot(n))) for n in range(1, number + 1)]
 
 
 async def test_the_others_wait_until_the_first_call_is_answered(begin):
@@ -80,44 +80,44 @@ async def test_a_wrong_configuration_is_told_by_one_call(begin, case):
 async def test_what_may_pass_is_told_after_three_of_them_within_seconds(begin, case):
     client, reply = begin(reply_of(case)), reply_of(case)
     with pytest.raises(EndpointRefused, match=case["told"]):
-        await client.ask("prompt", slot())
+        await reply_to(client, "prompt", slot())
     assert len(client.direct.transport.sent) == 3
     assert now_s() < 5
     passing = begin(reply, reply, answer())
-    assert (await passing.ask("prompt", slot())).outcome == "ok"
+    assert (await reply_to(passing, "prompt", slot())).outcome == "ok"
 
 
 @pytest.mark.parametrize("body", ["data: {}", "<html>", "", {"status": "up"}, {"error": "m"}])
 async def test_in_the_midst_of_a_run_what_is_not_understood_is_asked_again(begin, body):
     client = begin(answer(), *[raw(body)] * 4, answer())
-    await client.ask("prompt", slot())
-    assert (await client.ask("prompt", slot(2))).outcome == "ok"
+    await reply_to(client, "prompt", slot())
+    assert (await reply_to(client, "prompt", slot(2))).outcome == "ok"
     assert len(client.direct.transport.sent) == 6
 
 
 async def test_an_endpoint_that_has_answered_before_is_given_three_tries_and_may_think_alone(begin):
     client = begin(raw("data: {}", content_type="text/event-stream"), has_answered=True)
     with pytest.raises(EndpointRefused, match="SSE"):
-        await client.ask("prompt", slot())
+        await reply_to(client, "prompt", slot())
     assert len(client.direct.transport.sent) == 3
     client = begin(answer(None, reasoning_content="hm"), has_answered=True)
-    assert (await client.ask("prompt", slot())).outcome == "empty"
+    assert (await reply_to(client, "prompt", slot())).outcome == "empty"
 
 
 async def test_a_first_call_that_waits_says_so_once_with_what_came_last_and_until_when(begin):
     client = begin(*[error(503, "warming up")] * 5, answer(), deadline_s=600)
-    await client.ask("prompt", slot())
+    await reply_to(client, "prompt", slot())
     told = [note for note in client.meter.notes if "first call" in note]
     assert len(told) == 1
     assert "UTC, after HTTP 503: warming up" in told[0]
     silent = begin(answer(), deadline_s=600)
     silent.direct.transport.open.clear()
-    asked = await begun(silent.ask("prompt", slot(2)))
+    asked = await begun(reply_to(silent, "prompt", slot(2)))
     await asyncio.sleep(6)
     assert ["nothing has come yet" in note for note in silent.meter.notes] == [True]
     silent.direct.transport.open.set()
     await asked
-    await silent.ask("prompt", slot(3))
+    await reply_to(silent, "prompt", slot(3))
     await asyncio.sleep(9)
     assert len(silent.meter.notes) == 1
 
@@ -137,8 +137,8 @@ async def test_where_nobody_listens_the_run_ends_within_seconds(begin):
 
 async def test_a_server_that_has_answered_is_waited_for_as_long_as_a_call_may_take(begin):
     client = begin(REFUSED, REFUSED, answer(), *[REFUSED] * 9, answer())
-    assert (await client.ask("prompt", slot())).outcome == "ok", "a server that just starts"
-    assert (await client.ask("prompt", slot(2))).outcome == "ok"
+    assert (await reply_to(client, "prompt", slot())).outcome == "ok", "a server that just starts"
+    assert (await reply_to(client, "prompt", slot(2))).outcome == "ok"
     assert now_s() > 60
 
 
@@ -165,9 +165,9 @@ async def test_a_prompt_that_is_refused_for_its_content_fails_alone(begin):
 
 
 async def test_an_answer_that_is_recorded_needs_no_first_call(begin):
-    await begin(answer()).ask("prompt", slot())
+    await reply_to(begin(answer()), "prompt", slot())
     client = begin(error(401))
-    assert (await client.ask("prompt", slot())).cached_attempts == 1
+    assert (await reply_to(client, "prompt", slot())).cached_attempts == 1
     assert client.direct.transport.sent == []
 
 
@@ -187,10 +187,10 @@ async def test_a_web_page_is_free_where_no_model_ever_answered_and_may_be_charge
     for free in (WEB_PAGE, PROXY_407):
         stray = begin(free, price=PRICE, cap=1.0)
         with pytest.raises(EndpointRefused):
-            await stray.ask("prompt", slot())
+            await reply_to(stray, "prompt", slot())
         assert stray.budget.ledger.read().committed_usd == 0
     gateway = begin(WEB_PAGE, answer(), price=PRICE, cap=1.0, has_answered=True)
-    assert (await gateway.ask("prompt", slot())).outcome == "ok"
+    assert (await reply_to(gateway, "prompt", slot())).outcome == "ok"
     assert gateway.budget.ledger.read().open_attempts == 1
 
 
@@ -201,7 +201,7 @@ async def test_where_a_model_has_answered_before_one_refused_prompt_does_not_end
     assert isinstance(second, CallFailed)
     assert [reply.outcome for reply in others] == ["ok"] * 3
     changed = begin(error(400, "unknown parameter"), has_answered=True)
-    tasks = [asyncio.create_task(changed.ask("another", slot(n))) for n in range(9)]
+    tasks = [asyncio.create_task(reply_to(changed, "another", slot(n))) for n in range(9)]
     with pytest.raises(EndpointRefused, match="unknown parameter"):
         await tasks[2]
     await changed.calls.drain()
@@ -215,7 +215,7 @@ async def test_a_first_call_takes_the_money_that_is_kept_for_a_trial_that_waits_
     client = begin(lost, lost, answer(), price=PRICE, cap=0.0032)
     client.budget.trial_usd = lambda _: 0.001
     await client.budget.admit([0])
-    first = await begun(client.ask("prompt", slot(), order=1))
-    older = await begun(client.ask("prompt", slot(2), order=0))
+    first = await begun(reply_to(client, "prompt", slot(), order=1))
+    older = await begun(reply_to(client, "prompt", slot(2), order=0))
     assert [reply.text for reply in await asyncio.gather(first, older)] == ["M", "M"]
     assert now_s() < 60

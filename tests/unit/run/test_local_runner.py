@@ -23,20 +23,19 @@ class Client:
     def __init__(self, **errors):
         self.errors, self.asked, self.given_up = errors, [], []
         self.meter, self.budget = Meter(), SimpleNamespace(leave=lambda order: None)
-        self.replies = SimpleNamespace(prompt=lambda question: question.prompt)
 
-    async def ask(self, prompt, slot, *, order):
-        self.asked.append(slot.side)
+    async def answer(self, question, *, order):
+        self.asked.append(question.slot.side)
         try:
             for _ in range(100):
                 await asyncio.sleep(0)
         except asyncio.CancelledError:
-            self.given_up.append(slot.side)
+            self.given_up.append(question.slot.side)
             raise
-        assert len(self.asked) == 2 * (1 + slot.decision)
-        if slot.side in self.errors:
-            raise self.errors[slot.side]
-        return ChatReply(REPLY, "ok", None, (), 0)
+        assert len(self.asked) == 2 * (1 + question.slot.decision)
+        if question.slot.side in self.errors:
+            raise self.errors[question.slot.side]
+        return question.decision(question.prompt, ChatReply(REPLY, "ok", None, (), 0))
 
 
 @pytest.fixture
@@ -69,8 +68,8 @@ async def test_a_failed_call_leaves_the_other_one_its_answer(play, failing):
 )
 async def test_different_failed_calls_are_an_outage_and_none_that_trials_share(key, trials):
     class Failing(Client):
-        async def ask(self, prompt, slot, *, order):
-            named = key.format(order=order, side=slot.side)
+        async def answer(self, question, *, order):
+            named = key.format(order=order, side=question.slot.side)
             raise CallFailed("HTTP 400", replace(REQUEST, key=named))
 
     plan, failed = make_plan("baseline", "emulator", conditions=["N_0_0"], repetitions=12), []
@@ -89,9 +88,9 @@ async def test_few_trials_begin_or_go_on_in_one_round_of_the_event_loop():
     begun, asked, rounds = Counter(), Counter(), 0
 
     class Recorded(Client):
-        async def ask(self, prompt, slot, *, order):
+        async def answer(self, question, *, order):
             asked[rounds] += 1
-            return ChatReply(REPLY, "ok", None, (), 0)
+            return question.decision(question.prompt, ChatReply(REPLY, "ok", None, (), 0))
 
     async def capacity():
         begun[rounds] += 1
@@ -129,10 +128,10 @@ async def test_a_trial_that_is_left_takes_its_other_call_with_it(play, kind, fir
     error = kind("no more")
 
     class Waiting(Client):
-        async def ask(self, prompt, slot, *, order):
-            if slot.side == first:
+        async def answer(self, question, *, order):
+            if question.slot.side == first:
                 raise error
-            return await super().ask(prompt, slot, order=order)
+            return await super().answer(question, order=order)
 
     client = Waiting()
     with pytest.raises(kind) as told:

@@ -12,7 +12,7 @@ from merge_runner.run.writer import (
     LIVE_BATCH_BYTES,
     MOST_PENDING,
     MOST_PENDING_BYTES,
-    Flusher,
+    TrialWriter,
 )
 from merge_runner.trial_records import DecisionRow, TrialRecord
 from tests.support.gate import HANGS_S
@@ -43,8 +43,8 @@ class Scripted:
         return [order for batch in self.written for order in batch]
 
 
-def flusher_of(store, say=lambda line: None, **options):
-    return Flusher(store, "sweep", say, **options)
+def writer_of(store, say=lambda line: None, **options):
+    return TrialWriter(store, "sweep", say, **options)
 
 
 @pytest.mark.parametrize("error", [StoreLocked("somebody reads"), KeyError("a fault of ours")])
@@ -52,50 +52,50 @@ async def test_trials_wait_for_no_reader_and_no_flusher_that_is_gone_and_what_is
     error,
 ):
     store = Scripted(error)
-    flusher = flusher_of(store)
+    writer = writer_of(store)
     for order in range(2 * MOST_PENDING):
-        flusher.add(ended(order))
-    await asyncio.wait_for(flusher.wait_for_capacity(), HANGS_S)
+        writer.add(ended(order))
+    await asyncio.wait_for(writer.wait_for_capacity(), HANGS_S)
     store.error = StoreError("the disk is full")
     said = r"the disk is full\. When|the writer of results has failed \(Key"
     with pytest.raises(StoreError, match=f"^{2 * MOST_PENDING} trials are not stored: ({said})"):
-        await asyncio.wait_for(flusher.close(), HANGS_S)
+        await asyncio.wait_for(writer.close(), HANGS_S)
 
 
 async def test_long_replies_wait_and_are_written_in_parts_of_bounded_size():
     store = Scripted()
-    flusher = flusher_of(store, is_live=False)
+    writer = writer_of(store, is_live=False)
     most = MOST_PENDING_BYTES // (5 * MB) + 1
     for _ in range(most):
-        await asyncio.wait_for(flusher.wait_for_capacity(), HANGS_S)
-        flusher.add(ended(size=5 * MB))
-    waiting = asyncio.create_task(flusher.wait_for_capacity())
+        await asyncio.wait_for(writer.wait_for_capacity(), HANGS_S)
+        writer.add(ended(size=5 * MB))
+    waiting = asyncio.create_task(writer.wait_for_capacity())
     await asyncio.sleep(0.01)
     assert not waiting.done()
     store.go_on.set()
     async with asyncio.timeout(HANGS_S):
         await waiting
-    await flusher.close()
+    await writer.close()
     assert (len(store.orders), max(map(len, store.written))) == (most, 2)
 
 
 async def test_trials_are_stored_in_few_transactions():
     store = Scripted()
     store.go_on.set()
-    flusher = flusher_of(store, is_live=False)
+    writer = writer_of(store, is_live=False)
     for _ in range(600):
-        flusher.add(ended())
-    await flusher.close()
+        writer.add(ended())
+    await writer.close()
     assert [*map(len, store.written)] == [512, 88]
 
 
 async def test_live_trials_are_stored_in_short_transactions():
     store = Scripted()
     store.go_on.set()
-    flusher = flusher_of(store)
+    writer = writer_of(store)
     for _ in range(5):
-        flusher.add(ended(size=LIVE_BATCH_BYTES // 3))
-    await flusher.close()
+        writer.add(ended(size=LIVE_BATCH_BYTES // 3))
+    await writer.close()
     assert [*map(len, store.written)] == [2, 3]  # the last may be a quarter larger
 
 
@@ -106,39 +106,39 @@ def ended(order=0, status="finished", size=0):
     return TrialRecord(replace(SPEC, order=order), status, None, 1.0, None, (), (decision,))
 
 
-async def is_refused(flusher):
+async def is_refused(writer):
     """Wait until storing has failed."""
     async with asyncio.timeout(HANGS_S):
-        while not flusher.problem:
+        while not writer.problem:
             await asyncio.sleep(0.01)
 
 
 @pytest.mark.parametrize("known", [True, False])
 async def test_while_the_database_is_held_512_trials_stay_in_memory_and_the_failed_ones(known):
     store, said = Scripted(HELD), []
-    flusher = flusher_of(store, said.append)
-    flusher.add(ended(0))
+    writer = writer_of(store, said.append)
+    writer.add(ended(0))
     if known:
-        await is_refused(flusher)
+        await is_refused(writer)
     for order in range(1, 1000):
-        flusher.add(ended(order, "failed" if order in (600, 700) else "collided"))
-        await asyncio.wait_for(flusher.wait_for_capacity(), HANGS_S)
-    await is_refused(flusher)
+        writer.add(ended(order, "failed" if order in (600, 700) else "collided"))
+        await asyncio.wait_for(writer.wait_for_capacity(), HANGS_S)
+    await is_refused(writer)
     kept = [*range(512), 600, 700]
     dropped = [order for order in range(1000) if order not in kept]
-    assert [spec.order for spec in flusher.dropped] == dropped
-    assert flusher.problem == "1000 trials wait to be stored: somebody reads"
-    closing = asyncio.create_task(flusher.close())
+    assert [spec.order for spec in writer.dropped] == dropped
+    assert writer.problem == "1000 trials wait to be stored: somebody reads"
+    closing = asyncio.create_task(writer.close())
     async with asyncio.timeout(HANGS_S):
         while "1000 trials wait to be stored: somebody reads. Ctrl-C ends" not in str(said):
             await asyncio.sleep(0.05)
         store.error = None
         await closing
     assert store.orders == kept
-    assert (flusher.left, flusher.problem) == (486, "")
+    assert (writer.left, writer.problem) == (486, "")
     # They may come again, and are stored by the next call.
-    flusher.add(ended(512))
-    await asyncio.wait_for(flusher.close(), HANGS_S)
+    writer.add(ended(512))
+    await asyncio.wait_for(writer.close(), HANGS_S)
     assert store.orders[-1] == 512
 
 
@@ -149,11 +149,11 @@ async def test_while_the_database_is_held_512_trials_stay_in_memory_and_the_fail
 async def test_while_the_database_is_held_replies_stay_in_memory_up_to_a_bound(sizes, kept):
     """The first one always."""
     store = Scripted(HELD)
-    flusher = flusher_of(store)
+    writer = writer_of(store)
     for order, size in enumerate(sizes):
-        flusher.add(ended(order, size=size))
-        await is_refused(flusher)
+        writer.add(ended(order, size=size))
+        await is_refused(writer)
     store.error = None
-    await flusher.close()
+    await writer.close()
     assert store.orders == kept
-    assert [spec.order for spec in flusher.dropped] == [*range(len(kept), len(sizes))]
+    assert [spec.order for spec in writer.dropped] == [*range(len(kept), len(sizes))]

@@ -11,6 +11,7 @@ from merge_runner.llm.http import HttpTransport
 from merge_runner.providers import Endpoint, ModelEntry
 from merge_runner.records import CallFailed, Slot
 from tests.support.clients import client_of as a_client
+from tests.support.clients import reply_to
 from tests.support.harness import FAST, a_model
 
 PASSING = (408, 409, 429, 500, 502, 503, 504, 529)
@@ -48,7 +49,9 @@ async def client_of(llmock, tmp_path, monkeypatch):
 
 def ask(client, decision=0):
     # By its body a grader tells a call from another one that is tried again.
-    return client.ask(f"Where do you go at {decision} s?", Slot("N_0_0", 1, "left", decision, 0))
+    return reply_to(
+        client, f"Where do you go at {decision} s?", Slot("N_0_0", 1, "left", decision, 0)
+    )
 
 
 def asks(llmock, model):

@@ -104,7 +104,8 @@ def test_the_nine_pairs_take_turns_by_the_repetition():
 def test_the_usual_set_suits_the_resistance_unless_one_is_chosen(resistance):
     task = scenario(resistance=resistance)
     for program, name in ((cei(), USUAL_SETS[resistance]), (cei(set="F1"), "F1")):
-        assert thresholds_of(program.context(task, spec("N_0_0"), "left")) == SETS[name]
+        driver = program.make(task, spec("N_0_0"), "left")
+        assert thresholds_of(driver.context) == SETS[name]
     assert USUAL_SETS["human"] != USUAL_SETS["none"]
 
 

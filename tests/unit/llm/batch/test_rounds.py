@@ -16,7 +16,7 @@ from merge_runner.llm.ledger import Ledger
 from merge_runner.providers import ModelEntry, Price
 from merge_runner.records import CallFailed, Slot
 from tests.support.batch_mode import Memory
-from tests.support.clients import answer, budget_of, client_of, error
+from tests.support.clients import answer, budget_of, client_of, error, reply_to
 from tests.support.virtual_time import now_s
 
 pytestmark = pytest.mark.usefixtures("virtual_time")
@@ -63,7 +63,9 @@ class Run:
         async with contextlib.AsyncExitStack() as stack:
             asks = [
                 asyncio.create_task(
-                    self.client.ask("prompt", Slot("A1", each, "left", decision, 0), order=each)
+                    reply_to(
+                        self.client, "prompt", Slot("A1", each, "left", decision, 0), order=each
+                    )
                 )
                 for each in range(1, repetitions + 1)
             ]

@@ -1,4 +1,4 @@
-"""File of a cache folder: create it atomically, refuse a foreign one, upgrade it.
+"""Format of a cache folder's file: create it atomically, refuse a foreign one, upgrade it.
 
 Any program may have written the file, and diskcache unpickles keys and values, opens and removes
 the files that rows name, and applies the settings it reads. So ``TextDisk`` stores and returns text
@@ -182,6 +182,11 @@ def prepare(folder: Path, *, read_only: bool, allow_previous: bool) -> None:
                 f"format {FORMAT}"
             )
         upgrade(folder)
+
+
+def unusable(folder: Path, why: BaseException) -> UsageError:
+    """Return the error for a folder that cannot be opened."""
+    return UsageError(f"the cache {folder} cannot be used: {why}. {NEW_CACHE}")
 
 
 def require(folder: Path) -> None:
