@@ -200,7 +200,7 @@ def _result_of(deciding: Coroutine[Any, Any, Decision], side: Side) -> Decision:
         decision: Decision = end.value
         return decision
     except RuntimeError as error:
-        # A replay has no event loop to wait in.
+        # An audit has no event loop to wait in.
         if "no running event loop" not in str(error):
             raise
     deciding.close()

@@ -75,7 +75,7 @@ class Driver(Protocol):
 
         ``number`` is the decision step, from 0 at the start of control. With the control start
         ``own_exit`` that is the earlier exit, and the driver that exits later begins above 0. The
-        runner steps the coroutine once, without an event loop.
+        runner steps the coroutine once; an audit does so without an event loop.
         """
         ...
 

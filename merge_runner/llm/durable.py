@@ -29,7 +29,7 @@ ResultT = TypeVar("ResultT")
 Rows = list[tuple[Any, ...]]
 # Executes a statement in the transaction of an operation.
 Execute = Callable[..., sqlite3.Cursor]
-# A step of a durable transaction; docstrings of such functions say "Runs in a transaction".
+# A step of a durable transaction.
 Operation = Callable[[Execute], Any]
 
 

@@ -49,7 +49,10 @@ class EndpointState:
         self.underpriced_tiers = underpriced_tiers(self.entry)
 
     def error_of(self, call: Call, outcome: AttemptOutcome) -> MergeRunnerError | None:
-        """Return the error that follows from a call's last attempt, None if it is an answer."""
+        """Return the error that follows from a call's last attempt, None if it is an answer.
+
+        It also notes what the attempt tells about the endpoint.
+        """
         driver, message = self.driver, outcome.message or outcome.name
         if outcome.action == "rejected" or not self.verified:
             reason = reason_of(outcome, self.identity + call.request.path)

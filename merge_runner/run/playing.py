@@ -50,13 +50,13 @@ class Endings:
         if not self.suspended:
             return
         cap = self.session.ledger.cap
-        more = f"raise {cap.source}" if cap else "renew the quota"
+        assert cap is not None  # without one no trial waits
         waiting = dict.fromkeys(map(_played_as, self.session.todo), 0) | self.suspended
         self.session.fail(
             TrialSuspended.exit_code,
             f"{self.suspended.total()} trials wait for money{_unbalanced(waiting)}: "
-            f"{self.why_suspended}. Their replies stay stored: {more}, and run the same command "
-            "again",
+            f"{self.why_suspended}. Their replies stay stored: raise {cap.source}, and run the "
+            "same command again",
         )
 
     def note_failed(self) -> None:

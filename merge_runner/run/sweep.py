@@ -67,7 +67,7 @@ async def play(
         if part.trials < plan.trials:
             say(f"note: the recording holds {part.trials} of the plan's {plan.trials} trials")
         plan = part
-    with using(plan.parts.catalogue):  # it has the study's own wire formats and providers
+    with using(plan.parts.catalogue):  # it has the study's own providers
         async with open_session(plan, options, say=say) as session:
             expected = None
             if session.todo and not (options.replay or plan.is_free):

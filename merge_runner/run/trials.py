@@ -44,7 +44,7 @@ class Player(Protocol):
 
     @property
     def waiting_for_money(self) -> int:
-        """The number of them that wait for money, as far as this process knows."""
+        """The number of trials that wait for money, as far as this process knows."""
 
     @property
     def place(self) -> str:

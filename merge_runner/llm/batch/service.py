@@ -41,7 +41,7 @@ class BatchFailed(MergeRunnerError):
     """A request to a batch mode failed; ``kind`` names what follows.
 
     ``again``: retry later, after ``delay_s`` if the server asks for it. ``smaller``: submit fewer
-    requests, since too many tokens are enqueued. ``quota`` and ``refused``: this endpoint answers
+    requests, since too many tokens are enqueued. ``quota`` and ``rejected``: this endpoint answers
     nothing. ``lost``: the fate of the batch is unknown; its requests may have been billed. ``sent``
     is False where certainly no batch was created.
     """
