@@ -21,9 +21,11 @@ from contextvars import ContextVar
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
+from traceback import extract_tb
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from merge_runner.errors import UsageError, unknown_name
+from merge_runner.text_safety import one_line
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -183,11 +185,18 @@ def in_use_for(db: Path) -> Catalogue:
     return in_use() if in_use().text else _of_results.get(db.absolute(), in_use())
 
 
-# Errors of a foreign module during its import.
-FAULTS = (ArithmeticError, AttributeError, ImportError, LookupError, NameError, OSError,
-          RuntimeError, SyntaxError, TypeError, ValueError)  # fmt: skip
+# Errors that a plug-in's code may raise.
+FAULTS = (ArithmeticError, AssertionError, AttributeError, ImportError, LookupError, NameError,
+          OSError, RuntimeError, SyntaxError, TypeError, ValueError)  # fmt: skip
 _loading = threading.RLock()
 _loaded: list[UsageError | None] = []  # the error or None, once all are imported
+
+
+def fault_of(what: str, error: Exception) -> UsageError:
+    """Return an error of a plug-in's code as one line, with the place where it was raised."""
+    place = extract_tb(error.__traceback__)[-1]
+    where = f"{Path(place.filename).name}, line {place.lineno}"
+    return UsageError(f"{what} fails in {where}: {one_line(f'{type(error).__name__}: {error}')}")
 
 
 def plugins() -> list[EntryPoint]:

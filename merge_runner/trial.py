@@ -16,6 +16,7 @@ from merge_runner.drivers.language_model import LlmDriver, Question
 from merge_runner.errors import UsageError
 from merge_runner.perception import NoisyObserver
 from merge_runner.records import SIDES, CallFailed, Decision, Observation, ReplayMiss, Side
+from merge_runner.registry import FAULTS, fault_of
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 from merge_runner.trial_records import DecisionRow, FailedCall, TrialRecord, TrialSpec
@@ -193,15 +194,18 @@ class _DriverState:
 
 
 def _result_of(deciding: Coroutine[Any, Any, Decision], side: Side) -> Decision:
-    """Return the result of an ``async def decide`` that awaits nothing; raises UsageError."""
+    """Return the result of an ``async def decide`` that awaits nothing.
+
+    Raises UsageError for one that waits, or fails.
+    """
     try:
         deciding.send(None)
     except StopIteration as end:
         decision: Decision = end.value
         return decision
-    except RuntimeError as error:
+    except FAULTS as error:
         # An audit has no event loop to wait in.
         if "no running event loop" not in str(error):
-            raise
+            raise fault_of(f"the {side} driver", error) from error
     deciding.close()
     raise UsageError(f"the {side} driver waits while it decides: a program decides at once")

@@ -13,7 +13,7 @@ from merge_runner.drivers.base import Driver, DriverContext, Parameter, make_con
 from merge_runner.drivers.pace import program_pace
 from merge_runner.errors import UsageError
 from merge_runner.records import Side
-from merge_runner.registry import Registry, require
+from merge_runner.registry import FAULTS, Registry, fault_of, require
 from merge_runner.trial_records import TrialSpec
 
 if TYPE_CHECKING:
@@ -140,7 +140,11 @@ class Program:
     def make(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> Driver:
         """Return the driver of one side of a trial."""
         pace = program_pace(scenario, self.rate_hz)
-        return self.driver(make_context(scenario, spec, side, pace, self.values, self.data))
+        context = make_context(scenario, spec, side, pace, self.values, self.data)
+        try:
+            return self.driver(context)
+        except FAULTS as error:
+            raise fault_of(f"the {side} driver", error) from error
 
     def replaying(self, connection: DuckDBPyConnection | None) -> Program:
         """Return this program with the human trials of a database, if it replays some."""

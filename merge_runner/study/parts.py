@@ -271,7 +271,7 @@ def _run_plugin(name: str, file: str, source: str) -> None:
     try:
         loader.exec_module(module)
         sys.modules[name] = module
-    except (UsageError, AssertionError, *FAULTS) as exc:
+    except (UsageError, *FAULTS) as exc:
         lines = [f.lineno for f in extract_tb(exc.__traceback__) if f.filename == file]
         line = lines[-1] if lines else getattr(exc, "lineno", None)
         where = f"{file}, line {line}" if line else file

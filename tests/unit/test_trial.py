@@ -112,6 +112,18 @@ class Waiting(Holding):
         await asyncio.sleep(self.action)
 
 
+class Faulty(Holding):
+    """A program that fails."""
+
+    async def decide(self, observation, number):
+        raise KeyError("speed\nlimit")
+
+
+def test_a_program_that_fails_is_told_in_one_line_with_its_place():
+    with pytest.raises(UsageError, match=r"^the left driver fails in test_trial.py, line \d+: Key"):
+        play(Faulty(0.0), Holding(0.0))
+
+
 @pytest.mark.parametrize("delay_s", [0.0, 0.5])
 def test_a_program_that_waits_is_refused(delay_s):
     with pytest.raises(UsageError, match=r"^the right driver waits .*: a program decides at once$"):
