@@ -12,6 +12,7 @@ from pydantic import JsonValue
 from merge_runner.llm.reasoning import split_reasoning
 from merge_runner.providers import ModelEntry
 from merge_runner.records import Usage
+from merge_runner.registry import FAULTS, fault_of
 
 if TYPE_CHECKING:
     from merge_runner.llm.formats.server_error import ServerError
@@ -103,8 +104,14 @@ class WireFormat(ABC):
 
 
 def read_reply(wire: WireFormat, payload: dict[str, Any]) -> Reading:
-    """Read a body of status 200, and separate the answer in its text from the reasoning."""
-    reading = wire.read(payload)
+    """Read a body of status 200, and separate the answer in its text from the reasoning.
+
+    Raises UsageError where a plug-in's format fails.
+    """
+    try:
+        reading = wire.read(payload)
+    except FAULTS as error:
+        raise fault_of(f"the wire format {type(wire).__name__}", error) from error
     if reading.outcome not in {"ok", "truncated", "empty"}:
         return reading
     thoughts, answer, cut = split_reasoning(reading.text)

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from merge_runner.errors import UsageError
 from merge_runner.llm.delays import server_delay_s
 from merge_runner.llm.formats import FORMATS, Reading, WireFormat, WireRequest
 from merge_runner.llm.http_outcome import RawReply, judge, may_be_charged
@@ -169,6 +170,19 @@ def test_a_formats_own_word_on_an_error_goes_before_that_of_others(case):
     reply = RawReply(case["status"], case.get("headers", {}), json.dumps(body))
     found = judge(reply, Stubborn())
     assert (found.name, found.delay_s) == (case["is"], case.get("delay_s"))
+
+
+class Faulty(Stubborn):
+    """A format that expects too much."""
+
+    def read(self, payload):
+        return Reading(payload["said"])
+
+
+def test_a_format_that_fails_is_told_in_one_line_with_its_place():
+    told = r"^the wire format Faulty fails in test_http_outcome.py, line \d+: KeyError: 'said'$"
+    with pytest.raises(UsageError, match=told):
+        judge(RawReply(200, {}, "{}"), Faulty())
 
 
 @pytest.mark.parametrize("case", cases("http_outcomes", "charged"))
