@@ -14,7 +14,6 @@ from pathlib import Path
 from statistics import median
 
 from benchmarks.cases import (
-    MARGINAL,
     STUDIES,
     Bench,
     Case,
@@ -23,6 +22,7 @@ from benchmarks.cases import (
     cold,
     cold_floor,
     committed_recording,
+    further,
     import_humans,
     imports,
     in_flight,
@@ -36,6 +36,7 @@ from benchmarks.cases import (
     replay_many,
     resume,
     short,
+    short_floor,
     start,
 )
 from benchmarks.explorer import explorer, explorer_floor, export, first_page
@@ -62,14 +63,8 @@ CASES = (
     Case("sweep --dry-run", 2, start("sweep", "baseline", "--dry-run")),
     Case("cold, paid model", 1, paid),
     Case("cold, 200 ms", 1, cold(200)),
-    *(
-        case
-        for trials in MARGINAL
-        for case in (
-            Case(f"floor of {trials:,} short", 1, in_flight_floor(trials, 200, 0)),
-            Case(f"cold, {trials:,} short", 1, short(trials)),
-        )
-    ),
+    Case("floor, further calls", 1, further(short_floor)),
+    Case("cold, further calls", 1, further(short)),
     Case("50 in flight", 1, in_flight(200, 50)),
     Case("200 in flight", 1, in_flight(200, 200)),
     Case("2,000 in flight", 1, in_flight(2_000, 2_000)),

@@ -27,8 +27,7 @@ SHORT, SHORT_CALLS = ("--conditions", "R_-4_8"), 8
 # Few trials, whose calls are all under way before the first of them is answered.
 KILLED, KILLED_TRIALS = ("--reps", "2"), 22
 KILLED_DELAY_MS, QUIET_S = 1_000, 0.15
-# So many short trials less so few: what a further call costs.
-MARGINAL = (250, 2_000)
+FEW, MANY = 250, 2_000  # short trials
 STUDIES, MOST_DRIVEN = (110, 3_300, 11_000), 1_100
 
 
@@ -208,6 +207,21 @@ def short(trials: int) -> Callable[[Bench], Figures]:
     return lambda bench: figures_of(
         bench.sweep(bench.fresh("short"), *SHORT, "--reps", str(trials), "--in-flight", "200")
     )
+
+
+def short_floor(trials: int) -> Callable[[Bench], Figures]:
+    """As many short trials, bare."""
+    return in_flight_floor(trials, 200, 0)
+
+
+def further(measure: Callable[[int], Callable[[Bench], Figures]]) -> Callable[[Bench], Figures]:
+    """What many short trials take more than few."""
+
+    def difference(bench: Bench) -> Figures:
+        few, many = (measure(trials)(bench) for trials in (FEW, MANY))
+        return {figure: many[figure] - few[figure] for figure in ("wall_s", "cpu_s", "calls")}
+
+    return difference
 
 
 def in_flight_floor(trials: int, limit: int, delay_ms: int) -> Callable[[Bench], Figures]:
