@@ -194,7 +194,9 @@ _loaded: list[UsageError | None] = []  # the error or None, once all are importe
 
 def fault_of(what: str, error: Exception) -> UsageError:
     """Return an error of a plug-in's code as one line, with the place where it was raised."""
-    place = extract_tb(error.__traceback__)[-1]
+    package, frames = Path(__file__).parent, extract_tb(error.__traceback__)
+    foreign = [frame for frame in frames if package not in Path(frame.filename).parents]
+    place = (foreign or frames)[-1]
     where = f"{Path(place.filename).name}, line {place.lineno}"
     return UsageError(f"{what} fails in {where}: {one_line(f'{type(error).__name__}: {error}')}")
 

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 
+from merge_runner.results.store import query
 from tests.support import program
 from tests.support.harness import PROGRAM, PROJECT, environment, plugin
 
@@ -52,8 +53,10 @@ def test_an_import_that_fails_while_a_driver_decides_is_told_in_one_line(tmp_pat
     )
     sweep = ("sweep", "mine.toml", "--trust", "--quiet")
     run = program.run(sweep, cwd=tmp_path, env=environment())
-    told = "error: this needs no_such_module, which is not installed: pip install no_such_module\n"
-    assert (run.code, run.out, run.err) == (2, "", told)
+    told = "error: the left driver fails in mine.py, line 6: ModuleNotFoundError: No module named "
+    assert (run.code, run.err) == (2, f"{told}'no_such_module'\n")
+    ended = query(tmp_path / "results/merge.duckdb", "SELECT ended_at IS NOT NULL FROM sweeps")
+    assert ended[1] == [(True,)]
 
 
 def test_a_plug_in_may_look_at_what_is_there_and_register(tmp_path):
