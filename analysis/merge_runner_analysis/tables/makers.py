@@ -8,8 +8,10 @@ from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables.ablation_qualitative import ablation_qualitative
 from merge_runner_analysis.tables.ablation_quantitative import ablation_quantitative
 from merge_runner_analysis.tables.attempts import attempts
+from merge_runner_analysis.tables.contrasts import contrasts
 from merge_runner_analysis.tables.criticality import criticality
-from merge_runner_analysis.tables.effects import contrasts, effects_table, factors
+from merge_runner_analysis.tables.effects import effects_table
+from merge_runner_analysis.tables.factors import factors
 from merge_runner_analysis.tables.first_action import first_action
 from merge_runner_analysis.tables.gap import gap
 from merge_runner_analysis.tables.indicators import indicators

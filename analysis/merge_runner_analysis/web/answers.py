@@ -114,7 +114,7 @@ class Numbers:
         name, selection = _cache_key(kind, *named)
 
         def make() -> str:
-            from merge_runner_analysis.tables.effects import comparison
+            from merge_runner_analysis.tables.comparison import comparison
 
             study = self._part(selection)
             if kind == "comparison":

@@ -33,7 +33,7 @@ from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import finished_tables
 from merge_runner_analysis.tables.against import FILES, against
-from merge_runner_analysis.tables.effects import comparison
+from merge_runner_analysis.tables.comparison import comparison
 from merge_runner_analysis.tables.formats import render, table_view
 from merge_runner_analysis.tables.model import Column, Row, Table
 from merge_runner_analysis.tables.verdicts import verdicts

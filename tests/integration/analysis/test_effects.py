@@ -17,8 +17,8 @@ from merge_runner_analysis.metrics import COLLISIONS, LEFT_FIRST, METRICS
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.stats.effects import driver_effects, effects, primary
 from merge_runner_analysis.study import StudyResults
-from merge_runner_analysis.tables import effects as tables
-from merge_runner_analysis.tables.effects import comparison
+from merge_runner_analysis.tables import effect_notes
+from merge_runner_analysis.tables.comparison import comparison
 from tests.support.harness import FAST
 from tests.support.studies import changed, scaled, write_study, yielding
 from tests.support.tables import made, values_of
@@ -220,8 +220,8 @@ def test_a_note_says_which_cells_only_who_goes_first_has(prepare, tmp_path):
 def test_a_planted_gap_is_no_chance_whatever_its_factor_is_named(monkeypatch):
     study = SimpleNamespace(models=[SimpleNamespace(scripted=True)])
     text = StudyText(remove=["C4"], emulator={"gap_m": 2})
-    monkeypatch.setattr(tables, "texts_of", lambda _: {"chance": {"high": text}})
-    assert tables._planted(study) == ["chance=high adds 2 m to the gap that drivers aim at"]
+    monkeypatch.setattr(effect_notes, "texts_of", lambda _: {"chance": {"high": text}})
+    assert effect_notes._planted(study) == ["chance=high adds 2 m to the gap that drivers aim at"]
 
 
 def test_a_study_without_factors_says_so(tmp_path):
