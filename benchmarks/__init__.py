@@ -1,1 +1,1 @@
-"""How fast the runner is, against a floor and a peer, measured in one run on one machine."""
+"""Speed of the runner, against a floor and a peer, measured in one run on one machine."""

@@ -94,7 +94,7 @@ CASES = (
         for trials in STUDIES
         for what in ("tables", "report")
         for heat in ("cold", "warm")
-        # What a report of the smaller ones takes the second time says nothing new.
+        # A second report of the smaller studies says nothing new.
         if (what, heat) != ("report", "warm") or trials == max(STUDIES)
     ),
     Case("explorer of 11,000", 1, explorer(max(STUDIES))),

@@ -1,4 +1,4 @@
-"""What is measured: every case runs whole programs and returns its figures.
+"""Cases of the benchmark: each runs whole programs and returns its figures.
 
 ``wall_s``, ``cpu_s`` and ``peak_mb`` describe the measured process, ``calls`` is how many
 calls it made or read; ``stall_s`` is by how much its event loop was late at worst and ``playing_s``
@@ -33,7 +33,7 @@ STUDIES, MOST_DRIVEN = (110, 3_300, 11_000), 1_100
 
 @dataclass(frozen=True, slots=True)
 class Bench:
-    """Where the cases run."""
+    """Folder and server of the cases."""
 
     folder: Path
     server: Server
@@ -112,7 +112,7 @@ class Case:
     is_long: bool = False
 
     def chosen(self, only: str, skip: str) -> bool:
-        """Whether these patterns of names choose it."""
+        """Return whether these patterns of names choose it."""
         fits = self.name == only or (not self.is_long and fnmatch(self.name, only))
         return fits and not fnmatch(self.name, skip)
 
@@ -122,13 +122,13 @@ def figures_of(ran: Run, *, calls: int | None = None) -> Figures:
     figures = {"wall_s": ran.wall_s, "cpu_s": ran.cpu_s, "peak_mb": ran.peak_mb}
     if calls is not None:
         return {**figures, "calls": calls}
-    told = ran.summary
+    summary = ran.summary
     return {
         **figures,
-        "calls": told["calls"]["live"] + told["calls"]["cached"],
-        "trials": told["trials"]["planned"],
-        "stall_s": told["worst_stall_s"],
-        "playing_s": told["playing_s"],
+        "calls": summary["calls"]["live"] + summary["calls"]["cached"],
+        "trials": summary["trials"]["planned"],
+        "stall_s": summary["worst_stall_s"],
+        "playing_s": summary["playing_s"],
     }
 
 
@@ -215,7 +215,7 @@ def short_floor(trials: int) -> Callable[[Bench], Figures]:
 
 
 def further(measure: Callable[[int], Callable[[Bench], Figures]]) -> Callable[[Bench], Figures]:
-    """What many short trials take more than few."""
+    """Return the figures of many short trials minus those of few."""
 
     def difference(bench: Bench) -> Figures:
         few, many = (measure(trials)(bench) for trials in (FEW, MANY))
@@ -307,14 +307,14 @@ def resume(bench: Bench) -> Figures:
 
 
 def asked_again(server: Server, go_on: Callable[[], Run], calls: int | None = None) -> Figures:
-    """What a run that goes on after a kill asks again of what was answered before."""
+    """Count the answered calls that a run repeats after a kill."""
     before = server.stats()["answered"]
     ran = go_on()
     stats = server.stats()
     if stats["answered"] == before:
         raise RuntimeError("it was killed when everything was answered")
-    told = {"answered_before": before, "asked_again": stats["asked_again"]}
-    return {**figures_of(ran, calls=calls), "answered_after": stats["answered"] - before, **told}
+    counts = {"answered_before": before, "asked_again": stats["asked_again"]}
+    return {**figures_of(ran, calls=calls), "answered_after": stats["answered"] - before, **counts}
 
 
 def half_is_answered(server: Server, trials: int) -> Callable[[], bool]:
@@ -344,7 +344,7 @@ def limited(bench: Bench) -> Figures:
 
 
 def start(*argv: str) -> Callable[[Bench], Figures]:
-    """How long the program takes to say something."""
+    """Measure the time until the program prints something."""
 
     def measure(bench: Bench) -> Figures:
         folder = bench.fresh("start")

@@ -114,7 +114,7 @@ def _client(server: Sequence[str]) -> Iterator[httpx.Client]:
 
 
 def _until_read(client: httpx.Client) -> float:
-    """How long it takes, in s, until a page is no longer one that is to be asked for again."""
+    """Return the time in s until a page no longer refreshes itself."""
     began = time.perf_counter()
     while "refresh" in client.get("trials").raise_for_status().headers:
         time.sleep(POLL_S)

@@ -1,4 +1,4 @@
-"""What the figures should be: ratios of cases that were measured in one run."""
+"""Goals for the figures: ratios of cases that were measured in one run."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Goal:
     unit: str = ""
 
     def met(self, value: float) -> bool:
-        """Whether the figure keeps its bound."""
+        """Return whether the figure keeps its bound."""
         return value <= self.bound if self.at_most else value >= self.bound
 
 

@@ -47,7 +47,7 @@ def _measured(ran: Run) -> Figures:
 
 
 def installed() -> bool:
-    """Whether it is there; ``make bench`` installs it."""
+    """Return whether the peer is installed; ``make bench`` installs it."""
     return PEER.exists()
 
 

@@ -25,7 +25,7 @@ PROGRAM = (PYTHON, "-c", "from merge_runner.__main__ import main; main()")
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """What one process took: wall and CPU time in s, peak memory in MB; and what it printed.
+    """One process: wall and CPU time in s, peak memory in MB, and its output.
 
     A peak below this process's peak cannot be measured: 0.
     """
@@ -38,8 +38,8 @@ class Run:
     @property
     def summary(self) -> dict[str, Any]:
         """The JSON object in its last line."""
-        found: dict[str, Any] = json.loads(self.output.strip().splitlines()[-1])
-        return found
+        summary: dict[str, Any] = json.loads(self.output.strip().splitlines()[-1])
+        return summary
 
 
 def run(
@@ -86,7 +86,7 @@ def run(
 
 
 def _usual_environment() -> dict[str, str]:
-    """That of this process, but that Python keeps what it compiles, as it does for users."""
+    """Return this process's environment, in which Python keeps compiled files, as for users."""
     return {name: v for name, v in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
 
 
@@ -123,13 +123,13 @@ class Server:
         self._ask(Request(f"http://127.0.0.1:{self.port}/reset", data=b"", method="POST"))
 
     def stats(self) -> dict[str, Any]:
-        """What was asked since the last reset."""
+        """Return the requests since the last reset."""
         return self._ask(Request(f"http://127.0.0.1:{self.port}/stats"))
 
     def _ask(self, request: Request) -> dict[str, Any]:
         with urlopen(request) as reply:  # noqa: S310 # our own server
-            found: dict[str, Any] = json.load(reply)
-        return found
+            content: dict[str, Any] = json.load(reply)
+        return content
 
 
 @contextmanager

@@ -23,7 +23,7 @@ def multiply(folder: Path, repetitions: int, reply_bytes: int = 0) -> None:
     """Give every call in a cache, all of which are of repetition 1, that many repetitions.
 
     Equal answers lead to equal prompts, so the bodies stay; the ids of the replies become new. A
-    reply that is shorter than ``reply_bytes`` gets longer: its reasoning, and what it says of it.
+    reply that is shorter than ``reply_bytes`` gets longer: its reasoning and its summary.
     """
     cache = ResponseCache(folder)
     copies = _copies(list(cache.entries()), repetitions, reply_bytes)
@@ -33,7 +33,7 @@ def multiply(folder: Path, repetitions: int, reply_bytes: int = 0) -> None:
 
 
 def longer(reply: str, size: int, seed: str) -> str:
-    """A chat completion of about that many bytes; a quarter of them is said, the rest reasoned."""
+    """A chat completion of about that many bytes; a quarter is content, the rest reasoning."""
     lacking = size - len(reply)
     if lacking <= 0:
         return reply
@@ -41,9 +41,9 @@ def longer(reply: str, size: int, seed: str) -> str:
     message = body["choices"][0]["message"]
     text = _words()
     begin = random.Random(seed).randrange(len(text) - lacking)  # noqa: S311 # no secret
-    said = begin + lacking // 4
-    message["content"] = f"{text[begin:said]}\n\n{message['content']}"
-    message["reasoning_content"] = text[said : begin + lacking]
+    boundary = begin + lacking // 4
+    message["content"] = f"{text[begin:boundary]}\n\n{message['content']}"
+    message["reasoning_content"] = text[boundary : begin + lacking]
     return json.dumps(body)
 
 

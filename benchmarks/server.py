@@ -1,7 +1,7 @@
 """A loopback server that answers every chat completion at once, or after a delay, with one plan.
 
-It is as small as a server can be, so that what is measured is the client. The delay stands in the
-path: ``/delay/200/v1/chat/completions`` answers after 200 ms. ``GET /stats`` tells what was asked,
+It is as small as a server can be, so that the client is measured. The delay stands in the
+path: ``/delay/200/v1/chat/completions`` answers after 200 ms. ``GET /stats`` lists the requests,
 ``POST /reset`` forgets it.
 """
 
@@ -48,7 +48,7 @@ _MODEL = re.compile(rb'"model": ?"([^"]*)"')
 
 
 class Seen:
-    """What was asked since the last reset: arrival times in s, and answers by request."""
+    """Requests since the last reset: arrival times in s, and answers by request."""
 
     def __init__(self) -> None:
         self.arrivals: list[float] = []
@@ -95,8 +95,8 @@ class Conversation(asyncio.Protocol):
         self._received += data
         while (end := self._received.find(_HEAD_END)) >= 0:
             head = bytes(self._received[:end])
-            found = _LENGTH.search(head)
-            whole = end + len(_HEAD_END) + (int(found.group(1)) if found else 0)
+            length = _LENGTH.search(head)
+            whole = end + len(_HEAD_END) + (int(length.group(1)) if length else 0)
             if len(self._received) < whole:
                 return
             body = bytes(self._received[end + len(_HEAD_END) : whole])

@@ -1,8 +1,7 @@
 """A long sweep against a server full of faults, killed without a word again and again.
 
 The server runs in this process, counts what it is asked by slot and attempt, and bills every answer
-that it makes. What the sweep has spent by its own ledger stands beside that, and its digest beside
-a quiet run's digest.
+that it makes. The sweep's ledger is compared with that, and its digest with that of a quiet run.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ _USAGE = re.compile(r'"prompt_tokens": (\d+), "completion_tokens": (\d+)')
 
 @dataclass
 class Watch:
-    """What the server saw, and which calls had a durable reply when a run was killed."""
+    """Requests at the server, and which calls had a durable reply when a run was killed."""
 
     asked: Counter[tuple[str, str]] = field(default_factory=Counter)
     durable: set[str] = field(default_factory=set)
@@ -63,13 +62,13 @@ class Watch:
         self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
     ) -> web.StreamResponse:
         """Count a request, and bill its answer."""
-        told, body = request.headers[SLOT_HEADER], await request.text()
+        slot, body = request.headers[SLOT_HEADER], await request.text()
         key = call_key(
             endpoint="emulator",
             path="/chat/completions",
             headers={},
             body=body,
-            slot=Slot(**json.loads(told)),
+            slot=Slot(**json.loads(slot)),
         )
         self.asked[key, request.headers[ATTEMPT_HEADER]] += 1
         self.asked_again += key in self.durable
@@ -93,8 +92,8 @@ class Process:
         """Look at it, where the system shows it."""
         with contextlib.suppress(OSError):
             status = Path(f"/proc/{pid}/status").read_text()
-            held = re.search(r"VmHWM:\s+(\d+) kB", status)
-            self.peak_mb = max(self.peak_mb, int(held[1]) / 1024 if held else 0.0)
+            peak = re.search(r"VmHWM:\s+(\d+) kB", status)
+            self.peak_mb = max(self.peak_mb, int(peak[1]) / 1024 if peak else 0.0)
             self.handles = max(self.handles, len(os.listdir(f"/proc/{pid}/fd")))
 
 
@@ -151,9 +150,9 @@ class Sweep:
         return {key for (key,) in rows}
 
     def summary(self) -> dict[str, float]:
-        """What its last run told."""
-        told: dict[str, float] = json.loads((self.folder / "out").read_text(encoding="utf-8"))
-        return told
+        """Return the summary of its last run."""
+        summary: dict[str, float] = json.loads((self.folder / "out").read_text(encoding="utf-8"))
+        return summary
 
 
 async def to_its_end(
@@ -194,7 +193,7 @@ async def measure(folder: Path, trials: int, lives_s: float) -> Figures:
         (folder / "quiet").mkdir()
         quiet = Sweep(folder / "quiet", trials, url)
         await to_its_end(quiet, quietly, Process())
-    told = sweep.summary()
+    summary = sweep.summary()
     return {
         "wall_s": wall_s,
         "peak_mb": process.peak_mb,
@@ -206,12 +205,12 @@ async def measure(folder: Path, trials: int, lives_s: float) -> Figures:
         "attempts_made_twice": watch.asked.total() - len(watch.asked),
         "answered_asked_again": watch.asked_again,
         "billed_usd": watch.billed_usd,
-        "spent_usd": told["sweep_cost_usd"],
-        "set_aside_usd": told["set_aside_usd"],
+        "spent_usd": summary["sweep_cost_usd"],
+        "set_aside_usd": summary["set_aside_usd"],
         "beyond_ledger_usd": max(
-            0.0, watch.billed_usd - told["sweep_cost_usd"] - told["set_aside_usd"]
+            0.0, watch.billed_usd - summary["sweep_cost_usd"] - summary["set_aside_usd"]
         ),
-        "attempts_of_unknown_cost": told["attempts_of_unknown_cost"],
+        "attempts_of_unknown_cost": summary["attempts_of_unknown_cost"],
         "quiet_billed_usd": quietly.billed_usd,
         "digest_differs": results_digest(sweep.db) != results_digest(quiet.db),
     }

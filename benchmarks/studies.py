@@ -97,9 +97,9 @@ def write_study(path: Path, trials: int) -> None:
 
 
 def _goes(rng: np.random.Generator, condition: Condition) -> bool:
-    """Whether the left goes first, as often as among the humans."""
-    wanted = condition.projected_headway_m - 3 * condition.relative_velocity_mps - 0.3
-    return bool(rng.random() < 1 / (1 + np.exp(-wanted)))
+    """Draw whether the left goes first, as often as among the humans."""
+    logit = condition.projected_headway_m - 3 * condition.relative_velocity_mps - 0.3
+    return bool(rng.random() < 1 / (1 + np.exp(-logit)))
 
 
 def _actions(
@@ -109,11 +109,13 @@ def _actions(
     left = _goes(rng, condition)
     strength = rng.normal(0.36, 0.09) + 0.02 * abs(condition.projected_headway_m)
     strength *= 0.15 if rng.random() < 0.1 else 1  # they hesitate, and some of them collide
-    held = int(rng.integers(2, 5))
+    intervals = int(rng.integers(2, 5))
     actions = {}
     for side, first in (("left", left), ("right", not left)):
         signed = strength if first else -strength
-        steps = np.repeat([*(signed * rng.uniform(0.6, 1.2, held)), *([-0.3 * signed] * 2)], HELD)
+        steps = np.repeat(
+            [*(signed * rng.uniform(0.6, 1.2, intervals)), *([-0.3 * signed] * 2)], HELD
+        )
         whole = np.zeros(seconds * HELD)
         whole[: len(steps)] = steps
         wobble = noise * rng.normal(size=len(whole)) * (rng.random() < 0.4)
@@ -145,7 +147,7 @@ def _played(
                 continue
             outcomes = ("rate_limit", "ok") if fate > 0.99 else ("ok",)
             plan = tuple((actions[side] + [0.0] * HORIZON)[start : start + HORIZON])
-            found = Decision(
+            decision = Decision(
                 plan,
                 plan[:HELD],
                 "M" if plan[0] > 0 else "Y",
@@ -154,8 +156,8 @@ def _played(
                 reply=_reply(spec, side, start // HELD, outcomes),
             )
             if fate < 0.003:
-                found = replace(found, plan=None, failure="wrong_length", fallback=True)
-            decisions.append(DecisionRow(start // HELD, world.time_s, side, found))
+                decision = replace(decision, plan=None, failure="wrong_length", fallback=True)
+            decisions.append(DecisionRow(start // HELD, world.time_s, side, decision))
         for step in range(start, start + HELD):
             if world.status is None and not lost:
                 world.drive([actions["left"][step]], [actions["right"][step]])

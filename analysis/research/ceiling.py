@@ -59,9 +59,9 @@ def shares(n: int, first: int = DATA_SETS) -> dict[tuple[str, str], float]:
             "robust": judge(who_first_firth(trials), gap_ols(trials, robust=True), robust=True),
         }
         for rule, judged in rules.items():
-            each = {name: verdict.passed is True for name, verdict in judged.items()}
-            for name, passes in (each | {TOGETHER: all(each.values())}).items():
-                passed[name, rule] = passed.get((name, rule), 0) + passes
+            passes = {name: verdict.passed is True for name, verdict in judged.items()}
+            for name, is_passed in (passes | {TOGETHER: all(passes.values())}).items():
+                passed[name, rule] = passed.get((name, rule), 0) + is_passed
     return {key: count / first for key, count in passed.items()}
 
 

@@ -61,14 +61,14 @@ def since(rng, n: int, step_s: float, latest_s: float = 2) -> np.ndarray:
 def levels(rng, n: int, step_s: float) -> np.ndarray:
     """Random accelerations, each held for 0.6 to 3 s, (n, steps)."""
     steps = round(SECONDS / step_s)
-    found, held = np.zeros((n, steps)), np.zeros(n, int)
+    accelerations, steps_left = np.zeros((n, steps)), np.zeros(n, int)
     level = np.zeros(n)
     for step in range(steps):
-        level = np.where(held == 0, rng.uniform(-1.5, 1.5, n), level)
+        level = np.where(steps_left == 0, rng.uniform(-1.5, 1.5, n), level)
         drawn = rng.integers(round(0.6 / step_s), round(3 / step_s) + 1, n)
-        held = np.where(held == 0, drawn, held) - 1
-        found[:, step] = level
-    return found
+        steps_left = np.where(steps_left == 0, drawn, steps_left) - 1
+        accelerations[:, step] = level
+    return accelerations
 
 
 def constant_accelerations(rng, n, step_s):
@@ -78,27 +78,27 @@ def constant_accelerations(rng, n, step_s):
 def plan_of_few_levels(rng, n, step_s):
     """Re-planned each second: half of the plans go on, a quarter of them change within."""
     steps, second, tick = (round(s / step_s) for s in (SECONDS, 1, 0.2))
-    found, level = np.zeros((n, steps)), rng.choice(LEVELS_MPS2, n)
+    accelerations, level = np.zeros((n, steps)), rng.choice(LEVELS_MPS2, n)
     for start in range(0, steps, second):
         first = np.where(rng.random(n) < 0.5, level, rng.choice(LEVELS_MPS2, n))
         level = np.where(rng.random(n) < 0.25, rng.choice(LEVELS_MPS2, n), first)
         change = rng.integers(1, 5, (n, 1)) * tick
-        found[:, start : start + second] = np.where(
+        accelerations[:, start : start + second] = np.where(
             np.arange(second) < change, first[:, None], level[:, None]
         )
-    return driven(found, step_s)
+    return driven(accelerations, step_s)
 
 
 def held_pedal(rng, n, step_s):
     """As the humans': moved within 0.2 s, against the simulator's resistance, then taken out."""
-    wanted = levels(rng, n, FINE_S)
-    padded = np.concatenate([wanted[:, :1]] * 3 + [wanted], axis=1)
+    accelerations = levels(rng, n, FINE_S)
+    padded = np.concatenate([accelerations[:, :1]] * 3 + [accelerations], axis=1)
     pedal = np.lib.stride_tricks.sliding_window_view(padded, 4, axis=1).mean(axis=2)
     v = np.full((n, pedal.shape[1] + 1), 10.0)
     for step in range(pedal.shape[1]):
         slowed = 0.005 * (v[:, step] ** 2 - 10**2)  # the pedal also holds against the rest
         v[:, step + 1] = v[:, step] + FINE_S * (pedal[:, step] - slowed)
-    return np.array([without_resistance(times(FINE_S), one) for one in v])[
+    return np.array([without_resistance(times(FINE_S), speeds) for speeds in v])[
         :, :: round(step_s / FINE_S)
     ]
 
@@ -159,8 +159,8 @@ def following(rng, n, step_s):
     v = [np.full(n, 10.0)]
     for time in times(step_s)[:-1]:
         closing = v[-1] - 9.5 - amplitude * np.sin(frequency * time + phase)
-        wanted = 2 + v[-1] * headway_s + v[-1] * closing / (2 * np.sqrt(a * b))
-        acceleration = a * (1 - (v[-1] / desired) ** 4 - (wanted / np.maximum(gap, 0.5)) ** 2)
+        desired_gap = 2 + v[-1] * headway_s + v[-1] * closing / (2 * np.sqrt(a * b))
+        acceleration = a * (1 - (v[-1] / desired) ** 4 - (desired_gap / np.maximum(gap, 0.5)) ** 2)
         v.append(v[-1] + step_s * np.clip(acceleration, -4, HIGHEST_MPS2))
         gap = gap - closing * step_s
     return np.column_stack(v)
@@ -184,11 +184,11 @@ def share_of_holds(v: np.ndarray) -> np.ndarray:
     a = np.diff(v) / SAMPLE_S
     windows = np.lib.stride_tricks.sliding_window_view(a, 3, axis=1)
     same = np.ptp(windows, axis=2) < 0.1
-    held = np.zeros(a.shape, bool)
+    in_hold = np.zeros(a.shape, bool)
     for shift in range(3):
-        held[:, shift : shift + same.shape[1]] |= same
+        in_hold[:, shift : shift + same.shape[1]] |= same
     acting = np.abs(a) > 0.1
-    return (held & acting).sum(axis=1) / np.maximum(acting.sum(axis=1), 1)
+    return (in_hold & acting).sum(axis=1) / np.maximum(acting.sum(axis=1), 1)
 
 
 def largest_fifth(v: np.ndarray) -> np.ndarray:
@@ -219,7 +219,7 @@ def at_one_rate(control: Callable, rate_hz: int, noise_mps: float) -> np.ndarray
     rng = np.random.default_rng([260409609, (HELD + MOVING).index(control), rate_hz])
     v = control(rng, PROFILES, 1 / rate_hz)
     v = v + noise_mps * rng.standard_normal(v.shape)
-    return np.array([at_5_hz(times(1 / rate_hz), one) for one in v])
+    return np.array([at_5_hz(times(1 / rate_hz), speeds) for speeds in v])
 
 
 @cache
@@ -227,11 +227,11 @@ def measured(measure: Callable, control: Callable, rate_hz: int, noise_mps: floa
     return measure(at_one_rate(control, rate_hz, noise_mps))
 
 
-def separation(measure, held, moving, cell) -> float:
+def separation(measure, holds, moving, cell) -> float:
     """The area under the ROC curve: how often a held profile has the larger value."""
     first, second = (
         np.concatenate([measured(measure, control, *cell) for control in controls])
-        for controls in (held, moving)
+        for controls in (holds, moving)
     )
     return stats.mannwhitneyu(first, second).statistic / (len(first) * len(second))
 
@@ -253,8 +253,8 @@ def controls_table() -> str:
         row = [control.__name__.replace("_", " ")]
         for cell in cells:
             low, middle, high = np.percentile(measured(gains, control, *cell), [25, 50, 75])
-            held, moving = ([control], MOVING) if control in HELD else (HELD, [control])
-            area = separation(gains, held, moving, cell)
+            holds, moving = ([control], MOVING) if control in HELD else (HELD, [control])
+            area = separation(gains, holds, moving, cell)
             row.append(f"{middle:.2f} ({low:.2f} to {high:.2f}), {area:.2f}")
         rows.append(row)
     return markdown(["control", *map(recording, cells)], rows)
@@ -267,8 +267,8 @@ def clock_table() -> str:
         speeds = at_one_rate(control, 5, 0.0)
         row = [control.__name__.replace("_", " ")]
         for v in (speeds, clocked(speeds)):
-            found = gains(v)
-            row.append(f"{found.mean():.2f}, {100 * (found > 0).mean():.0f} %")
+            gain = gains(v)
+            row.append(f"{gain.mean():.2f}, {100 * (gain > 0).mean():.0f} %")
         rows.append(row)
     return markdown(["control", "as it is", "one acceleration a second"], rows)
 

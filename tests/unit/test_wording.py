@@ -12,7 +12,8 @@ from tests.support.harness import PROJECT
 
 SOURCES = (
     *(PROJECT / "merge_runner").rglob("*.py"),
-    *(PROJECT / "analysis/merge_runner_analysis").rglob("*.py"),
+    *(PROJECT / "analysis").rglob("*.py"),
+    *(PROJECT / "benchmarks").rglob("*.py"),
 )
 # Everyday words in place of terms, and relative clauses in place of nouns.
 PHRASES = re.compile(

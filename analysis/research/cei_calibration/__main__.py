@@ -46,8 +46,8 @@ def check(
 
     thresholds = require(SETS, "set", name)
     scenario = experiment(resistance or SEARCHES[name].resistance)
-    found = [numbers_of(thresholds, scenario, n, tunnel=tunnel) for n in range(sets)]
-    print_out(_text(compared(found)))
+    numbers = [numbers_of(thresholds, scenario, n, tunnel=tunnel) for n in range(sets)]
+    print_out(_text(compared(numbers)))
 
 
 @app.command()
@@ -71,9 +71,9 @@ def search(
         "seed": seed,
     }
     given: dict[str, Any] = {key: value for key, value in changes.items() if value is not None}
-    for found in replace(require(SEARCHES, "set", name), **given).run():
-        say(f"generation {found.number}: cost {found.cost:.1f} at best; {_line(found.thresholds)}")
-    print_out(_line(found.thresholds))
+    for step in replace(require(SEARCHES, "set", name), **given).run():
+        say(f"generation {step.number}: cost {step.cost:.1f} at best; {_line(step.thresholds)}")
+    print_out(_line(step.thresholds))
 
 
 @app.command()
@@ -82,9 +82,9 @@ def fit(db: DbOption = DEFAULT_DB) -> None:
     from analysis.research.cei_calibration.authors_fit import fit_thresholds, threshold_set
 
     fits = fit_thresholds(Path(db))
-    for name, one in zip(("lower", "upper"), fits, strict=True):
+    for name, model in zip(("lower", "upper"), fits, strict=True):
         print_out(
-            f"{name} threshold, {one.n} trials; how far each driver's is off:\n{_drivers(one)}"
+            f"{name} threshold, {model.n} trials; how far each driver's is off:\n{_drivers(model)}"
         )
     print_out(f'\n[drivers.fitted]\nprogram = "cei"\nset = "{next(iter(SETS))}"')
     print_out(_line(threshold_set(*fits), "\n"))
@@ -94,8 +94,8 @@ def _line(thresholds: ThresholdSet, between: str = ", ") -> str:
     return between.join(f"{name} = {value:.4f}" for name, value in thresholds._asdict().items())
 
 
-def _drivers(one: Fit) -> str:
-    return "\n".join(f"  {name} {effect:+.4f}" for name, effect in sorted(one.drivers.items()))
+def _drivers(model: Fit) -> str:
+    return "\n".join(f"  {name} {effect:+.4f}" for name, effect in sorted(model.drivers.items()))
 
 
 def _text(table: pd.DataFrame) -> str:

@@ -88,11 +88,11 @@ def fit_thresholds(db: Path) -> tuple[Fit, Fit]:
 def estimated(reactions: pd.DataFrame) -> pd.DataFrame:
     """Return the reactions with the columns ``lower`` and ``upper``; NaN is unknown."""
     speeds = grid_speeds()
-    found = [
+    thresholds = [
         _thresholds(speeds[row.condition, row.side], row.exit_mps, row.later_mps, row.reacted)
         for row in reactions.itertuples()
     ]
-    lower, upper = zip(*found, strict=True)
+    lower, upper = zip(*thresholds, strict=True)
     estimates = reactions.assign(lower=lower, upper=upper)
     still = estimates[~estimates["reacted"]]
     highest = still.groupby("driver")["upper"].transform("max") * BEYOND
@@ -111,14 +111,14 @@ def grid_speeds() -> dict[tuple[str, str], Array]:
             -condition.projected_headway_m, -condition.relative_velocity_mps
         )
     distinct = list(dict.fromkeys(conditions.values()))
-    trials = [Trial(one, (agent, None), (0, 0)) for one in distinct for agent in GRID]
+    trials = [Trial(condition, (agent, None), (0, 0)) for condition in distinct for agent in GRID]
     scenario = experiment().model_copy(update={"timeout_s": SIMULATED_S})
     model = Model(task_of(scenario, TRACK), ThresholdSet(*(0.0,) * 10), FITTING)
     traces = simulate(model, trials, tunnel=True)
     later = traces.control_at + round(LATER_S / TICK_S)
     speeds = traces.speeds_mps[later, 0, np.arange(len(trials))].reshape(len(distinct), -1)
-    found = dict(zip(distinct, speeds, strict=True))
-    return {key: found[condition] for key, condition in conditions.items()}
+    speeds_of = dict(zip(distinct, speeds, strict=True))
+    return {key: speeds_of[condition] for key, condition in conditions.items()}
 
 
 def _thresholds(
@@ -129,7 +129,7 @@ def _thresholds(
     if off.min() >= NEAR_MPS:
         return np.nan, np.nan
     nearest = [GRID[n] for n in np.flatnonzero(np.isclose(off, off.min(), rtol=0, atol=1e-9))]
-    lowers, uppers = {one.lower for one in nearest}, {one.upper for one in nearest}
+    lowers, uppers = {agent.lower for agent in nearest}, {agent.upper for agent in nearest}
     if not reacted:
         return np.nan, min(uppers)
     highest = max(uppers)
@@ -150,7 +150,7 @@ def mixed(estimates: pd.DataFrame, threshold: str) -> Fit:
     model = MixedLM(chosen[threshold].to_numpy(float), terms, groups=chosen["driver"].to_numpy())
     for method in ("bfgs", "lbfgs", "powell"):
         with warnings.catch_warnings():
-            # What they warn of is checked below.
+            # Both warnings are checked below.
             warnings.simplefilter("ignore", ConvergenceWarning)
             warnings.simplefilter("ignore", SingularMatrixWarning)
             try:
@@ -161,7 +161,10 @@ def mixed(estimates: pd.DataFrame, threshold: str) -> Fit:
             return Fit(
                 len(chosen),
                 dict(zip(TERMS, map(float, fit.fe_params), strict=True)),
-                {str(name): float(np.ravel(one)[0]) for name, one in fit.random_effects.items()},
+                {
+                    str(name): float(np.ravel(intercept)[0])
+                    for name, intercept in fit.random_effects.items()
+                },
             )
     raise UsageError(f"{few}: none of its fits converges")
 

@@ -31,7 +31,7 @@ def design(
     thresholds: ThresholdSet,
     scenario: ScenarioConfig,
     sample_set: int,
-    each: int = TRIALS_OF_A_PAIR,
+    trials_of_a_pair: int = TRIALS_OF_A_PAIR,
 ) -> list[Trial]:
     """All conditions, ``each`` times with every synthetic pair: of 10 these are 990 trials.
 
@@ -39,7 +39,7 @@ def design(
     """
     trials = []
     for name, condition in HUMAN_CONDITIONS.items():
-        for repetition in range(1, each * len(OFFSETS) + 1):
+        for repetition in range(1, trials_of_a_pair * len(OFFSETS) + 1):
             left, right = (thresholds.base(offset) for offset in offsets_of(0, repetition))
             seeds = (
                 _seed(scenario, name, repetition, "left", sample_set),

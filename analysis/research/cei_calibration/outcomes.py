@@ -33,18 +33,18 @@ def measured(task: Task, trials: Sequence[Trial], traces: Traces) -> pd.DataFram
     """
     frame = pd.DataFrame(
         {
-            "projected_headway_m": [one.condition.projected_headway_m for one in trials],
-            "relative_velocity_mps": [one.condition.relative_velocity_mps for one in trials],
+            "projected_headway_m": [trial.condition.projected_headway_m for trial in trials],
+            "relative_velocity_mps": [trial.condition.relative_velocity_mps for trial in trials],
             "status": traces.status,
             "merged_first": _merged_first(task, traces),
             "gap_mean100_m": _gaps(task, traces),
             "conflict_resolution_s": _resolutions(task, traces),
         }
     )
-    initial = np.array([one.condition.speeds_mps for one in trials]).T
+    initial = np.array([trial.condition.speeds_mps for trial in trials]).T
     deviations = np.abs(traces.speeds_mps - initial).max(axis=0)
-    each = np.arange(len(trials))
-    now, next_ = (traces.speeds_mps[traces.control_at + k, :, each].T for k in (0, 1))
+    columns = np.arange(len(trials))
+    now, next_ = (traces.speeds_mps[traces.control_at + k, :, columns].T for k in (0, 1))
     for side, deviation, first in zip(SIDES, deviations, (next_ - now) / TICK_S, strict=True):
         frame[f"deviation_{side}_mps"] = deviation
         frame[f"first_{side}_mps2"] = first
@@ -53,16 +53,16 @@ def measured(task: Task, trials: Sequence[Trial], traces: Traces) -> pd.DataFram
 
 def summary(trials: pd.DataFrame) -> dict[tuple[str, str], float]:
     """Return the numbers of the targets by measure and term; a failed fit has none."""
-    found = {
+    numbers = {
         ("collisions", "count"): float((trials["status"] == "collided").sum()),
         ("timeouts", "count"): float((trials["status"] == "timeout").sum()),
     }
     fits = {"who_first": who_first_logit(trials), "gap": gap_ols(trials, "gap_mean100_m")}
     for measure, fit in fits.items():
-        found |= {(measure, name): term.b for name, term in fit.terms.items()}
+        numbers |= {(measure, name): term.b for name, term in fit.terms.items()}
     resolved = trials[trials["conflict_resolution_s"].notna() & trials["merged_first"].notna()]
     sign = np.where(resolved["merged_first"] == "left", 1.0, -1.0)
-    found |= _coefficients(
+    numbers |= _coefficients(
         "conflict_resolution",
         resolved["conflict_resolution_s"].to_numpy(float),
         sign * resolved["projected_headway_m"].to_numpy(float),
@@ -72,10 +72,10 @@ def summary(trials: pd.DataFrame) -> dict[tuple[str, str], float]:
         np.tile(trials[name].to_numpy(float), 2)
         for name in ("projected_headway_m", "relative_velocity_mps")
     )
-    found |= _coefficients(
+    numbers |= _coefficients(
         "deviation", _both(trials, "deviation_{}_mps"), np.abs(headway), np.abs(velocity)
     )
-    return found | _first_actions(trials)
+    return numbers | _first_actions(trials)
 
 
 def _merged_first(task: Task, traces: Traces) -> list[str | None]:
@@ -86,27 +86,27 @@ def _merged_first(task: Task, traces: Traces) -> list[str | None]:
 
 
 def _arrivals(positions_m: Array, point_m: float) -> Array:
-    """When vehicles reach a point, in samples; infinite: never. Shape (2, n)."""
-    there = positions_m >= point_m
-    sample = there.argmax(axis=0)
+    """Return the samples in which vehicles reach a point; infinite: never. Shape (2, n)."""
+    reached = positions_m >= point_m
+    sample = reached.argmax(axis=0)
     before, now = (
         np.take_along_axis(positions_m, np.maximum(sample - k, 0)[None], axis=0)[0] for k in (1, 0)
     )
     moved = np.where(now > before, now - before, 1.0)
-    return np.where(there.any(axis=0), sample - (now - point_m) / moved, np.inf)
+    return np.where(reached.any(axis=0), sample - (now - point_m) / moved, np.inf)
 
 
 def _gaps(task: Task, traces: Traces) -> Array:
     """Net gaps at the first sample with a mean position past the merge point."""
-    there = traces.positions_m.sum(axis=1) >= 2 * task.track.merge_point_m
+    reached = traces.positions_m.sum(axis=1) >= 2 * task.track.merge_point_m
     apart = np.abs(np.diff(traces.positions_m, axis=1)[:, 0])
-    gap = np.take_along_axis(apart, there.argmax(axis=0)[None], axis=0)[0]
-    counts = there.any(axis=0) & (traces.status == "finished")
+    gap = np.take_along_axis(apart, reached.argmax(axis=0)[None], axis=0)[0]
+    counts = reached.any(axis=0) & (traces.status == "finished")
     return np.where(counts, gap - task.scenario.vehicle_length_m, np.nan)
 
 
 def _resolutions(task: Task, traces: Traces) -> Array:
-    """When the vehicles are first off a collision course, in s since the start of control."""
+    """Return the times in s after which vehicles are first off a collision course."""
     boxes = task.scenario.vehicle_length_m, task.scenario.vehicle_width_m
     length, track = boxes[0], task.track
     # Just past the contact, since at it boxes do not overlap yet.
@@ -116,21 +116,21 @@ def _resolutions(task: Task, traces: Traces) -> Array:
         *((point, *exact_bounds(track, *boxes, point)) for point in touching),
     ]
     course = np.zeros(traces.positions_m.shape[::2], bool)
-    for own in (0, 1):
+    for side in (0, 1):
         for point in points:
-            course |= _on_course(traces, own, *point)
+            course |= _on_course(traces, side, *point)
     samples = np.arange(len(course))[:, None]
     off = ~course & (samples >= traces.control_at) & (samples <= traces.ended_at)
     seconds = (off.argmax(axis=0) - traces.control_at) * TICK_S
     return np.where(off.any(axis=0) & (traces.status != "collided"), seconds, np.nan)
 
 
-def _on_course(traces: Traces, own: int, at_m: float, low_m: float, high_m: float) -> Mask:
+def _on_course(traces: Traces, side: int, at_m: float, low_m: float, high_m: float) -> Mask:
     """Return True where the other will be within the bounds when one vehicle is at the point."""
-    position, speed = traces.positions_m[:, own], traces.speeds_mps[:, own]
+    position, speed = traces.positions_m[:, side], traces.speeds_mps[:, side]
     moving = (position < at_m) & (speed > 0)
     seconds = np.where(moving, at_m - position, 0.0) / np.where(moving, speed, 1.0)
-    other = traces.positions_m[:, 1 - own] + traces.speeds_mps[:, 1 - own] * seconds
+    other = traces.positions_m[:, 1 - side] + traces.speeds_mps[:, 1 - side] * seconds
     return np.asarray(moving & (low_m <= other) & (other <= high_m))
 
 
@@ -154,7 +154,7 @@ def _first_actions(trials: pd.DataFrame) -> dict[tuple[str, str], float]:
     """The slope on the own relative velocity; how far vehicles that are slower, or not, differ."""
     velocity = np.outer(SIGNS, trials["relative_velocity_mps"].to_numpy(float)).ravel()
     action = _both(trials, "first_{}_mps2")
-    found = {("first_action", "slope"): float(np.polyfit(velocity, action, 1)[0])}
+    numbers = {("first_action", "slope"): float(np.polyfit(velocity, action, 1)[0])}
     for name, sign in (("slower", -1), ("equal", 0), ("faster", 1)):
-        found["first_action", f"sd_{name}"] = float(action[np.sign(velocity) == sign].std())
-    return found
+        numbers["first_action", f"sd_{name}"] = float(action[np.sign(velocity) == sign].std())
+    return numbers

@@ -79,12 +79,12 @@ def numbers_of(
     """Return the numbers of the targets for a sample set; counts are scaled to 990."""
     trials = design(thresholds, scenario, sample_set, trials_of_a_pair)
     model = model_of(thresholds, scenario)
-    found = summary(measured(model.task, trials, simulate(model, trials, tunnel=tunnel)))
+    numbers = summary(measured(model.task, trials, simulate(model, trials, tunnel=tunnel)))
     scale = {"count": TRIALS_OF_A_PAIR / trials_of_a_pair}
-    return {key: value * scale.get(key[1], 1.0) for key, value in found.items()}
+    return {key: value * scale.get(key[1], 1.0) for key, value in numbers.items()}
 
 
-def compared(found: Sequence[Numbers]) -> pd.DataFrame:
+def compared(sets: Sequence[Numbers]) -> pd.DataFrame:
     """One row a target: its value, the mean and the spread of what was found, the miss.
 
     The miss is in the tolerances of the search.
@@ -92,7 +92,7 @@ def compared(found: Sequence[Numbers]) -> pd.DataFrame:
     rows = []
     for target in targets():
         key = (target.measure, target.term)
-        values = [numbers[key] for numbers in found if key in numbers]
+        values = [numbers[key] for numbers in sets if key in numbers]
         mean = float(np.mean(values)) if values else None
         rows.append(
             {
@@ -109,20 +109,20 @@ def compared(found: Sequence[Numbers]) -> pd.DataFrame:
     return pd.DataFrame(rows).astype({"std_error": float, "spread": float})
 
 
-def cost(numbers: Numbers, wanted: list[Target]) -> float:
+def cost(numbers: Numbers, expected: list[Target]) -> float:
     """Return the sum of squared misses, in tolerances."""
     return sum(
         ((numbers[key] - target.value) / target.tolerance) ** 2
         if (key := (target.measure, target.term)) in numbers
         else MISSING**2
-        for target in wanted
+        for target in expected
     )
 
 
 def search(
     start: ThresholdSet,
     scenario: ScenarioConfig,
-    wanted: list[Target],
+    expected: list[Target],
     *,
     generations: int,
     size: int,
@@ -143,11 +143,11 @@ def search(
         costs = [
             cost(
                 numbers_of(
-                    ThresholdSet(*each), scenario, FIRST_SAMPLE_SET + number, trials_of_a_pair
+                    ThresholdSet(*candidate), scenario, FIRST_SAMPLE_SET + number, trials_of_a_pair
                 ),
-                wanted,
+                expected,
             )
-            for each in candidates
+            for candidate in candidates
         ]
         best = candidates[np.argsort(costs)[: max(2, round(size * BEST_SHARE))]]
         mean = best.mean(axis=0)

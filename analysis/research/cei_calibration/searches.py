@@ -31,7 +31,7 @@ class SetSearch:
         return search(
             self.start,
             experiment(self.resistance),
-            [one for one in targets() if self.first_action or one.origin == "model"],
+            [target for target in targets() if self.first_action or target.origin == "model"],
             generations=self.generations,
             size=self.size,
             seed=self.seed,

@@ -74,56 +74,57 @@ class _World:
     def __init__(self, model: Model, trials: Sequence[Trial], *, tunnel: bool) -> None:
         self.model, self.task = model, model.task
         begins = [
-            0.0 if tunnel else max(one.condition.exit_times_s(self.task.track)) for one in trials
+            0.0 if tunnel else max(trial.condition.exit_times_s(self.task.track))
+            for trial in trials
         ]
         places = [
-            one.condition.positions_m(at, self.task.track)
-            for one, at in zip(trials, begins, strict=True)
+            trial.condition.positions_m(at, self.task.track)
+            for trial, at in zip(trials, begins, strict=True)
         ]
         self.positions_m = [np.array(places).T]
-        self.speeds_mps = [np.array([one.condition.speeds_mps for one in trials]).T]
+        self.speeds_mps = [np.array([trial.condition.speeds_mps for trial in trials]).T]
         self.accelerations = np.zeros(2 * len(trials))
         self.error = np.zeros(2 * len(trials))
-        seeds = [one.seeds[side] for side in (0, 1) for one in trials]
+        seeds = [trial.seeds[side] for side in (0, 1) for trial in trials]
         self.noise = np.stack([_noise(seed, self.task.scenario.timeout_s) for seed in seeds], 1)
         self.running = np.arange(len(trials))
         self.status = np.full(len(trials), RUNNING, "<U8")
         self.ended_at = np.zeros(len(trials), np.int64)
         self.control_at = np.zeros(len(trials), np.int64)
-        own = self._vehicles()
-        other = _others(own)
-        drivers = [one.drivers[side] for side in (0, 1) for one in trials]
+        vehicles = self._vehicles()
+        others = _others(vehicles)
+        drivers = [trial.drivers[side] for side in (0, 1) for trial in trials]
         self.driven = np.array([driver is not None for driver in drivers])
         # At their start vehicles have the speeds that their cruise controls are set to.
-        desired = own.speeds_mps if tunnel else set_speeds(self.task, own.speeds_mps)
-        ticks = np.zeros(len(seeds)) if tunnel else tunnel_ticks(own, other)
+        desired = vehicles.speeds_mps if tunnel else set_speeds(self.task, vehicles.speeds_mps)
+        ticks = np.zeros(len(seeds)) if tunnel else tunnel_ticks(vehicles, others)
         bases = [driver or NOBODY for driver in drivers]
-        self.agents = start(model, bases, own, other, desired, ticks, self.noise[0])
+        self.agents = start(model, bases, vehicles, others, desired, ticks, self.noise[0])
         self._end()
 
     def step(self) -> None:
         """All observe and decide, and all are driven for 50 ms."""
         sample = len(self.positions_m)
-        own = self._vehicles()
-        other = _others(own)
+        vehicles = self._vehicles()
+        others = _others(vehicles)
         both = np.concatenate([self.running, self.running + self.status.size])
         noise = self.noise[sample][both]
-        out = own.positions_m.reshape(2, -1).min(axis=0) > self.task.track.tunnel_exit_m - 1e-9
+        out = vehicles.positions_m.reshape(2, -1).min(axis=0) > self.task.track.tunnel_exit_m - 1e-9
         self.control_at[self.running[~out]] = sample
         controls = np.concatenate([out, out]) & self.driven[both]
         agents = self.agents
-        agents.perceive(self.model, other, _swapped(self.accelerations), noise[:, 0])
-        agents.decide(self.model, own, other, noise[:, 1], controls)
-        error = agents.desired_mps - own.speeds_mps
+        agents.perceive(self.model, others, _swapped(self.accelerations), noise[:, 0])
+        agents.decide(self.model, vehicles, others, noise[:, 1], controls)
+        error = agents.desired_mps - vehicles.speeds_mps
         damping = CRUISE_DAMPING * (self.error - error) / TICK_S
         cruise = np.clip(CRUISE_GAIN * error - damping, -1, 1)
         self.error = error
         inputs = np.where(controls, agents.inputs, cruise)
-        wanted = self.task.net_mps2(inputs, own.speeds_mps)
-        positions, speeds = move(own.positions_m, own.speeds_mps, wanted, TICK_S)
+        net_mps2 = self.task.net_mps2(inputs, vehicles.speeds_mps)
+        positions, speeds = move(vehicles.positions_m, vehicles.speeds_mps, net_mps2, TICK_S)
         # Where a vehicle stops within the step, it executes less than the command.
-        stops = own.speeds_mps + wanted * TICK_S < 0
-        self.accelerations = np.where(stops, -own.speeds_mps / TICK_S, wanted)
+        stops = vehicles.speeds_mps + net_mps2 * TICK_S < 0
+        self.accelerations = np.where(stops, -vehicles.speeds_mps / TICK_S, net_mps2)
         self.positions_m.append(_with(self.positions_m[-1], self.running, positions))
         self.speeds_mps.append(_with(self.speeds_mps[-1], self.running, speeds))
         self._end()
@@ -159,8 +160,8 @@ def _noise(seed: int, seconds: float) -> Array:
     return np.random.default_rng(seed).standard_normal((round(seconds / TICK_S) + 1, 2))
 
 
-def _others(own: Vehicles) -> Vehicles:
-    return Vehicles(_swapped(own.positions_m), _swapped(own.speeds_mps))
+def _others(vehicles: Vehicles) -> Vehicles:
+    return Vehicles(_swapped(vehicles.positions_m), _swapped(vehicles.speeds_mps))
 
 
 def _swapped(values: Array) -> Array:
@@ -175,15 +176,15 @@ def _with(values: Array, chosen: NDArray[np.int64], changed: Array) -> Array:
 
 
 def _collisions(task: Task, positions_m: Array) -> Mask:
-    """Which pairs of vehicles collide, by the scenario's rule; positions of the shape (2, n)."""
+    """Return True for pairs of vehicles that collide by the scenario's rule; positions: (2, n)."""
     track, scenario = task.track, task.scenario
     # Centres farther apart than a diagonal never do; of the few others the world's rule is asked.
     before = np.maximum(track.merge_point_m - positions_m, 0.0)
     across = before.sum(axis=0) * track.branch_sine
     along = np.diff(positions_m + before * (1 - track.branch_cosine), axis=0)[0]
     reach = np.hypot(scenario.vehicle_length_m, scenario.vehicle_width_m)
-    found = across**2 + along**2 < reach**2
-    for n in np.flatnonzero(found):
+    collide = across**2 + along**2 < reach**2
+    for n in np.flatnonzero(collide):
         left, right = map(float, positions_m[:, n])
-        found[n] = collided(scenario, track, left, right)
-    return np.asarray(found)
+        collide[n] = collided(scenario, track, left, right)
+    return np.asarray(collide)

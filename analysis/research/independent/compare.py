@@ -35,24 +35,24 @@ def program_tables(db: Path, *options: str) -> dict[str, dict[str, dict[str, str
         cwd=db.parent, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    found: dict[str, dict[str, dict[str, str]]] = {}
+    tables: dict[str, dict[str, dict[str, str]]] = {}
     for is_name, lines in groupby(done.stdout.splitlines(), lambda line: line.startswith("# ")):
         if is_name:
             name = [*lines][-1].removeprefix("# ")
         else:
-            found[name] = {row["row"]: row for row in csv.DictReader(filter(None, lines))}
-    return found
+            tables[name] = {row["row"]: row for row in csv.DictReader(filter(None, lines))}
+    return tables
 
 
-def held(program) -> dict[str, float]:
+def p_of_i5(program) -> dict[str, float]:
     """The p of I5, which is not recomputed, by row."""
     rows = program["verdicts"].items()
     return {name: float(row["p"]) for name, row in rows if name.endswith("/held") and row["p"]}
 
 
-def disagreements(program, own, *, imported: bool):
+def disagreements(program, recomputed, *, imported: bool):
     """Every row and number in which the program and the recomputation differ."""
-    for table, rows in own.items():
+    for table, rows in recomputed.items():
         printed = {
             name: row
             for name, row in program[table].items()
@@ -60,17 +60,17 @@ def disagreements(program, own, *, imported: bool):
         }
         yield from (f"{table} {name}: in one alone" for name in printed.keys() ^ rows.keys())
         both = {name: (printed[name], row) for name, row in rows.items() if name in printed}
-        for name, (said, row) in both.items():
+        for name, (cells, row) in both.items():
             for column, value in row.items():
                 iterated = column in ITERATED or table in TESTED
-                if column in said and not _equal(said[column], value, iterated=iterated):
-                    yield f"{table} {name} {column}: {said[column]}, and {value} recomputed"
-            if not row and any(said[c] for c in ("n", "p", "value", "difference") if c in said):
+                if column in cells and not _equal(cells[column], value, iterated=iterated):
+                    yield f"{table} {name} {column}: {cells[column]}, and {value} recomputed"
+            if not row and any(cells[c] for c in ("n", "p", "value", "difference") if c in cells):
                 yield f"{table} {name}: judged, and not by the recomputation"
 
 
 def _of_paper(table: str, row: str, imported: bool) -> bool:
-    """Whether a row holds what the paper prints, and is not computed."""
+    """Return whether a row is the paper's and not computed."""
     # I5 and the numbers beside it are not recomputed.
     if table == "indicators" and row.rpartition("/")[2].startswith(("I5", "score")):
         return True
@@ -78,26 +78,26 @@ def _of_paper(table: str, row: str, imported: bool) -> bool:
     return row.partition("/")[0] == "human" and not outcomes and not imported
 
 
-def _equal(said: str, value, *, iterated: bool) -> bool:
-    if value is None or said == "":
-        return said == "" and value is None
+def _equal(cell: str, value, *, iterated: bool) -> bool:
+    if value is None or cell == "":
+        return cell == "" and value is None
     if isinstance(value, str):
-        return said == value
+        return cell == value
     if isinstance(value, bool | np.bool_):
-        return said == str(bool(value))
+        return cell == str(bool(value))
     tolerance = 1e-4 if iterated else 1e-6
-    return math.isclose(float(said), float(value), rel_tol=tolerance, abs_tol=1e-9)
+    return math.isclose(float(cell), float(value), rel_tol=tolerance, abs_tol=1e-9)
 
 
 def compare(db: Path, study: str = "", *, imported: bool = False) -> list[str]:
-    """Where the tables of a database differ, or of one of its studies, whose file lies beside it.
+    """Return the differences of a database's tables, or of a study's, whose file lies beside it.
 
     ``imported``: all humans are imported, so that their rows are computed from trials, too.
     """
     options = ["--study", f"{study}.toml"] if study else []
     program = program_tables(db, *options)
-    own = recompute.tables(str(db), study, held(program))
-    return [*disagreements(program, own, imported=imported)]
+    recomputed = recompute.tables(str(db), study, p_of_i5(program))
+    return [*disagreements(program, recomputed, imported=imported)]
 
 
 if __name__ == "__main__":

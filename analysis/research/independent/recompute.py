@@ -31,7 +31,7 @@ METRICS = (
 MOST_INVALID = 0.2
 
 
-def tables(db: str, study: str = "", held=None) -> dict[str, dict[str, dict]]:
+def tables(db: str, study: str = "", i5_p=None) -> dict[str, dict[str, dict]]:
     """The tables of a database, or of one of its studies.
 
     I5 is not recomputed: ``held`` has its p by row of the table ``verdicts``, which is corrected
@@ -49,7 +49,7 @@ def tables(db: str, study: str = "", held=None) -> dict[str, dict[str, dict]]:
     humans = {} if recorded.empty else {("human", ""): recorded}
     # Who went first is published, trial by trial.
     who = humans or {("human", ""): measured.published_humans()}
-    found = {
+    computed = {
         "who-first": _by_term(who | judged, WHO_FIRST, _who_first)
         | _clustered(recorded, "who-first"),
         "gap": _by_term(humans | judged, GAP, _gap) | _clustered(recorded, "gap"),
@@ -58,11 +58,11 @@ def tables(db: str, study: str = "", held=None) -> dict[str, dict[str, dict]]:
         "indicators": _indicators(who | baselines),
         "contrasts": _prompts(judged, trials.attrs["orders"]),
         "factors": _factors(judged, trials.attrs["orders"]),
-        "verdicts": _beside_humans(judged, who, recorded, held or {}),
+        "verdicts": _beside_humans(judged, who, recorded, i5_p or {}),
     }
-    for rows in found.values():
+    for rows in computed.values():
         rows |= {_id(key): {} for key in groups.keys() - judged.keys()}
-    return found
+    return computed
 
 
 def _id(key: tuple[str, str]) -> str:
@@ -70,7 +70,7 @@ def _id(key: tuple[str, str]) -> str:
 
 
 def _is_judged(rows: pd.DataFrame) -> bool:
-    """Whether at most a fifth of the decisions of each model that was asked are invalid."""
+    """Return whether at most a fifth of the decisions of each model are invalid."""
     counts: dict[str, np.ndarray] = {}
     for asked in rows.loc[rows["status"] != "failed", "asked"]:
         for model, pair in asked.items():
@@ -78,7 +78,7 @@ def _is_judged(rows: pd.DataFrame) -> bool:
     return all(invalid <= MOST_INVALID * n for n, invalid in counts.values())
 
 
-def _beside_humans(judged, who, recorded: pd.DataFrame, held) -> dict[str, dict]:
+def _beside_humans(judged, who, recorded: pd.DataFrame, i5_p) -> dict[str, dict]:
     """The humans and every driver and prompt that is judged, by measure."""
     (human,) = who.values()
     humans = {"who": human, "recorded": None if recorded.empty else recorded}
@@ -86,7 +86,7 @@ def _beside_humans(judged, who, recorded: pd.DataFrame, held) -> dict[str, dict]
     for key, trials in judged.items():
         alike = trials[trials["cell"].isin(measured.OUTCOMES)]  # where humans drove
         robust = {name: holds for name, (*_, holds) in _verdicts(alike).items()}
-        p = held.get(f"{_id(key)}/held")
+        p = i5_p.get(f"{_id(key)}/held")
         for name, row in recompute_verdicts.rows(alike, humans, robust, p).items():
             rows[f"{_id(key)}/{name}"] = row
     return rows
@@ -130,10 +130,10 @@ def _gap(trials: pd.DataFrame) -> list[dict]:
             # Conditions that differ in relative velocity alone.
             played = dict(zip(used["cell"], x, strict=True))
             apart = [
-                played[one] - played[two]
-                for one in played
-                for two in played
-                if one[0] == two[0] and one[1] > two[1]
+                played[faster] - played[slower]
+                for faster in played
+                for slower in played
+                if faster[0] == slower[0] and faster[1] > slower[1]
             ]
             b, freedom = robust[:, 0], len(y) - x.shape[1]
             if apart:
@@ -157,7 +157,7 @@ def _clustered(recorded: pd.DataFrame, table: str) -> dict[str, dict]:
             "clustered-mean100": (statistics.ordinary, measured.gap_data(recorded, "gap_mean100")),
         }
         terms, names, other = GAP, "b se t p", ("hc3_se", "hc3_p", "equivalence_p", "velocity_p")
-    found = {}
+    by_row = {}
     for name, (fit, (x, y, used)) in data.items():
         pair = used["pair"].to_numpy()
         rows = statistics.by_pairs(fit, x, y, pair)
@@ -165,8 +165,8 @@ def _clustered(recorded: pd.DataFrame, table: str) -> dict[str, dict]:
             rows = statistics.wald(*rows.T, len(np.unique(pair)) - 1)
         for k, term in enumerate(terms):
             row = {"n": len(y)} | _columns(names, rows, k) | dict.fromkeys(other)
-            found[f"human/{name}/{term}"] = row
-    return found
+            by_row[f"human/{name}/{term}"] = row
+    return by_row
 
 
 def _values(trials: pd.DataFrame, column: str, kind: str) -> pd.Series:
@@ -197,7 +197,7 @@ def _estimate(trials: pd.DataFrame, column: str, kind: str) -> tuple:
 
 
 def _undecided(trials: pd.DataFrame, column: str) -> int:
-    """How many trials another collision rule ended, so that this one did not see what follows."""
+    """Count the trials that another collision rule ended before this one decided."""
     if column not in ("collided", "boxes"):
         return 0
     if column == "collided" and (trials["source"] == "human").all():
@@ -225,28 +225,28 @@ def _order(orders) -> dict[str, list[str]]:
 
     Whoever lists one alone says nothing of where it stands, unless nobody else lists any.
     """
-    found: dict[str, list[str]] = {}
+    ordered: dict[str, list[str]] = {}
     for factor in {name for order in orders.values() for name in order}:
         lists = [order[factor] for order in orders.values() if factor in order]
         if len(lists) > 1:
-            lists = sorted((each for each in lists if len(each) > 1), key=lambda x: -len(x))
-        found[factor] = [*dict.fromkeys(level for each in lists for level in each)]
-    return found
+            lists = sorted((levels for levels in lists if len(levels) > 1), key=lambda x: -len(x))
+        ordered[factor] = [*dict.fromkeys(level for levels in lists for level in levels)]
+    return ordered
 
 
 def _together(orders, *groups: pd.DataFrame) -> bool:
-    """Whether one study was played with all these trials."""
+    """Return whether one study was played with all these trials."""
     every = [studies for trials in groups for studies in trials["studies"]]
     return len(orders) < 2 or bool(frozenset.intersection(*every))
 
 
-def _otherwise(one: pd.DataFrame, other: pd.DataFrame) -> list[pd.DataFrame]:
+def _otherwise(first: pd.DataFrame, second: pd.DataFrame) -> list[pd.DataFrame]:
     """The trials but for those of programs that do the same in both: all of one are the other's.
 
-    A program is told by its other levels, and does the same only if it does so in every condition.
+    A program is known by its other levels, and does the same only if it does so in every condition.
     """
     ways: list[dict] = [{}, {}]
-    for known, trials in zip(ways, (one, other), strict=True):
+    for known, trials in zip(ways, (first, second), strict=True):
         for cell, way, status in zip(trials["cell"], trials["way"], trials["status"], strict=True):
             if status != "failed":
                 known.setdefault(cell, set()).add(way)
@@ -255,16 +255,16 @@ def _otherwise(one: pd.DataFrame, other: pd.DataFrame) -> list[pd.DataFrame]:
         by_others.setdefault(cell[1:] if isinstance(cell, tuple) else None, []).append(cell)
     same = set()
     for cells in by_others.values():
-        mine, its = ([known[cell] for cell in cells] for known in ways)
-        if all(a <= b or b <= a for a, b in zip(mine, its, strict=True)):
+        of_first, of_second = ([known[cell] for cell in cells] for known in ways)
+        if all(a <= b or b <= a for a, b in zip(of_first, of_second, strict=True)):
             same |= {*cells}
-    return [trials[~trials["cell"].isin(same)] for trials in (one, other)]
+    return [trials[~trials["cell"].isin(same)] for trials in (first, second)]
 
 
-def _compared(one: pd.DataFrame, other: pd.DataFrame, column: str, kind: str) -> dict:
-    if _undecided(one, column) or _undecided(other, column):
+def _compared(first: pd.DataFrame, second: pd.DataFrame, column: str, kind: str) -> dict:
+    if _undecided(first, column) or _undecided(second, column):
         return {}
-    frames = [trials[trials[column].notna()] for trials in _otherwise(one, other)]
+    frames = [trials[trials[column].notna()] for trials in _otherwise(first, second)]
     if not {*frames[0]["cell"]} & {*frames[1]["cell"]}:
         return {}
     values = [_values(trials, column, kind) for trials in frames]
@@ -298,27 +298,27 @@ def _qualities(trials: pd.DataFrame) -> dict:
 def _verdicts(trials: pd.DataFrame) -> dict[str, tuple]:
     """By indicator: the row of its fit, and whether it holds by the paper's and the robust rule."""
     _, headway, velocity = _who_first(trials)
-    found = {
+    by_indicator = {
         "I1": (headway, *_both(headway, ("p", "firth_p"), ("b", "firth_b"), 1)),
         "I2": (velocity, *_both(velocity, ("p", "firth_p"), ("b", "firth_b"), -1)),
     }
     if "gap" in trials:
         _, slope, level, _ = _gap(trials)
         p, equivalence = level["p"], level["equivalence_p"]
-        found["I3"] = (slope, *_both(slope, ("p", "hc3_p"), ("b", "b"), 1))
-        found["I4"] = (
+        by_indicator["I3"] = (slope, *_both(slope, ("p", "hc3_p"), ("b", "b"), 1))
+        by_indicator["I4"] = (
             level,
             None if p is None else p >= 0.05,
             None if equivalence is None else equivalence < 0.05,
         )
-    return found
+    return by_indicator
 
 
 def _both(row: dict, p: tuple, b: tuple, sign: int) -> tuple[bool | None, bool | None]:
-    """Whether an effect of this sign is significant, by either test; None without a fit."""
+    """Return whether an effect of this sign is significant, by each test; None without a fit."""
     return tuple(
-        None if row[one] is None else bool(sign * row[other] > 0 and row[one] < 0.05)
-        for one, other in zip(p, b, strict=True)
+        None if row[p_name] is None else bool(sign * row[b_name] > 0 and row[p_name] < 0.05)
+        for p_name, b_name in zip(p, b, strict=True)
     )
 
 
@@ -332,35 +332,37 @@ def _prompts(groups, orders) -> dict[str, dict]:
             continue
         for name, column, kind, shown in _measured(groups):
             compared = shown or column == "left_first"
-            found = _compared(trials, reference, column, kind) if compared else {}
-            if found:
+            tested = _compared(trials, reference, column, kind) if compared else {}
+            if tested:
                 frames = [t[t[column].notna()] for t in _otherwise(trials, reference)]
                 shared = {*frames[0]["cell"]} & {*frames[1]["cell"]}
-                sizes = [int(one["cell"].isin(shared).sum()) for one in frames]
-                found |= {"n": sizes[0], "n_reference": sizes[1]}
-                rows[f"{driver}/{variant}/{listed[0]}/{name}"] = found
+                sizes = [int(frame["cell"].isin(shared).sum()) for frame in frames]
+                tested |= {"n": sizes[0], "n_reference": sizes[1]}
+                rows[f"{driver}/{variant}/{listed[0]}/{name}"] = tested
     return rows
 
 
 def _factors(groups, orders) -> dict[str, dict]:
     """Every level of each factor, its differences from the first, pooled over other factors."""
     rows: dict[str, dict] = {}
-    scripted = {bool(one["scripted"].any()) for one in groups.values()}
+    scripted = {bool(group["scripted"].any()) for group in groups.values()}
     order = _order(orders)
     for stand_in in sorted(scripted):
-        chosen = [one for one in groups.values() if bool(one["scripted"].any()) == stand_in]
+        chosen = [group for group in groups.values() if bool(group["scripted"].any()) == stand_in]
         mark = " [scripted]" if stand_in and len(scripted) > 1 else ""
-        levels = [one["levels"].iloc[0] for one in chosen]
-        for factor in dict.fromkeys(name for each in levels for name in each):
-            found = {each[factor] for each in levels if factor in each}
+        levels = [group["levels"].iloc[0] for group in chosen]
+        for factor in dict.fromkeys(name for of_group in levels for name in of_group):
+            known = {of_group[factor] for of_group in levels if factor in of_group}
             first = [*order.get(factor, ()), "baseline", "self"]
-            names = sorted(found, key=lambda n: (first.index(n) if n in first else len(first), n))
+            names = sorted(known, key=lambda n: (first.index(n) if n in first else len(first), n))
             if len(names) < 2:
                 continue
             pooled = {}
             for name in names:
                 parts = [
-                    t for t, each in zip(chosen, levels, strict=True) if each.get(factor) == name
+                    t
+                    for t, of_group in zip(chosen, levels, strict=True)
+                    if of_group.get(factor) == name
                 ]
                 pooled[name] = _with_other_levels(pd.concat(parts), factor)
             pooled = _one_cell(pooled)
@@ -374,10 +376,12 @@ def _factors(groups, orders) -> dict[str, dict]:
 def _measured(groups) -> list[tuple[str, str, str, bool]]:
     """The metrics of which a trial has a value; boxes that were the rule are no second measure."""
     every = pd.concat([*groups.values()]) if groups else pd.DataFrame()
-    there = [one for one in METRICS if one[1] in every and every[one[1]].notna().any()]
+    present = [
+        metric for metric in METRICS if metric[1] in every and every[metric[1]].notna().any()
+    ]
     if groups and every["collided"].equals(every["boxes"]):
-        there = [one for one in there if one[1] != "boxes"]
-    return there
+        present = [metric for metric in present if metric[1] != "boxes"]
+    return present
 
 
 def _one_cell(pooled: dict[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
@@ -405,14 +409,17 @@ def _unread(level: str, trials: pd.DataFrame) -> dict[tuple, set]:
     ended = trials[trials["status"] != "failed"]
     ways = ended.groupby("cell")["way"].agg(set).to_dict()
     others = sorted({cell[1:] for cell in ways})
-    found: dict[tuple, set] = {}
-    for place, own in enumerate(others):
-        for its in others[place + 1 :]:
-            shared = [cell[0] for cell in ways if cell[1:] == own and (cell[0], *its) in ways]
-            pairs = [(ways[name, *own], ways[name, *its]) for name in shared]
+    shared_cells: dict[tuple, set] = {}
+    for place, first in enumerate(others):
+        for second in others[place + 1 :]:
+            shared = [cell[0] for cell in ways if cell[1:] == first and (cell[0], *second) in ways]
+            pairs = [(ways[name, *first], ways[name, *second]) for name in shared]
             if shared and all(a <= b or b <= a for a, b in pairs):
-                found |= {(level, name, own, its): {(name, *own), (name, *its)} for name in shared}
-    return found
+                shared_cells |= {
+                    (level, name, first, second): {(name, *first), (name, *second)}
+                    for name in shared
+                }
+    return shared_cells
 
 
 def _with_other_levels(trials: pd.DataFrame, factor: str) -> pd.DataFrame:
@@ -432,14 +439,14 @@ def _level(trials, reference, column, kind, orders) -> dict:
     if trials is reference or not _together(orders, trials, reference):
         return row
     if kind == "median":
-        one, other = (t[t[column].notna()] for t in _otherwise(trials, reference))
-        shared = set(one["cell"]) & set(other["cell"])
+        first, second = (t[t[column].notna()] for t in _otherwise(trials, reference))
+        shared = set(first["cell"]) & set(second["cell"])
         if shared:
-            a, b = (each[each["cell"].isin(shared)][column].median() for each in (one, other))
+            a, b = (frame[frame["cell"].isin(shared)][column].median() for frame in (first, second))
             row["difference"] = a - b
         return row
-    found = _compared(trials, reference, column, kind)
-    if found:
-        row |= {"difference": found["difference"], "p": found.get("p")}
-        row |= {f"difference_{end}": found.get(end) for end in ("ci_low", "ci_high")}
+    tested = _compared(trials, reference, column, kind)
+    if tested:
+        row |= {"difference": tested["difference"], "p": tested.get("p")}
+        row |= {f"difference_{end}": tested.get(end) for end in ("ci_low", "ci_high")}
     return row

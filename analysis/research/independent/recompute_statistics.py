@@ -14,12 +14,12 @@ Z = stats.norm.ppf(0.975)
 
 
 def separated(x: np.ndarray, y: np.ndarray) -> bool:
-    """Whether a hyperplane has all successes on one side, by linear programming (Konis 2007)."""
+    """Return whether a hyperplane separates the successes, by a linear program (Konis 2007)."""
     signed = x * (2 * y - 1)[:, None]
-    found = optimize.linprog(
+    solution = optimize.linprog(
         -signed.sum(axis=0), A_ub=-signed, b_ub=np.zeros(len(y)), bounds=[(-1, 1)] * x.shape[1]
     )
-    return -found.fun > 1e-7
+    return -solution.fun > 1e-7
 
 
 def logit(x: np.ndarray, y: np.ndarray) -> np.ndarray | None:
@@ -32,7 +32,7 @@ def logit(x: np.ndarray, y: np.ndarray) -> np.ndarray | None:
 
 
 def unidentified(x: np.ndarray, y: np.ndarray) -> bool:
-    """Whether trials are too few, in too few conditions, or all of one outcome."""
+    """Return whether trials are too few, in too few conditions, or all of one outcome."""
     few = len(y) <= x.shape[1] or np.linalg.matrix_rank(x) < x.shape[1]
     return few or len(np.unique(y)) < 2
 
@@ -65,13 +65,13 @@ class Firth:
         it may have several maxima, and a saddle where data are symmetric: it is begun anew at both
         sides of the whole fit.
         """
-        found = []
+        maxima = []
         for side in (-1, 0, 1) if self.se.any() else (0,):
             start = self.b + side * self.se
             if column is not None:
                 start[column] = value
-            found.append(self._climbed(start, column))
-        return max(found, key=self.likelihood)
+            maxima.append(self._climbed(start, column))
+        return max(maxima, key=self.likelihood)
 
     def _climbed(self, b: np.ndarray, column: int | None) -> np.ndarray:
         x, y, n = self.x, self.y, self.n
@@ -92,8 +92,8 @@ class Firth:
 
     def lost(self, column: int, value: float) -> float:
         """Twice the log-likelihood that is lost where a coefficient has this value."""
-        best, held = (self.likelihood(b) for b in (self.b, self.fitted(column, value)))
-        return max(0.0, 2 * (best - held))
+        best, restricted = (self.likelihood(b) for b in (self.b, self.fitted(column, value)))
+        return max(0.0, 2 * (best - restricted))
 
     def p(self, column: int) -> float:
         """By the likelihood ratio."""
@@ -107,8 +107,8 @@ class Firth:
             far = sign * 2 * self.se[column]
             while self.lost(column, b + far) < level:
                 far *= 1.5
-            found = optimize.brentq(lambda at: self.lost(column, at) - level, b, b + far)
-            ends.append(found)
+            end = optimize.brentq(lambda at: self.lost(column, at) - level, b, b + far)
+            ends.append(end)
         return ends
 
 
@@ -133,12 +133,12 @@ def least_squares(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray | None, ...]
     rest = y - x @ b
     hat = np.einsum("ij,jk,ik->i", x, bread, x)
     plain = bread * (rest @ rest) / freedom
-    found = [wald(b, np.sqrt(np.diag(plain)), freedom), None, None]
+    results = [wald(b, np.sqrt(np.diag(plain)), freedom), None, None]
     if hat.max() < 1 - 1e-9:
         meat = x.T @ (x * ((rest / (1 - hat)) ** 2)[:, None])
-        found[2] = bread @ meat @ bread
-        found[1] = wald(b, np.sqrt(np.diag(found[2])), freedom)
-    return tuple(found)
+        results[2] = bread @ meat @ bread
+        results[1] = wald(b, np.sqrt(np.diag(results[2])), freedom)
+    return tuple(results)
 
 
 def ordinary(x: np.ndarray, y: np.ndarray) -> np.ndarray | None:
@@ -179,10 +179,10 @@ def by_pairs(fit, x: np.ndarray, y: np.ndarray, pair: np.ndarray) -> np.ndarray 
     return np.column_stack([whole[:, 0], np.sqrt(moved * (len(parts) - 1) / len(parts))])
 
 
-def difference(one: tuple, other: tuple, level: float = 0.95) -> dict:
-    """Of two estimates (b, se, freedom), by t with Satterthwaite's freedom (1946)."""
-    value, se = one[0] - other[0], np.hypot(one[1], other[1])
-    spread = sum(part[1] ** 4 / part[2] for part in (one, other))
+def difference(first: tuple, second: tuple, level: float = 0.95) -> dict:
+    """Compare two estimates (b, se, freedom) by t with Satterthwaite's freedom (1946)."""
+    value, se = first[0] - second[0], np.hypot(first[1], second[1])
+    spread = sum(part[1] ** 4 / part[2] for part in (first, second))
     freedom = se**4 / spread if spread else np.inf
     t = stats.t(freedom)
     half = t.ppf((1 + level) / 2) * se
@@ -245,12 +245,12 @@ def median_interval(values: np.ndarray) -> tuple[float | None, float | None]:
     return (ordered[k - 1], ordered[len(values) - k]) if k else (None, None)
 
 
-def rates_within(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Series]) -> dict:
+def rates_within(first: pd.Series, second: pd.Series, cells: tuple[pd.Series, pd.Series]) -> dict:
     """Two rates in the cells that both have: Mantel and Haenszel, Miettinen and Nurminen.
 
     Empty where there is no such cell.
     """
-    a, n, b, m = _counts(one, other, cells)
+    a, n, b, m = _counts(first, second, cells)
     if not len(a):
         return {}
     w = n * m / (n + m)
@@ -260,8 +260,8 @@ def rates_within(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Se
     p = 2 * stats.norm.sf(abs((a - n * hits / every).sum()) / np.sqrt(chance)) if chance else 1.0
 
     def error(at: float) -> float:
-        first, second = _given_difference(a, n, b, m, at)
-        of_cells = first * (1 - first) / n + second * (1 - second) / m
+        at_level, at_reference = _given_difference(a, n, b, m, at)
+        of_cells = at_level * (1 - at_level) / n + at_reference * (1 - at_reference) / m
         return np.sqrt((w**2 * of_cells * every / (every - 1)).sum()) / w.sum()
 
     ends = []
@@ -280,7 +280,7 @@ def rates_within(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Se
             )
         )
     enough = stats.norm.ppf(0.975) + stats.norm.ppf(0.8)
-    found = [
+    sizes = [
         optimize.brentq(lambda size, sign=sign: enough * error(sign * size) - size, 1e-9, 1)
         for sign in (-1, 1)
     ]
@@ -290,7 +290,7 @@ def rates_within(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Se
         "ci_low": 100 * ends[0],
         "ci_high": 100 * ends[1],
         "p": p,
-        "detectable": 100 * min(found) if surest > 1.959963984540054 else None,
+        "detectable": 100 * min(sizes) if surest > 1.959963984540054 else None,
     }
 
 
@@ -310,30 +310,30 @@ def _given_difference(a, n, b, m, apart: float) -> tuple[np.ndarray, np.ndarray]
     return np.clip((low + high) / 2 + apart, 0, 1), (low + high) / 2
 
 
-def _counts(one: pd.Series, other: pd.Series, cells: tuple) -> list[np.ndarray]:
+def _counts(at_level: pd.Series, at_reference: pd.Series, cells: tuple) -> list[np.ndarray]:
     """Successes and trials of the one, and of the other, in each cell that both have."""
     first, second = (
         v.astype(float).groupby(c).agg(["sum", "size"])
-        for v, c in zip((one, other), cells, strict=True)
+        for v, c in zip((at_level, at_reference), cells, strict=True)
     )
     both = first.join(second, how="inner", suffixes=("1", "2"))
     return [both[name].to_numpy(int) for name in ("sum1", "size1", "sum2", "size2")]
 
 
-def exact_p(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Series]) -> float:
+def exact_p(first: pd.Series, second: pd.Series, cells: tuple[pd.Series, pd.Series]) -> float:
     """Fisher's exact test within the cells that both have, two-sided by probability."""
-    a, n, b, m = _counts(one, other, cells)
+    a, n, b, m = _counts(first, second, cells)
     # The distribution of the successes of the first, all margins of all cells given.
     chances, least = np.ones(1), 0
     for k in range(len(a)):
         total = a[k] + b[k]
-        there = np.arange(max(0, total - m[k]), min(n[k], total) + 1)
-        chances = np.convolve(chances, stats.hypergeom(n[k] + m[k], total, n[k]).pmf(there))
-        least += there[0]
+        hits = np.arange(max(0, total - m[k]), min(n[k], total) + 1)
+        chances = np.convolve(chances, stats.hypergeom(n[k] + m[k], total, n[k]).pmf(hits))
+        least += hits[0]
     return min(1.0, chances[chances <= chances[a.sum() - least] * (1 + 1e-7)].sum())
 
 
-def agreeing(one: tuple, other: tuple, p: float, level: float = 0.95) -> tuple[float, float]:
+def agreeing(first: tuple, second: tuple, p: float, level: float = 0.95) -> tuple[float, float]:
     """The interval of one rate less another, (rate, trials) each, that excludes 0 by this p.
 
     Each end leaves out (1 - level) / 2 of the melded chances of Fay, Proschan and Brittain (2015):
@@ -341,7 +341,7 @@ def agreeing(one: tuple, other: tuple, p: float, level: float = 0.95) -> tuple[f
     the end beside 0 leaves out its own share of p.
     """
     alpha = 1 - level
-    sides = [_melded(one, other, 0.0), _melded(other, one, 0.0)]
+    sides = [_melded(first, second, 0.0), _melded(second, first, 0.0)]
     parts = [alpha / 2, alpha / 2]
     near = int(sides[1] < sides[0])
     by_half, by_p = sides[near] < alpha / 2, p < alpha
@@ -349,7 +349,7 @@ def agreeing(one: tuple, other: tuple, p: float, level: float = 0.95) -> tuple[f
     if by_p != by_half or (share > alpha / 2) == by_p:
         parts[near] = share
     ends = []
-    for part, pair in zip(parts, ((one, other), (other, one)), strict=True):
+    for part, pair in zip(parts, ((first, second), (second, first)), strict=True):
         if _melded(*pair, -1.0) >= part:
             ends.append(-1.0)
         else:
@@ -359,10 +359,10 @@ def agreeing(one: tuple, other: tuple, p: float, level: float = 0.95) -> tuple[f
     return ends[0], -ends[1]
 
 
-def _melded(one: tuple, other: tuple, at: float) -> float:
+def _melded(first: tuple, second: tuple, at: float) -> float:
     """The chance that the lowest belief of one rate exceeds the highest of the other by so much."""
-    k, n = one[0] * one[1], one[1]
-    missed, m = other[1] * (1 - other[0]), other[1]
+    k, n = first[0] * first[1], first[1]
+    missed, m = second[1] * (1 - second[0]), second[1]
     highest = stats.beta(m - missed + 1, missed) if missed > 1e-9 else None
     if k < 1e-9:
         return 1.0 if highest is None else highest.sf(-at)
@@ -377,13 +377,13 @@ def _melded(one: tuple, other: tuple, at: float) -> float:
 
 def detectable_rate(n: int, m: int, rate: float) -> float | None:
     """The smallest difference from ``rate`` that Fisher's test finds with a power of 0.8."""
-    found = np.zeros((n + 1, m + 1))
+    rejects = np.zeros((n + 1, m + 1))
     for total in range(n + m + 1):
-        there = np.arange(max(0, total - m), min(n, total) + 1)
-        chance = stats.hypergeom(n + m, total, n).pmf(there)
-        p = [chance[chance <= one * (1 + 1e-7)].sum() for one in chance]
-        found[there, total - there] = np.array(p) < 0.05
-    by_first = found @ stats.binom.pmf(np.arange(m + 1), m, rate)
+        hits = np.arange(max(0, total - m), min(n, total) + 1)
+        chance = stats.hypergeom(n + m, total, n).pmf(hits)
+        p = [chance[chance <= limit * (1 + 1e-7)].sum() for limit in chance]
+        rejects[hits, total - hits] = np.array(p) < 0.05
+    by_first = rejects @ stats.binom.pmf(np.arange(m + 1), m, rate)
 
     def lacking(other):
         return stats.binom.pmf(np.arange(n + 1), n, other) @ by_first - 0.8
@@ -392,7 +392,7 @@ def detectable_rate(n: int, m: int, rate: float) -> float | None:
     return min((100 * abs(optimize.brentq(lacking, rate, e) - rate) for e in ends), default=None)
 
 
-def means_within(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Series]) -> dict:
+def means_within(first: pd.Series, second: pd.Series, cells: tuple[pd.Series, pd.Series]) -> dict:
     """Two means by least squares with a level for each cell that both have, by Welch's test.
 
     Errors are HC2's, degrees of freedom those of Bell and McCaffrey (2002) for two variances. Empty
@@ -401,7 +401,7 @@ def means_within(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Se
     shared = set(cells[0]) & set(cells[1])
     if not shared:
         return {}
-    kept = [v[c.isin(shared).to_numpy()] for v, c in zip((one, other), cells, strict=True)]
+    kept = [v[c.isin(shared).to_numpy()] for v, c in zip((first, second), cells, strict=True)]
     y = np.concatenate([v.to_numpy(float) for v in kept])
     group = np.repeat([1.0, 0.0], [len(v) for v in kept])
     cell = pd.factorize(pd.concat([c[c.isin(shared)] for c in cells]))[0]
@@ -433,6 +433,6 @@ def means_within(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Se
 def holm(p: list[float]) -> np.ndarray:
     """A family's p by Holm (1979)."""
     p, m = np.array(p), len(p)
-    order, found = np.argsort(p, kind="stable"), np.empty(len(p))
-    found[order] = np.minimum(np.maximum.accumulate(p[order] * (m - np.arange(m))), 1)
-    return found
+    order, corrected = np.argsort(p, kind="stable"), np.empty(len(p))
+    corrected[order] = np.minimum(np.maximum.accumulate(p[order] * (m - np.arange(m))), 1)
+    return corrected

@@ -75,8 +75,8 @@ def read(db: str, study: str = "") -> pd.DataFrame:
     for trial in trials.itertuples():
         key = (trial.trial_id, trial.spec_hash)
         spec = json.loads(specs.get(trial.spec_hash, "{}"))
-        own = decided.get(key, decisions.iloc[:0])
-        named = _named(trial, spec, levels.get(key, {}), own)
+        of_trial = decided.get(key, decisions.iloc[:0])
+        named = _named(trial, spec, levels.get(key, {}), of_trial)
         named["studies"] = studies.get(key, frozenset())
         rows.append(named | _driven(trial, named, samples.get(key)))
     every = _with_cells(pd.DataFrame(rows))
@@ -88,7 +88,7 @@ def read(db: str, study: str = "") -> pd.DataFrame:
     if study:
         kept = every["studies"].map(lambda names: any(study == name[0] for name in names))
         every = every[kept | (every["source"] == "human")]
-        orders = {name: one for name, one in orders.items() if name[0] == study}
+        orders = {name: order for name, order in orders.items() if name[0] == study}
     every.attrs["orders"] = orders
     return every
 
@@ -147,7 +147,7 @@ def _with_cells(trials: pd.DataFrame) -> pd.DataFrame:
     return trials.assign(cell=pd.Series(list(cells), trials.index, dtype=object))
 
 
-def _named(trial, spec, stored, own) -> dict:
+def _named(trial, spec, stored, decisions) -> dict:
     """The driver's name, the ego's side, and the levels of the trial."""
     factors = {name: level for name, (level, _) in stored.items()}
     if trial.source == "human":
@@ -163,17 +163,21 @@ def _named(trial, spec, stored, own) -> dict:
         else:
             ego = min(SIDES, key=models.get)
     ego = trial.focal or ego
-    one, other = models[ego], models["right" if ego == "left" else "left"]
-    own_factors = {n: v for n, v in factors.items() if n != "prompt"}
-    shown = {n: v for n, v in own_factors.items() if n != "opponent" and not stored[n][1]}
-    driver = one if one == other else f"{one}+{other}"
+    driver_model, other_model = models[ego], models["right" if ego == "left" else "left"]
+    varied = {n: v for n, v in factors.items() if n != "prompt"}
+    shown = {n: v for n, v in varied.items() if n != "opponent" and not stored[n][1]}
+    driver = driver_model if driver_model == other_model else f"{driver_model}+{other_model}"
     driver += f" [{', '.join(f'{n}={v}' for n, v in sorted(shown.items()))}]" if shown else ""
-    model = one if one == other or opponent not in (None, "self") else f"{one}+{other}"
-    asked = own[own["asked"]].groupby("side")["valid"].agg(["size", "sum"])
+    model = (
+        driver_model
+        if driver_model == other_model or opponent not in (None, "self")
+        else f"{driver_model}+{other_model}"
+    )
+    asked = decisions[decisions["asked"]].groupby("side")["valid"].agg(["size", "sum"])
     return {
         "driver": driver,
         "ego": ego,
-        "levels": {"model": model, "prompt": factors.get("prompt", trial.variant)} | own_factors,
+        "levels": {"model": model, "prompt": factors.get("prompt", trial.variant)} | varied,
         "programs": not any(asking.values()),
         "asked": {models[side]: (int(n), int(n - valid)) for side, n, valid in asked.itertuples()},
     }
@@ -183,8 +187,8 @@ def _samples(rows: pd.DataFrame) -> dict:
     """Times, and by side positions, speeds and accelerations."""
     sides = dict([*rows.groupby("side")])
     names = {"s": "position_m", "v": "velocity_mps", "a": "acceleration_mps2"}
-    found = {n: {side: sides[side][c].to_numpy(float) for side in SIDES} for n, c in names.items()}
-    return {"t": sides["left"]["time_s"].to_numpy(float), **found}
+    series = {n: {side: sides[side][c].to_numpy(float) for side in SIDES} for n, c in names.items()}
+    return {"t": sides["left"]["time_s"].to_numpy(float), **series}
 
 
 def _as_seen(ego: str, at: dict) -> bytes:
@@ -195,7 +199,7 @@ def _as_seen(ego: str, at: dict) -> bytes:
 
 
 def _passed(t: np.ndarray, s: np.ndarray, level: float) -> float:
-    """When a vehicle passes a level, linearly within the step; NaN: never."""
+    """Return the time at which a vehicle passes a level, linear within the step; NaN: never."""
     steps = np.flatnonzero((s[:-1] < level) & (s[1:] >= level))
     if not len(steps):
         return np.nan
@@ -207,9 +211,9 @@ def _measured(trial, ego: str, at: dict) -> dict:
     t, s, v = at["t"], at["s"], at["v"]
     boxes = _boxes(trial, at)
     near = [_apart(x, y) < LENGTH for x, y in zip(s["left"], s["right"], strict=True)]
-    found = {"boxes": boxes, "collided": None if trial.source == "human" else any(near)}
+    outcomes = {"boxes": boxes, "collided": None if trial.source == "human" else any(near)}
     if trial.status != "finished":
-        return found
+        return outcomes
     merges = {side: _passed(t, s[side], MERGE) for side in SIDES}
     first = min(SIDES, key=lambda side: np.nan_to_num(merges[side], nan=np.inf))
     second = "right" if first == "left" else "left"
@@ -227,7 +231,7 @@ def _measured(trial, ego: str, at: dict) -> dict:
     conflict = after & (closing > 0.01) & (np.abs(lead) > LENGTH)
     mean_there = np.flatnonzero(s["left"] + s["right"] >= 2 * MERGE)
     left_rear = _passed(t, s[first], MERGE + LENGTH / 2)
-    return found | {
+    return outcomes | {
         # As the ego saw it: where it sat on the right, left is right.
         "first": "left" if first == ego else "right",
         "left_first": first == ego,
@@ -256,15 +260,15 @@ def _apart(left: float, right: float) -> float:
 
 
 def overlap(left: float, right: float) -> bool:
-    """Whether the boxes of two vehicles overlap, by separating axes."""
+    """Return whether the boxes of two vehicles overlap, by separating axes."""
     boxes = []
     for side, s in zip(SIDES, (left, right), strict=True):
         sine = (1 if side == "left" else -1) * SINE if s < MERGE else 0.0
         along = np.array([sine, np.sqrt(1 - sine**2)])
         boxes.append((_place(side, s), along, np.array([along[1], -along[0]])))
-    (one, *first), (other, *second) = boxes
+    (first_centre, *first), (second_centre, *second) = boxes
     return all(
-        abs((one - other) @ axis)
+        abs((first_centre - second_centre) @ axis)
         < sum(
             LENGTH / 2 * abs(along @ axis) + WIDTH / 2 * abs(across @ axis)
             for along, across in (first, second)
@@ -281,7 +285,7 @@ def _moved(s: float, v: float, a: float, dt: float) -> tuple[float, float]:
 
 
 def _boxes(trial, at: dict) -> bool | None:
-    """Whether boxes overlapped at 20 Hz; None where another rule ended the trial before."""
+    """Return whether boxes overlapped at 20 Hz; None where another rule ended the trial before."""
     if trial.source == "human":
         return trial.status == "collided"
     t, s, v = at["t"], at["s"], at["v"]

@@ -24,38 +24,41 @@ ENOUGH = 20  # counted trials, and half of those that ended: fewer have no verdi
 KEPT = ("estimate", "ci_low", "ci_high", "n")
 
 
-def rows(trials: pd.DataFrame, humans: dict, indicators, held: float | None) -> dict[str, dict]:
+def rows(trials: pd.DataFrame, humans: dict, indicators, i5_p: float | None) -> dict[str, dict]:
     """The rows of a driver and prompt by measure, of its trials in the humans' conditions.
 
     ``humans`` are two frames of trials: ``who`` and ``recorded``, the latter None without an
     import. ``indicators`` has by name whether I1 to I4 hold by the robust rules. ``held`` is the p
     of I5, which belongs to the same family.
     """
-    found = {}
+    by_measure = {}
     for name in ("headway", "velocity"):
         column = ("headway", "velocity").index(name) + 1
-        found[name] = _beside(
+        by_measure[name] = _beside(
             _first(trials, column),
             _first(humans["who"], column),
             _firsts_apart(trials, humans["who"], column),
         )
-    found["collisions"], collisions = _collisions(trials, humans["who"])
+    by_measure["collisions"], collisions = _collisions(trials, humans["who"])
     for name in ("gap", "gap-headway"):
-        own, other = _gap(trials, name), human_gap(humans["recorded"], trials, name)
+        driver, human = _gap(trials, name), human_gap(humans["recorded"], trials, name)
         apart = {}
-        if own.get("se") is not None and other.get("se") is not None:
-            parts = [(each["estimate"], each["se"], each["freedom"]) for each in (own, other)]
+        if driver.get("se") is not None and human.get("se") is not None:
+            parts = [
+                (estimate["estimate"], estimate["se"], estimate["freedom"])
+                for estimate in (driver, human)
+            ]
             apart = statistics.difference(*parts)
-        found[name] = _beside(own, other, apart)
+        by_measure[name] = _beside(driver, human, apart)
     moved = Moved.of(trials)
-    found["gap-velocity"] = _beside(
+    by_measure["gap-velocity"] = _beside(
         moved.row(0.95), human_moved(humans["recorded"], trials).row(0.95), {}
     )
     if moved.differences is not None:
-        found["gap-velocity"]["p"] = moved.beyond_p()
-    _correct([*found.values(), {"p": held}])
+        by_measure["gap-velocity"]["p"] = moved.beyond_p()
+    _correct([*by_measure.values(), {"p": i5_p}])
     ended = int((trials["status"] != "failed").sum())
-    for name, row in found.items():
+    for name, row in by_measure.items():
         row["state"] = _state(name, row, indicators, within=moved.within())
         if row["state"] is None or row["n"] < max(ENOUGH, ended / 2):
             row["detectable"] = None
@@ -75,11 +78,14 @@ def rows(trials: pd.DataFrame, humans: dict, indicators, held: float | None) -> 
             low, high = statistics.agreeing(*collisions, row["p"], level)
             apart = {"ci_low": 100 * low, "ci_high": 100 * high}
         else:
-            own, other = _gap(trials, name), human_gap(humans["recorded"], trials, name)
-            parts = [(each["estimate"], each["se"], each["freedom"]) for each in (own, other)]
+            driver, human = _gap(trials, name), human_gap(humans["recorded"], trials, name)
+            parts = [
+                (estimate["estimate"], estimate["se"], estimate["freedom"])
+                for estimate in (driver, human)
+            ]
             apart = statistics.difference(*parts, level)
         row |= {f"difference_{end}": apart[end] for end in ends}
-    return found
+    return by_measure
 
 
 def _correct(rows: list[dict]) -> None:
@@ -101,22 +107,26 @@ def _correct(rows: list[dict]) -> None:
 def of_humans(humans: dict) -> dict[str, dict]:
     """The rows of the humans themselves, over all conditions."""
     who = humans["who"]
-    found = {"headway": _first(who, 1), "velocity": _first(who, 2)}
+    by_measure = {"headway": _first(who, 1), "velocity": _first(who, 2)}
     k, n = int(who["boxes"].sum()), len(who)
     low, high = statistics.wilson(k / n, n)
-    found["collisions"] = {"estimate": 100 * k / n, "ci_low": 100 * low, "ci_high": 100 * high}
-    found["collisions"]["n"] = n
+    by_measure["collisions"] = {"estimate": 100 * k / n, "ci_low": 100 * low, "ci_high": 100 * high}
+    by_measure["collisions"]["n"] = n
     for name in ("gap", "gap-headway"):
-        found[name] = human_gap(humans["recorded"], None, name)
+        by_measure[name] = human_gap(humans["recorded"], None, name)
     played = who if humans["recorded"] is None else humans["recorded"]
-    found["gap-velocity"] = human_moved(humans["recorded"], played).row(0.95)
-    return {name: {column: row.get(column) for column in KEPT} for name, row in found.items()}
+    by_measure["gap-velocity"] = human_moved(humans["recorded"], played).row(0.95)
+    return {name: {column: row.get(column) for column in KEPT} for name, row in by_measure.items()}
 
 
-def _beside(own: dict, other: dict, apart: dict) -> dict:
-    row = {name: own.get(name) for name in ("estimate", "ci_low", "ci_high", "n")}
-    row |= {"k": own.get("k"), "undecided": own.get("undecided"), "human": other.get("estimate")}
-    row |= {f"human_{end}": other.get(end) for end in ("ci_low", "ci_high")}
+def _beside(driver: dict, human: dict, apart: dict) -> dict:
+    row = {name: driver.get(name) for name in ("estimate", "ci_low", "ci_high", "n")}
+    row |= {
+        "k": driver.get("k"),
+        "undecided": driver.get("undecided"),
+        "human": human.get("estimate"),
+    }
+    row |= {f"human_{end}": human.get(end) for end in ("ci_low", "ci_high")}
     row |= {name: apart.get(name) for name in ("difference", "p", "detectable")}
     row |= {f"difference_{end}": apart.get(end) for end in ("ci_low", "ci_high")}
     return row | {"p_holm": None, "level": None}
@@ -126,8 +136,8 @@ def _profiled(x: np.ndarray, y: np.ndarray, column: int, level: float = 0.95) ->
     """A coefficient of Firth's fit with its profile interval and likelihood-ratio test."""
     fit = statistics.Firth(x, y)
     low, high = fit.interval(column, level)
-    found = {"estimate": fit.b[column], "se": fit.se[column], "ci_low": low, "ci_high": high}
-    return found | {"p": fit.p(column)}
+    estimate = {"estimate": fit.b[column], "se": fit.se[column], "ci_low": low, "ci_high": high}
+    return estimate | {"p": fit.p(column)}
 
 
 def _first(trials: pd.DataFrame, column: int) -> dict:
@@ -138,21 +148,26 @@ def _first(trials: pd.DataFrame, column: int) -> dict:
     return _profiled(x, y, column) | {"n": len(y)}
 
 
-def _firsts_apart(own: pd.DataFrame, other: pd.DataFrame, column: int, level: float = 0.95) -> dict:
-    """How two slopes differ: an interaction in one model in which every term may differ."""
-    x, x_left, _ = measured.who_first_data(own)
-    y, y_left, _ = measured.who_first_data(other)
+def _firsts_apart(
+    driver: pd.DataFrame, human: pd.DataFrame, column: int, level: float = 0.95
+) -> dict:
+    """Compare two slopes: an interaction in one model in which every term may differ."""
+    x, x_left, _ = measured.who_first_data(driver)
+    y, y_left, _ = measured.who_first_data(human)
     if statistics.unidentified(x, x_left):
         return {}
     design = np.block([[x, x], [y, 0 * y]])
-    found = _profiled(design, np.r_[x_left, y_left], 3 + column, level)
+    interaction = _profiled(design, np.r_[x_left, y_left], 3 + column, level)
     needed = stats.norm.ppf(0.975) + stats.norm.ppf(0.8)
-    return found | {"difference": found["estimate"], "detectable": needed * found["se"]}
+    return interaction | {
+        "difference": interaction["estimate"],
+        "detectable": needed * interaction["se"],
+    }
 
 
-def _collisions(own: pd.DataFrame, human: pd.DataFrame) -> tuple[dict, tuple]:
+def _collisions(driver: pd.DataFrame, human: pd.DataFrame) -> tuple[dict, tuple]:
     """The row in percent, and both rates; with undecided trials both worst cases (Manski 1989)."""
-    ended = own[own["status"] != "failed"]
+    ended = driver[driver["status"] != "failed"]
     cut_off = int(ended["boxes"].isna().sum())
     n, k = len(ended) - cut_off, int(ended["boxes"].fillna(value=False).astype(bool).sum())
     if not len(ended):
@@ -171,17 +186,17 @@ def _collisions(own: pd.DataFrame, human: pd.DataFrame) -> tuple[dict, tuple]:
     counts = human["boxes"].astype(float).groupby(human["cell"]).agg(["mean", "size"])
     rate = float(sum(w * counts["mean"][cell] for cell, w in weights.items()))
     as_good_as = 1 / sum(w**2 / counts["size"][cell] for cell, w in weights.items())
-    there = sum(int(counts["size"][cell]) for cell in weights.index)
+    humans = sum(int(counts["size"][cell]) for cell in weights.index)
     ends = statistics.wilson(rate, as_good_as)
-    other = {"estimate": 100 * rate, "ci_low": 100 * ends[0], "ci_high": 100 * ends[1]}
+    human_row = {"estimate": 100 * rate, "ci_low": 100 * ends[0], "ci_high": 100 * ends[1]}
     if cut_off:
-        return _beside(row, other, {}), ()
+        return _beside(row, human_row, {}), ()
     p = statistics.exact_p(
-        *(each["boxes"].astype(float) for each in (ended, human)), (ended["cell"], human["cell"])
+        *(frame["boxes"].astype(float) for frame in (ended, human)), (ended["cell"], human["cell"])
     )
     apart = {"difference": 100 * (k / n - rate), "p": p}
-    apart["detectable"] = statistics.detectable_rate(n, there, rate)
-    return _beside(row, other, apart), ((k / n, n), (rate, as_good_as))
+    apart["detectable"] = statistics.detectable_rate(n, humans, rate)
+    return _beside(row, human_row, apart), ((k / n, n), (rate, as_good_as))
 
 
 def _gap(trials: pd.DataFrame, name: str) -> dict:
@@ -198,7 +213,7 @@ def _gap(trials: pd.DataFrame, name: str) -> dict:
 
 
 class Moved:
-    """How far relative velocity alone moves a predicted gap, between any two played conditions."""
+    """Differences of the predicted gap between played conditions that differ in velocity alone."""
 
     def __init__(self, b, covariance, freedom, n, conditions):
         self.n, self.freedom, self.differences = n, freedom, None
@@ -286,7 +301,7 @@ def human_gap(recorded: pd.DataFrame | None, driven: pd.DataFrame | None, name: 
 
 
 def human_moved(recorded: pd.DataFrame | None, driven: pd.DataFrame) -> Moved:
-    """How far relative velocity alone moves the humans' gap in the conditions of a driver."""
+    """Return the humans' differences in the conditions of a driver."""
     conditions = {*zip(driven["h"], driven["dv"], strict=True)}
     if recorded is None:
         return Moved(GAP_B, _human_covariance(), GAP_N - 4, GAP_N, conditions)
@@ -308,7 +323,7 @@ def _human_design() -> np.ndarray:
 
 
 def _human_covariance() -> np.ndarray:
-    """What one standard deviation of the gaps about the published regression implies."""
+    """Return the covariance that the published residual standard deviation implies."""
     x = _human_design()
     return GAP_SD_M**2 * np.linalg.inv(x.T @ x)
 
