@@ -16,8 +16,10 @@ from merge_runner.run.cluster_worker import Chunk
 from merge_runner.run.estimate import earlier_answers
 from merge_runner.run.guard import MOST_INVALID, FirstDecisions
 from merge_runner.run.local_runner import LocalRunner
+from merge_runner.run.replay import Replay
 from merge_runner.run.session import Session
-from merge_runner.run.trials import Player
+
+Player = LocalRunner | ClusterRunner | Replay
 
 # Trials under way in a batch run: one that waits for a round takes no time, but memory.
 MOST_IN_ROUNDS = 10_000

@@ -25,7 +25,6 @@ SHOWN = 5  # trials that are stored otherwise
 class Endings:
     """Tally of trials as they end, which also go to the writer."""
 
-    session: Session
     progress: Progress
     writer: TrialWriter
     misses: list[Miss] = field(default_factory=list)
@@ -34,14 +33,14 @@ class Endings:
 
     def add(self, spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
         """Take a trial that has ended, or is suspended for lack of money."""
-        counts = self.progress.trials.outcome_counts
+        counts = self.progress.outcome_counts
         if isinstance(record, TrialSuspended):
             counts["suspended"] += 1
             self.suspended[_played_as(spec)] += 1
             self.why_suspended = str(record)
             return
         counts[record.status] += 1
-        self.progress.trials.done[spec.arm] += 1
+        self.progress.done[spec.arm] += 1
         self.misses += misses_of(record)
         self.writer.add(record)
 
@@ -49,10 +48,11 @@ class Endings:
         """Note the trials that wait for money."""
         if not self.suspended:
             return
-        cap = self.session.ledger.cap
+        session = self.progress.session
+        cap = session.ledger.cap
         assert cap is not None  # without one no trial waits
-        waiting = dict.fromkeys(map(_played_as, self.session.todo), 0) | self.suspended
-        self.session.fail(
+        waiting = dict.fromkeys(map(_played_as, session.todo), 0) | self.suspended
+        session.fail(
             TrialSuspended.exit_code,
             f"{self.suspended.total()} trials wait for money{_unbalanced(waiting)}: "
             f"{self.why_suspended}. Their replies stay stored: raise {cap.source}, and run the "
@@ -61,28 +61,28 @@ class Endings:
 
     def note_failed(self) -> None:
         """Note the calls without a recorded reply, or else the number of failed trials."""
-        failed = self.progress.trials.outcome_counts["failed"]
-        self.session.fail_by_misses(self.misses)
+        session, failed = self.progress.session, self.progress.outcome_counts["failed"]
+        session.fail_by_misses(self.misses)
         if failed and not self.misses:
-            self.session.fail(1, f"{failed} trials failed")
+            session.fail(1, f"{failed} trials failed")
 
 
 async def play_and_store(
-    session: Session, progress: Progress, writer: TrialWriter, stopping: Stopping
+    progress: Progress, writer: TrialWriter, stopping: Stopping
 ) -> tuple[bool, bool]:
     """Play and store the missing trials; problems are noted in the session.
 
     Returns whether the database can be written, and whether the task was cancelled. It cannot if
     Ctrl-C ends the wait for another program that holds it.
     """
-    endings = Endings(session, progress, writer)
-    progress.trials.unstored = lambda: writer.problem
+    endings = Endings(progress, writer)
+    progress.unstored = lambda: writer.problem
     try:
         cancelled = await _play(endings, stopping)
         endings.note_suspended()
     finally:
         progress.ended_at = datetime.now(UTC)
-        is_writable = await _store_rest(session, writer, stopping)
+        is_writable = await _store_rest(progress.session, writer, stopping)
     endings.note_failed()
     return is_writable, cancelled
 
@@ -92,7 +92,8 @@ async def _play(endings: Endings, stopping: Stopping) -> bool:
 
     Two tasks, since Ctrl-C stops the trials but lets the calls that are paid for end.
     """
-    session, writer, player = endings.session, endings.writer, endings.progress.runner
+    session, player = endings.progress.session, endings.progress.runner
+    writer = endings.writer
     work = asyncio.create_task(
         player.play(session.todo, endings.add, capacity=writer.wait_for_capacity)
     )

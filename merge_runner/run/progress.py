@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from merge_runner.llm.attempts import Meter
-from merge_runner.llm.ledger import Ledger
-from merge_runner.run.plan import Plan, usual_prompts
+from merge_runner.run.plan import usual_prompts
 from merge_runner.run.progress_file import (
     ProgressSnapshot,
     clear_dead,
@@ -25,11 +24,13 @@ from merge_runner.run.progress_file import (
     write_snapshot,
 )
 from merge_runner.run.summary import calls_text, underpriced
-from merge_runner.run.trials import Player
 from merge_runner.text_safety import first_of, printable, say
 
 if TYPE_CHECKING:
     from rich.text import Text
+
+    from merge_runner.run.players import Player
+    from merge_runner.run.session import Session
 
 PULSE_S = 0.05
 # Pulses between writes of the file and of a terminal, and between plain lines.
@@ -40,38 +41,30 @@ CLOSE_IT = "you may close this: the same command goes on"
 
 
 @dataclass(slots=True)
-class TrialCounts:
-    """Numbers of trials: ``stored`` before a run, and by arm those ``todo`` in it.
+class Progress:
+    """State of a run, as its display shows it; ``runner`` plays the missing trials of ``session``.
 
-    ``done`` has by arm how many of them ended, ``outcome_counts`` their outcomes: a Status,
-    or ``suspended`` until there is more money. ``unstored`` returns the reason why trials are not
-    stored; empty: nothing is wrong.
+    ``todo`` has their number by arm, and ``done`` how many of them ended; ``outcome_counts`` has
+    their outcomes: a Status, or ``suspended`` until there is more money. ``unstored`` returns the
+    reason why trials are not stored; empty: nothing is wrong. ``worst_stall_s`` is the longest
+    delay of the event loop. ``batches`` returns the batches that are waited for.
     """
 
-    todo: Counter[str]
-    stored: int = 0
+    session: Session
+    runner: Player
+    batches: Callable[[], list[str]] = list
+    todo: Counter[str] = field(init=False)
     done: Counter[str] = field(default_factory=Counter)
     outcome_counts: Counter[str] = field(default_factory=Counter)
     unstored: Callable[[], str] = str
-
-
-@dataclass(slots=True)
-class Progress:
-    """State of a run, as its display shows it; ``runner`` plays its trials.
-
-    ``worst_stall_s`` is the longest delay of the event loop. ``batches`` returns the batches that
-    are waited for.
-    """
-
-    plan: Plan
-    runner: Player
-    ledger: Ledger
-    trials: TrialCounts
-    batches: Callable[[], list[str]] = list
     began_at: datetime = field(default_factory=lambda: datetime.now(UTC))
     ended_at: datetime | None = None
     worst_stall_s: float = 0.0
     doing: Literal["playing", "checking"] = "playing"
+
+    def __post_init__(self) -> None:
+        """Count the missing trials."""
+        self.todo = Counter(spec.arm for spec in self.session.todo)
 
     def meter(self) -> Meter:
         """Return the counts of all models together."""
@@ -85,22 +78,24 @@ class Progress:
         meter = self.meter()
         now = datetime.now(UTC)
         elapsed_s = (now - self.began_at).total_seconds()
-        counts = self.trials.outcome_counts
+        counts = self.outcome_counts
         failed = counts["failed"]
         ended = counts.total() - counts["suspended"] - failed
         batches = first_of(self.batches(), "others", REASONS_SHOWN)
         # The time that a batch takes is unknown.
         shares = self._shares()
         left_s = None if batches else self._left_s(elapsed_s, ended + failed, shares)
-        before = f" (+{self.trials.stored} stored before)" if self.trials.stored else ""
+        stored = len(self.session.stored)
+        before = f" (+{stored} stored before)" if stored else ""
         waiting = self.runner.waiting_for_money
         state = f"{max(0, self.runner.running_trials - waiting)} running{self.runner.place}"
         state += f", {waiting} wait for money" if waiting else ""
-        total = self.trials.todo.total()
+        total = self.todo.total()
         trials = f"{ended + failed}/{total} ended{before}, {state}"
         cost = f"{meter.cost_usd:.2f} USD"
-        if (cap := self.ledger.cap) is not None:
-            cost += f", {self.ledger.committed_usd:.2f} of {cap.usd:g} over all runs"
+        ledger = self.session.ledger
+        if (cap := ledger.cap) is not None:
+            cost += f", {ledger.committed_usd:.2f} of {cap.usd:g} over all runs"
         left = "" if left_s is None else f", about {left_s:.0f} s left"
         rows = [
             *dict.fromkeys(("WARNING", text) for text in self._warnings()),
@@ -116,7 +111,7 @@ class Progress:
             sweep_id=sweep_id,
             updated_at=now,
             doing=self.doing,
-            ended=self.trials.stored + ended,
+            ended=stored + ended,
             failed=failed,
             cost_usd=meter.cost_usd,
             left_s=left_s,
@@ -129,23 +124,23 @@ class Progress:
         The slowest model determines it. Trials that begin together end together, so early in a run
         the calls are a better basis.
         """
-        total = self.trials.todo.total()
+        total = self.todo.total()
         if ended >= total:
             return None
         parts = []
         for model, share in shares.items():
-            done = self._of(model, self.trials.done)
-            todo = self._of(model, self.trials.todo)
+            done = self._of(model, self.done)
+            todo = self._of(model, self.todo)
             if done < todo:
                 parts.append(max(done / todo, share))
         part = min(parts, default=ended / total)
         return elapsed_s / part - elapsed_s if part else None
 
     def _of(self, model: str, by_arm: Counter[str]) -> int:
-        registered = self.plan.registered
+        registered = self.session.plan.registered
         return sum(
             by_arm[arm.label]
-            for arm in self.plan.arms
+            for arm in self.session.plan.arms
             if model in {registered[name] for name in arm.entries}
         )
 
@@ -155,16 +150,18 @@ class Progress:
         The number of decisions in a trial is known only at its end, so the usual number is taken.
         """
         expected, made = defaultdict[str, float](float), Counter[str]()
-        for arm in self.plan.arms:
+        for arm in self.session.plan.arms:
             for name in filter(arm.entries.get, arm.full_names.values()):
-                model = self.plan.registered[name]
-                expected[model] += self.trials.todo[arm.label] * usual_prompts(arm)
+                model = self.session.plan.registered[name]
+                expected[model] += self.todo[arm.label] * usual_prompts(arm)
         for name, meter in self.runner.meters.items():
-            made[self.plan.registered.get(name, name)] += meter.calls_live + meter.calls_cached
+            made[self.session.plan.registered.get(name, name)] += (
+                meter.calls_live + meter.calls_cached
+            )
         return {m: min(made[m] / calls, 0.99) for m, calls in expected.items() if calls}
 
     def _warnings(self) -> Iterator[str]:
-        if problem := self.trials.unstored():
+        if problem := self.unstored():
             yield problem
         for name, meter in self.runner.meters.items():
             yield from (f"another model answers: {pair}" for pair in sorted(meter.mismatches))
@@ -247,11 +244,10 @@ def terminal_text(progress: Progress) -> Text:
     """Return the text on a terminal; text from a server must not be read as markup."""
     from rich.text import Text
 
-    mock = " (a mock)" if progress.plan.scripted else ""
+    plan = progress.session.plan
+    mock = " (a mock)" if plan.scripted else ""
     rows = (f"{name:<8} {text}" for name, text in progress.snapshot("").rows)
-    return Text(
-        printable("\n".join([f"{progress.plan.name}: {progress.plan.driver}{mock}", *rows]))
-    )
+    return Text(printable("\n".join([f"{plan.name}: {plan.driver}{mock}", *rows])))
 
 
 @dataclass
@@ -274,8 +270,8 @@ class Log:
                 say(f"{name}: {text}")
                 self.shown_once.add(kind)
         rows = dict(reversed(snapshot.rows))  # the first of each name
-        ended = snapshot.ended + snapshot.failed - progress.trials.stored
-        line = f"trials: {ended}/{progress.trials.todo.total()} ended{progress.runner.place}"
+        ended = snapshot.ended + snapshot.failed - len(progress.session.stored)
+        line = f"trials: {ended}/{progress.todo.total()} ended{progress.runner.place}"
         line += f"; failed: {snapshot.failed}" if snapshot.failed else ""
         line += f"; cost: {rows['cost']}" if snapshot.cost_usd >= CENT_USD else ""
         if line != self.last_line or progress.doing == "playing":

@@ -14,7 +14,6 @@ from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, command_at
 from merge_runner.records import ReplayMiss
 from merge_runner.results.export import write_table
 from merge_runner.run.estimate import Estimate, usd_text
-from merge_runner.run.options import Options
 from merge_runner.text_safety import first_of
 from merge_runner.trial_records import Status
 
@@ -37,21 +36,23 @@ def underpriced(tier: str) -> str:
 
 
 def as_dict(
-    options: Options,
     progress: Progress,
+    sweep_id: str,
     expected: Estimate | None,
     checked: tuple[dict[str, Any], Audit] | None,
-    **ended_with: object,
 ) -> dict[str, Any]:
     """Return the summary as JSON values; ``expected`` is the estimate before the run, if any.
 
     ``checked`` are the facts of the database and their audit; without them the values from
-    ``decisions`` on are left out. ``ended_with`` is added unchanged.
+    ``decisions`` on are left out.
     """
-    plan, trials = progress.plan, progress.trials
+    session = progress.session
+    plan, options = session.plan, session.options
     playing_s = ((progress.ended_at or progress.began_at) - progress.began_at).total_seconds()
     summary: dict[str, Any] = {
-        **ended_with,
+        "sweep_id": sweep_id,
+        "exit_code": session.exit_code,
+        "messages": session.messages,
         "name": plan.name,
         "run_name": options.name,
         "model": plan.model,
@@ -61,8 +62,8 @@ def as_dict(
         "cache": str(options.cache),
         "trials": {
             "planned": plan.trials,
-            "stored_before": trials.stored,
-            "suspended": trials.outcome_counts["suspended"],
+            "stored_before": len(session.stored),
+            "suspended": progress.outcome_counts["suspended"],
         },
         **_counts(progress),
         "estimate": None if expected is None else asdict(expected),
@@ -79,7 +80,8 @@ def as_dict(
 
 
 def _counts(progress: Progress) -> dict[str, Any]:
-    spending, meter, cap = progress.ledger.spending, progress.meter(), progress.ledger.cap
+    meter, ledger = progress.meter(), progress.session.ledger
+    spending, cap = ledger.spending, ledger.cap
     return {
         "calls": {"live": meter.calls_live, "cached": meter.calls_cached},
         "calls_shared": meter.calls_shared,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import tempfile
-from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import AsyncExitStack, closing
 from dataclasses import replace
@@ -25,17 +24,16 @@ from merge_runner.run.interrupt import NEVER, Stopping
 from merge_runner.run.options import Options
 from merge_runner.run.plan import Plan, usual_prompts
 from merge_runner.run.playing import play_and_store
-from merge_runner.run.progress import Progress, TrialCounts, show_progress
+from merge_runner.run.progress import Progress, show_progress
 from merge_runner.run.progress_file import write_snapshot
 from merge_runner.run.replay import Replay
 from merge_runner.run.run_record import begin, check, end
 from merge_runner.run.session import Session, misses_of, open_session
 from merge_runner.run.summary import as_dict
-from merge_runner.run.trials import Player
 from merge_runner.run.writer import TrialWriter
 
 if TYPE_CHECKING:
-    from merge_runner.llm.batch.rounds import Rounds
+    from merge_runner.run.players import Player
 
 
 async def play(
@@ -88,7 +86,7 @@ async def run(
     replay, sweep_id, checked = Replay(plan, session.cache), "", None
     ahead = await replay.look_ahead(session.todo) if options.replay else []
     if misses := [miss for record in ahead for miss in misses_of(record)]:
-        progress = _progress(session, replay)
+        progress = Progress(session, replay)
         session.fail_by_misses(misses)
         contents = described(options.recordings, session.cache.entries())
         session.messages.append(
@@ -107,14 +105,14 @@ async def run(
 
                 rounds = open_rounds(plan, options, session.cache, session.say)
                 player = await open_player(session, store, rounds, stack)
-            progress = _progress(session, player, rounds)
+            progress = Progress(session, player, rounds.status_lines if rounds else list)
             commit, dirty = await git
             with unreadable_is_usage():
                 sweep_id = begin(session, store, commit, dirty=dirty)
             shown = show_progress(progress, db, sweep_id, quiet=options.quiet)
             await stack.enter_async_context(shown)
             writer = TrialWriter(store, sweep_id, session.say, is_live=not options.replay)
-            is_writable, cancelled = await play_and_store(session, progress, writer, stopping)
+            is_writable, cancelled = await play_and_store(progress, writer, stopping)
             progress.doing = "checking"
             write_snapshot(db, progress.snapshot(sweep_id))
             if is_writable:
@@ -122,20 +120,7 @@ async def run(
                 checked = await check(session, store, sweep_id, player.first)
         if cancelled:
             raise asyncio.CancelledError
-    return as_dict(
-        options, progress, expected, checked,
-        sweep_id=sweep_id, exit_code=session.exit_code, messages=session.messages,
-    )  # fmt: skip
-
-
-def _progress(session: Session, player: Player, rounds: Rounds | None = None) -> Progress:
-    return Progress(
-        plan=session.plan,
-        runner=player,
-        ledger=session.ledger,
-        trials=TrialCounts(Counter(spec.arm for spec in session.todo), len(session.stored)),
-        batches=rounds.status_lines if rounds else list,
-    )
+    return as_dict(progress, sweep_id, expected, checked)
 
 
 async def estimate_rest(session: Session, *, whole: bool = False) -> Estimate:

@@ -103,7 +103,7 @@ def news_of(client, url):
 def running(db, ended=None, **changes):
     """Say that the sweep runs, in this process."""
     shown = progress(runner(), Counter(baseline=3 * len(CONDITIONS)))
-    shown.trials.outcome_counts = Counter(ended or {"finished": 2})
+    shown.outcome_counts = Counter(ended or {"finished": 2})
     write_snapshot(db, shown.snapshot("sweep-1").model_copy(update={"left_s": 20.0, **changes}))
 
 

@@ -35,9 +35,9 @@ def test_every_figure_is_that_of_the_meters():
     meters[0].outcomes["ok"] = meters[1].outcomes["timeout"] = 1
     meters[1].mismatches["o3 -> gpt-4o"] = 2
     shown = progress(runner(*meters, running_trials=5), began_at=ago(60))
-    shown.trials.stored += 7
-    shown.trials.outcome_counts.update(finished=2, failed=1, suspended=1)
-    shown.trials.done.update(baseline=3)
+    shown.session.stored += [None] * 7
+    shown.outcome_counts.update(finished=2, failed=1, suspended=1)
+    shown.done.update(baseline=3)
     fields = dict(rows(shown))
     assert fields["trials"] == "3/10 ended (+7 stored before), 5 running"
     assert fields["failed"] == "1"
@@ -65,12 +65,12 @@ def test_each_model_of_several_shows_its_share_of_the_decisions():
     plan = make_plan("baseline", ["emulator", "random"])
     of_each = {"emulator": Meter(calls_live=231), "random": Meter(calls_cached=9999)}
     shown = progress(runner(), todo=Counter(spec.arm for spec in plan.trial_specs()))
-    shown.plan, shown.runner.meters = plan, of_each
+    shown.session.plan, shown.runner.meters = plan, of_each
     assert [text for name, text in rows(shown) if name == "decided"] == [
         "emulator: about 10% of the decisions",
         "random: about 99% of the decisions",
     ]
-    shown.trials.outcome_counts.update(finished=plan.trials)
+    shown.outcome_counts.update(finished=plan.trials)
     assert "decided" not in dict(rows(shown))
 
 
@@ -80,24 +80,24 @@ def test_the_time_left_is_that_of_the_slowest_model_that_has_trials_left():
     calls = 2 * 10.5 * plan.trials / 3  # of a model
     fast = {"emulator": Meter(calls_live=2 * round(calls)), "random": Meter(calls_live=calls // 4)}
     shown = progress(runner(), began_at=ago(100), todo=todo)
-    shown.plan, shown.runner.meters = plan, fast
+    shown.session.plan, shown.runner.meters = plan, fast
 
     def left_s():
         spent_s, left_s = times(dict(rows(shown))["time"])
         return left_s * 100 / spent_s
 
-    shown.trials.done.update(emulator=todo["emulator"] - 1)
-    shown.trials.outcome_counts.update(finished=todo["emulator"] - 1)
+    shown.done.update(emulator=todo["emulator"] - 1)
+    shown.outcome_counts.update(finished=todo["emulator"] - 1)
     assert left_s() == pytest.approx(300, rel=0.05)
     # A model whose trials have ended with fewer calls than usual is not waited for.
     fast["emulator"].calls_live = 1
-    shown.trials.done["emulator"] += 1
+    shown.done["emulator"] += 1
     assert left_s() == pytest.approx(300, rel=0.05)
     fast["random"].calls_live = 0
     assert "left" not in dict(rows(shown))["time"]
     # Programs alone are left: their trials tell.
-    shown.trials.done["random"] = todo["random"]
-    shown.trials.outcome_counts["finished"] = todo["emulator"] + todo["random"]
+    shown.done["random"] = todo["random"]
+    shown.outcome_counts["finished"] = todo["emulator"] + todo["random"]
     assert left_s() == pytest.approx(50, rel=0.05)
 
 
@@ -127,7 +127,7 @@ def test_a_log_says_in_short_what_is_new_and_its_last_line_once(capsys):
     )
     assert 100 < len(line) <= 121
     assert line.endswith(" ...\n")
-    shown.trials.outcome_counts.update(finished=9, failed=1)
+    shown.outcome_counts.update(finished=9, failed=1)
     shown.doing = "checking"
     for _ in range(3):
         log.show(shown)
@@ -140,7 +140,7 @@ def test_a_log_has_a_warning_once_in_a_line_of_its_own(capsys):
     shown, log = progress(runner(Meter())), Log()
     shown.batches = lambda: ["round 1"]
     for number in (3, 4):
-        shown.trials.unstored = lambda number=number: f"{number} trials wait to be stored"
+        shown.unstored = lambda number=number: f"{number} trials wait to be stored"
         log.show(shown)
     warning, close, first, second = capsys.readouterr().err.splitlines()
     assert warning == "WARNING: 3 trials wait to be stored"

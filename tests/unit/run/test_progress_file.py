@@ -1,7 +1,6 @@
 """What a running sweep tells other processes in the file beside its database."""
 
 import os
-from collections import Counter
 from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
 
@@ -11,13 +10,14 @@ from merge_runner.llm.ledger import Spending
 from merge_runner.run import progress_file
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import make_plan
-from merge_runner.run.progress import Progress, TrialCounts
+from merge_runner.run.progress import Progress
 from merge_runner.run.progress_file import (
     clear_dead,
     read_snapshot,
     remove_snapshot,
     write_snapshot,
 )
+from tests.support.snapshots import session
 
 NO_PROCESS = 2**22 + 1  # above the largest that Linux gives
 LONG_AGO = datetime(2026, 1, 1, tzinfo=UTC)
@@ -26,9 +26,8 @@ LEDGER = SimpleNamespace(spending=Spending(), cap=None)
 
 def snapshot(sweep_id="s", **changes):
     plan = make_plan("baseline", "constant", repetitions=2, conditions=["N_0_0"])
-    plain = Progress(
-        plan, LocalRunner(plan, {}, 0), LEDGER, TrialCounts(Counter(baseline=2))
-    ).snapshot(sweep_id)
+    run = session(plan, LEDGER, {"baseline": 2})
+    plain = Progress(run, LocalRunner(plan, {}, 0)).snapshot(sweep_id)
     return plain.model_copy(update=changes)
 
 
