@@ -192,7 +192,7 @@ _loading = threading.RLock()
 _loaded: list[UsageError | None] = []  # the error or None, once all are imported
 
 
-def fault_of(what: str, error: Exception) -> UsageError:
+def fault_of(what: str, error: BaseException) -> UsageError:
     """Return an error of a plug-in's code as one line, with the place where it was raised."""
     package, frames = Path(__file__).parent, extract_tb(error.__traceback__)
     foreign = [frame for frame in frames if package not in Path(frame.filename).parents]

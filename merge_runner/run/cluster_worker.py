@@ -12,7 +12,6 @@ from functools import cache, partial
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from traceback import walk_tb
 from typing import TYPE_CHECKING, Any
 
 import merge_runner
@@ -25,7 +24,7 @@ from merge_runner.llm.ledger import Cap, Ledger
 from merge_runner.llm.limiter import Limiter
 from merge_runner.llm.store import Attempts, CachedCall
 from merge_runner.records import Usage
-from merge_runner.registry import plugin_sources, using
+from merge_runner.registry import fault_of, plugin_sources, using
 from merge_runner.run.clients import live_clients
 from merge_runner.run.guard import FirstDecisions
 from merge_runner.run.local_runner import LocalRunner
@@ -33,7 +32,6 @@ from merge_runner.run.options import Options
 from merge_runner.run.parts import find_parts
 from merge_runner.run.plan import Plan
 from merge_runner.study.parts import catalogue_of
-from merge_runner.text_safety import one_line
 from merge_runner.trial_records import TrialRecord, TrialSpec
 
 if TYPE_CHECKING:
@@ -78,10 +76,9 @@ class Played:
 
     def fail(self, error: BaseException) -> None:
         """Note an error as text, since not every exception can be pickled."""
-        if isinstance(error, MergeRunnerError):
-            self.error, self.exit_code = str(error), error.exit_code
-        else:
-            self.error, self.exit_code = _described(error), SweepStopped.exit_code
+        if not isinstance(error, MergeRunnerError):
+            error = SweepStopped(str(fault_of("a trial", error)))
+        self.error, self.exit_code = str(error), error.exit_code
 
 
 class _Pickler(pickle.Pickler):
@@ -214,13 +211,6 @@ async def go_on(run: str, results: Sequence[Any], *, dask_worker: Worker) -> Pen
     return await state.replies.exchange(results) or await state.work
 
 
-def _resolved(plan: Plan) -> Plan:
-    """Return the plan with the parts that its study names, made from their sources."""
-    study = plan.study
-    catalogue = catalogue_of(study.file, study.text, study.plugins)
-    return plan.model_copy(update={"parts": find_parts(plan.arms, plan.conditions, catalogue)})
-
-
 async def _play(chunk: Chunk, state: WorkerRun) -> Played:
     replies, played = state.replies, Played()
 
@@ -233,7 +223,10 @@ async def _play(chunk: Chunk, state: WorkerRun) -> Played:
         stack.enter_context(closing(replies))
         try:
             if state.plan is None:
-                state.plan = _resolved(chunk.plan)
+                source, arms, conditions = chunk.plan.study, chunk.plan.arms, chunk.plan.conditions
+                catalogue = catalogue_of(source.file, source.text, source.plugins)
+                parts = find_parts(arms, conditions, catalogue)
+                state.plan = chunk.plan.model_copy(update={"parts": parts})
             plan, options, calls = state.plan, chunk.options, Calls()
             stack.enter_context(using(plan.parts.catalogue))
             clients = live_clients(
@@ -257,12 +250,3 @@ async def _play(chunk: Chunk, state: WorkerRun) -> Played:
         if error is not None:
             played.fail(error)
     return played
-
-
-def _described(error: BaseException) -> str:
-    """Return an error of foreign code, such as a driver's, in one line with its place."""
-    frames = [frame for frame, _ in walk_tb(error.__traceback__)]
-    package = Path(merge_runner.__file__).parent
-    foreign = (f for f in frames if package not in Path(f.f_code.co_filename).parents)
-    code = next(foreign, frames[-1]).f_code
-    return one_line(f"{code.co_qualname} of {code.co_filename} raised {error!r}")

@@ -42,7 +42,7 @@ class Plan(BaseModel):
     the drivers except opponents, separated by commas, as ids of sweeps do. ``levels`` has the
     levels of each factor of its file, the reference first. ``entries`` are the language models of
     all arms by their names in an arm's ``full_names``, and ``endpoints`` the identities of their
-    endpoints (``providers.Endpoint``). ``probe`` is ``first`` where only first decisions are asked,
+    endpoints (``providers.Endpoint``). ``first`` is ``first`` where only first decisions are asked,
     and empty in a sweep. ``parts`` are no part of the JSON: a plan that is read has none.
     """
 
@@ -59,7 +59,7 @@ class Plan(BaseModel):
     conditions: tuple[str, ...]
     sample_set: int
     order_seed: int
-    probe: Literal["", "first"] = Field("", validation_alias="seat", serialization_alias="seat")
+    first: Literal["", "first"] = Field("", validation_alias="seat", serialization_alias="seat")
     parts: Annotated[InstanceOf[Parts], Field(exclude=True)] = Parts()
 
     @property
@@ -71,8 +71,8 @@ class Plan(BaseModel):
         if self.study.file.budget:
             return self.study.name
         models = ",".join(sorted(self.model.split(",")))
-        probe = f"/{self.probe}" if self.probe else ""
-        return f"{self.study.name}/{models}/set{self.sample_set}{probe}"
+        first = f"/{self.first}" if self.first else ""
+        return f"{self.study.name}/{models}/set{self.sample_set}{first}"
 
     @property
     def registered(self) -> dict[str, str]:
@@ -112,14 +112,8 @@ class Plan(BaseModel):
 
     def specs(self) -> dict[str, str]:
         """Return the canonical JSON that each spec hash covers."""
-        texts = (self.spec(arm, name) for arm in self.arms for name in self.conditions)
+        texts = (spec_text(self, *crossed) for crossed in product(self.arms, self.conditions))
         return {spec_hash(text): text for text in texts}
-
-    def spec(self, arm: Arm, condition: str) -> str:
-        """Return the canonical JSON that the spec hash of an arm's trials covers."""
-        return spec_text(
-            arm, self.parts, condition, endpoints=self.endpoints, sample_set=self.sample_set
-        )
 
     def trial_specs(self) -> list[TrialSpec]:
         """Return all trials, repetition by repetition: an unfinished sweep is balanced, too.
@@ -129,11 +123,9 @@ class Plan(BaseModel):
         """
         specs = [
             TrialSpec(
-                trial_id=trial_id(
-                    arm, condition, repetition, sample_set=self.sample_set, probe=self.probe
-                ),
+                trial_id=trial_id(self, arm, condition, repetition),
                 spec_hash=hashed,
-                source="first_decision" if self.probe else "llm" if arm.entries else "driver",
+                source="first_decision" if self.first else "llm" if arm.entries else "driver",
                 model_left=arm.sides["left"],
                 model_right=arm.sides["right"],
                 variant=arm.variant,
@@ -150,7 +142,7 @@ class Plan(BaseModel):
                 kinematics=self.parts.conditions[condition],
             )
             for arm, condition in product(self.arms, self.conditions)
-            for hashed in (spec_hash(self.spec(arm, condition)),)
+            for hashed in (spec_hash(spec_text(self, arm, condition)),)
             for repetition in range(1, arm.repetitions + 1)
         ]
 
@@ -229,7 +221,7 @@ def make_plan(
         conditions=names,
         sample_set=sample_set,
         order_seed=order_seed,
-        probe="first" if first else "",
+        first="first" if first else "",
         parts=parts,
     )
 

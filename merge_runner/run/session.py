@@ -12,6 +12,7 @@ from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.ledger import Cap, Ledger, scopes
 from merge_runner.providers import resolve_endpoint
 from merge_runner.records import ReplayMiss
+from merge_runner.registry import using
 from merge_runner.results.database import unreadable_is_usage
 from merge_runner.results.replay_misses import Miss, explain
 from merge_runner.results.store import Store
@@ -76,16 +77,19 @@ async def open_session(
     Asks a user's own server for the name of its model, and locks the models of a live run.
     ``say`` shows a line to the user. Raises UsageError.
     """
-    if options.batch:
-        from merge_runner.run.clients import check_batches
-
-        check_batches(plan, options)
     overlay = None
     if options.recordings:
         from merge_runner.results.recording import spilled
 
         overlay = partial(spilled, options.recordings)
-    with closing(ResponseCache(options.cache, overlay=overlay)) as cache:
+    with (
+        using(plan.parts.catalogue),  # it has the study's own providers
+        closing(ResponseCache(options.cache, overlay=overlay)) as cache,
+    ):
+        if options.batch:
+            from merge_runner.run.clients import check_batches
+
+            check_batches(plan, options)
         plan = await with_names(plan, options, cache, say)
         specs = {spec.key: spec for spec in plan.trial_specs()}
         # A replay derives everything from the recorded replies alone, so it plays every trial.

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 from merge_runner.prompts.blocks import decomposed
 from merge_runner.records import SIDES, Side, canonical_json
-from merge_runner.run.parts import Parts
 from merge_runner.scenarios.merge.conditions import MEAN_SPEED_MPS
 from merge_runner.study.arms import FOCAL, OPPONENT, PROMPT, Arm
 from merge_runner.text_safety import in_a_name
 from merge_runner.trial_records import SPEC_VERSION
 
+if TYPE_CHECKING:
+    from merge_runner.run.plan import Plan
 
-def trial_id(arm: Arm, condition: str, repetition: int, *, sample_set: int, probe: str) -> str:
+
+def trial_id(plan: Plan, arm: Arm, condition: str, repetition: int) -> str:
     """Return the id of a trial of an arm."""
-    begin = "seat/" if probe else ""
-    set_ = f"/set{sample_set}" if sample_set else ""
+    begin = "seat/" if plan.first else ""
+    set_ = f"/set{plan.sample_set}" if plan.sample_set else ""
     # The prompt and the opponent are in it already.
     levels = "".join(
         f"/{name}={in_a_name(level)}"
@@ -28,32 +30,31 @@ def trial_id(arm: Arm, condition: str, repetition: int, *, sample_set: int, prob
     return f"{begin}{arm.model}/{prompt}/{condition}/rep{repetition:02d}{set_}{levels}{focal}"
 
 
-def spec_text(
-    arm: Arm, parts: Parts, condition: str, *, endpoints: Mapping[str, str], sample_set: int
-) -> str:
+def spec_text(plan: Plan, arm: Arm, condition: str) -> str:
     """Return the canonical JSON of what determines a trial of an arm.
 
     It leaves out the condition's headway and relative velocity. These are columns of the trial's
     row, where a change of them is refused; the mean speed is no column, and so part of the spec.
     """
-    mean_speed_mps = parts.conditions[condition].mean_speed_mps
+    mean_speed_mps = plan.parts.conditions[condition].mean_speed_mps
     spec: dict[str, object] = {
         "spec_version": SPEC_VERSION,
         "scenario": arm.scenario.model_dump(),
-        "prompt_blocks": _prompt_blocks(arm, parts),
-        "left": _driver(arm, "left", parts, endpoints),
-        "right": _driver(arm, "right", parts, endpoints),
-        "sample_set": sample_set,
+        "prompt_blocks": _prompt_blocks(plan, arm),
+        "left": _driver(plan, arm, "left"),
+        "right": _driver(plan, arm, "right"),
+        "sample_set": plan.sample_set,
     }
     if mean_speed_mps != MEAN_SPEED_MPS:
         spec["mean_speed_mps"] = mean_speed_mps
     return canonical_json(spec)
 
 
-def _prompt_blocks(arm: Arm, parts: Parts) -> dict[str, str]:
+def _prompt_blocks(plan: Plan, arm: Arm) -> dict[str, str]:
     """Return the digests of the prompt's blocks; a block of one driver alone names its side."""
+    prompts = plan.parts.prompts
     left, right = (
-        parts.prompts[arm.prompt(side)].digests if arm.full_names[side] in arm.entries else None
+        prompts[arm.prompt(side)].digests if arm.full_names[side] in arm.entries else None
         for side in SIDES
     )
     if left is None or right is None:
@@ -66,14 +67,14 @@ def _prompt_blocks(arm: Arm, parts: Parts) -> dict[str, str]:
     }
 
 
-def _driver(arm: Arm, side: Side, parts: Parts, endpoints: Mapping[str, str]) -> dict[str, object]:
+def _driver(plan: Plan, arm: Arm, side: Side) -> dict[str, object]:
     name = arm.full_names[side]
     entry = arm.entries.get(name)
     if entry is None:
-        return parts.programs[name].in_spec(name)
-    sent = parts.formats[entry.format].request(entry, "")
+        return plan.parts.programs[name].in_spec(name)
+    sent = plan.parts.formats[entry.format].request(entry, "")
     return {
-        "endpoint": endpoints[name],
+        "endpoint": plan.endpoints[name],
         "path": sent.path,
         "headers": sent.headers,
         "body": sent.body,

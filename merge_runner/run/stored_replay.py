@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, nullcontext, suppress
 from dataclasses import dataclass, field, fields, replace
+from itertools import product
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -154,9 +155,8 @@ def _audit(
             text = f"it disagrees with itself in {', '.join(wrong)}"
             problems.append(Finding("config", text, sweep_id))
         planned = {
-            trial_id(arm, condition, repetition, sample_set=plan.sample_set, probe=plan.probe): ""
-            for arm in plan.arms
-            for condition in plan.conditions
+            trial_id(plan, arm, condition, repetition): ""
+            for arm, condition in product(plan.arms, plan.conditions)
             for repetition in range(1, arm.repetitions + 1)
         }
         # The stored plug-ins are somebody's code and never run.
@@ -193,9 +193,7 @@ def _installed_part(
             notes[str(exc)] += arm.repetitions * len(plan.conditions)
         else:
             arms.append(arm)
-    parts = find_parts(arms, plan.conditions if arms else (), known)
-    if parts.replays_humans:
-        parts = parts.with_humans(connection)
+    parts = find_parts(arms, plan.conditions if arms else (), known).with_humans(connection)
     return plan.model_copy(update={"arms": tuple(arms), "parts": parts})
 
 

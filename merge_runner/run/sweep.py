@@ -14,7 +14,6 @@ from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.templates import answer_counts
 from merge_runner.paths import SHIPPED_RECORDINGS
 from merge_runner.providers import UNNAMED
-from merge_runner.registry import using
 from merge_runner.results.database import unreadable_is_usage
 from merge_runner.results.provenance import git_state
 from merge_runner.results.replay_misses import described
@@ -65,14 +64,13 @@ async def play(
         if part.trials < plan.trials:
             say(f"note: the recording holds {part.trials} of the plan's {plan.trials} trials")
         plan = part
-    with using(plan.parts.catalogue):  # it has the study's own providers
-        async with open_session(plan, options, say=say) as session:
-            expected = None
-            if session.todo and not (options.replay or plan.is_free):
-                expected = await estimate_rest(session)
-                if expected.trials:  # some call is not stored yet
-                    agree(expected)
-            return await run(session, expected, stopping)
+    async with open_session(plan, options, say=say) as session:
+        expected = None
+        if session.todo and not (options.replay or plan.is_free):
+            expected = await estimate_rest(session)
+            if expected.trials:  # some call is not stored yet
+                agree(expected)
+        return await run(session, expected, stopping)
 
 
 async def run(
@@ -172,9 +170,8 @@ async def unsent(
         has_cache = (options.cache / "cache.db").is_file()
         cache = options.cache if has_cache else Path(folder) / "responses"
         options = replace(options, db=db, cache=cache, dry_run=True)
-        with using(plan.parts.catalogue):
-            async with open_session(plan, options, say=say) as session:
-                return await estimate_rest(session, whole=whole)
+        async with open_session(plan, options, say=say) as session:
+            return await estimate_rest(session, whole=whole)
 
 
 def _has_replies(cache: ResponseCache, plan: Plan) -> bool:

@@ -107,13 +107,13 @@ def test_every_option_of_a_sweep_reaches_its_plan_or_its_run(monkeypatch, tmp_pa
         Path("d"), Path("c"), 6, 7, 8, 9, strict_model=True, keep_going=True, quiet=True,
         dask="local:2", batch=True, typed=words, ledgers=[plan.ledger],
     )  # fmt: skip
-    assert (plan.probe, plan.sample_set, plan.order_seed) == ("first", 4, 5)
+    assert (plan.first, plan.sample_set, plan.order_seed) == ("first", 4, 5)
     assert (len(plan.conditions), plan.repetitions) == (4, {"A1": 3})
     assert {(arm.model, *arm.factors.values()) for arm in plan.arms} == {
         ("emulator+constant", "0.2"),
         ("constant+emulator", "0.2"),
     }
-    assert (replayed.probe, replayed.conditions, len(replayed.arms)) == ("", ("L_4_8",), 4)
+    assert (replayed.first, replayed.conditions, len(replayed.arms)) == ("", ("L_4_8",), 4)
     assert (replaying.replay, [*replaying.recordings]) == (True, [Path("r.parquet")])
 
 

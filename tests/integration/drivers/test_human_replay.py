@@ -12,6 +12,7 @@ from merge_runner.errors import UsageError
 from merge_runner.records import SIDES
 from merge_runner.results.store import Store, query
 from merge_runner.run.plan import make_plan
+from merge_runner.run.spec import spec_text
 from merge_runner.run.stored_replay import audit_database
 from merge_runner_analysis.humans.load import import_trials, sort_files
 from tests.support.driven_trials import driven_by
@@ -129,7 +130,7 @@ def test_a_study_names_the_pair(db, plan_of):
     text = HUMAN + '[drivers.second]\nprogram = "human-replay"\npair = "pair2"\n'
     plan = plan_of("second", text)
     assert driven_by(plan).merged_first == "right"
-    assert json.loads(plan.spec(plan.arms[0], "L_4_0"))["left"]["based_on"] == HUMAN_REPLAY
+    assert json.loads(spec_text(plan, plan.arms[0], "L_4_0"))["left"]["based_on"] == HUMAN_REPLAY
     unknown = "unknown pair of human-replay 'pair7'; valid: all, pair1, pair2"
     for changed, said in (
         (text.replace("pair2", "pair7"), unknown),

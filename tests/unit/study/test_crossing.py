@@ -7,6 +7,7 @@ import pytest
 from merge_runner.config import PERFECT
 from merge_runner.errors import UsageError
 from merge_runner.run.plan import make_plan
+from merge_runner.run.spec import spec_text
 
 HEAD = 'description = "x"\nrepetitions = 2\nconditions = ["N_0_0"]\n'
 
@@ -16,9 +17,8 @@ def arms(plan):
 
 
 def bodies(plan):
-    return {
-        json.loads(plan.spec(arm, "N_0_0"))["left"]["body"].get("temperature") for arm in plan.arms
-    }
+    texts = [spec_text(plan, arm, "N_0_0") for arm in plan.arms]
+    return {json.loads(text)["left"]["body"].get("temperature") for text in texts}
 
 
 def test_models_factors_and_prompts_are_crossed_and_named_by_what_varies(plan_of):

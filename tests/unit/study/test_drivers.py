@@ -7,6 +7,7 @@ import pytest
 
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.registry import using
+from merge_runner.run.spec import spec_text
 from merge_runner.study.file import StudyFile
 from merge_runner.study.parts import declared_catalogue
 from tests.support.braking import BRAKING
@@ -24,7 +25,7 @@ def plan_of(plan_of):
 
 def specs(plan):
     """What the spec of each arm says."""
-    return [json.loads(plan.spec(arm, "N_0_0")) for arm in plan.arms]
+    return [json.loads(spec_text(plan, arm, "N_0_0")) for arm in plan.arms]
 
 
 def hashes(plan):
