@@ -72,7 +72,7 @@ class Registry(Mapping[str, T]):
         """Make an empty table; messages call one of its things ``kind``."""
         self.kind = kind
         self._things: dict[str, T] = {}
-        self._complete = False
+        self.is_complete = False  # then installed packages alone add things
         self.made.append(self)
 
     def register(self, name: str, thing: T) -> T:
@@ -87,7 +87,7 @@ class Registry(Mapping[str, T]):
             raise UsageError(f"there is a {self.kind} {name!r} already")
         if _collecting.get():
             in_use().parts.setdefault(self.kind, {})[name] = thing
-        elif self._complete and not _installing.get():
+        elif self.is_complete and not _installing.get():
             raise UsageError(
                 f"the {self.kind} {name!r} comes too late: register it in a plug-in of a study "
                 "(`files` of [plugins]), by Study.register, or in a module that an installed "
@@ -96,10 +96,6 @@ class Registry(Mapping[str, T]):
         else:
             self._things[name] = thing
         return thing
-
-    def complete(self) -> None:
-        """Accept further things from installed packages alone."""
-        self._complete = True
 
     def require(self, name: str, hint: str = "") -> T:
         """Return the thing of this name; raise UsageError with the valid names."""
@@ -110,7 +106,7 @@ class Registry(Mapping[str, T]):
         """Parts of packages and of the study in use; ``register`` prevents equal names."""
         load_plugins()
         if not _installing.get():
-            self.complete()
+            self.is_complete = True
         return ChainMap(in_use().parts.get(self.kind, {}), self._things)
 
     def __getitem__(self, name: str) -> T:
@@ -225,7 +221,7 @@ def load_plugins() -> None:
             with installing():
                 _loaded[0] = _import_all()
             for registry in Registry.made:
-                registry.complete()
+                registry.is_complete = True
     if (failure := _loaded[0]) is not None:
         raise UsageError(str(failure)) from failure.__cause__
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from contextlib import closing
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from merge_runner.cli import options as cli
 from merge_runner.cli.options import agree, print_out
@@ -60,12 +60,14 @@ def ledger(
         print_out(json.dumps(rows, ensure_ascii=False))
         return
     why = [{"sweep": row["sweep"], **reason} for row in rows for reason in row.pop("reasons")]
-    text = "\n".join(filter(None, map(as_table, (_shown_spending(rows), why))))
+    kept = [name for name in rows[0] if any(row[name] for row in rows)] if rows else []
+    heads = {"open_attempts": "attempts of unknown cost"}
+    spent = [{heads.get(name, name): row[name] for name in kept} for row in rows]
+    text = "\n".join(filter(None, map(as_table, (spent, why))))
     print_out(f"{text}\n{APART}" if text else "Nothing is spent.")
 
 
 def _release(cache: ResponseCache, name: str, *, yes: bool) -> None:
-    """Release the reservations of a sweep, once the user agrees."""
     from merge_runner.llm.ledger import Ledger
 
     ledger = Ledger(cache, name)
@@ -84,10 +86,3 @@ def _release(cache: ResponseCache, name: str, *, yes: bool) -> None:
             "released; try again when it has ended"
         )
     ledger.release()
-
-
-def _shown_spending(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the rows for a reader: without columns that are 0 or empty in all of them."""
-    kept = [name for name in rows[0] if any(row[name] for row in rows)] if rows else []
-    heads = {"open_attempts": "attempts of unknown cost"}
-    return [{heads.get(name, name): row[name] for name in kept} for row in rows]

@@ -177,6 +177,8 @@ def _play_all(
     options: Options,
 ) -> int:
     """Play studies one after the other; return the first exit code that is not 0."""
+    from merge_runner.llm.models import shutdown_notes
+
     planned = [(name, plans(name)) for name in studies]
     if options.max_cost_usd is not None:  # one cap covers them all
         ledgers = [plan.ledger for _, made in planned for plan in made]
@@ -187,7 +189,12 @@ def _play_all(
             say(f"{name}:")
         files = [Path(name)] if name.endswith(".parquet") else []
         played = replace(options, recordings=(*files, *options.recordings))
-        codes += [play(plan, played) for plan in made]
+        for plan in made:
+            if not options.replay:
+                entries = {plan.registered[name]: entry for name, entry in plan.entries.items()}
+                for note in shutdown_notes(entries, datetime.now(UTC).date()):
+                    say(note)
+            codes.append(play(plan, played))
         # Trials that failed, or are not recorded, are no reason to leave the next sweep out.
         if codes[-1] not in (0, 1, 4):
             break
@@ -201,23 +208,18 @@ def _plans(name: str, *, selection: dict[str, Any], options: Options, trust: boo
     if name.endswith(".parquet"):
         from merge_runner.run.recorded_plans import recorded_plans
 
-        _check_whole(name, chosen=any(selection.values()), replay=options.replay)
+        if not options.replay:
+            raise UsageError(f"{name} is a recording: merge-runner replay {name}")
+        if any(selection.values()):
+            raise UsageError(
+                f"{name} is replayed as it was played: for a part of it, or other models, name "
+                f"its study: merge-runner replay STUDY --recording {name}"
+            )
         return [*recorded_plans(Path(name), db=options.db, trust=trust)]
     plan = make_plan(name, **selection, db=options.db, trust=trust)
     if options.dask is not None and plan.parts.replays_humans:
         raise UsageError("human-replay reads the database of this machine: leave --dask out")
     return [plan]
-
-
-def _check_whole(recording: str, *, chosen: bool, replay: bool) -> None:
-    """Raise UsageError unless a recording is replayed whole."""
-    if not replay:
-        raise UsageError(f"{recording} is a recording: merge-runner replay {recording}")
-    if chosen:
-        raise UsageError(
-            f"{recording} is replayed as it was played: for a part of it, or other models, name "
-            f"its study: merge-runner replay STUDY --recording {recording}"
-        )
 
 
 def _as_in_replay(parameter: inspect.Parameter) -> inspect.Parameter:
@@ -241,23 +243,12 @@ _parameters = inspect.signature(sweep, eval_str=True).parameters.values()
 replay.__signature__ = inspect.Signature([*map(_as_in_replay, _parameters)])  # type: ignore[attr-defined] # read by typer
 
 
-def _say_shutdowns(plan: Plan, options: Options) -> None:
-    from merge_runner.llm.models import shutdown_notes
-
-    if not options.replay:
-        entries = {plan.registered[name]: entry for name, entry in plan.entries.items()}
-        for note in shutdown_notes(entries, datetime.now(UTC).date()):
-            say(note)
-
-
 def _estimate(plan: Plan, options: Options, *, show_prompts: bool, as_json: bool) -> int:
-    """Print the estimate of a plan; return the exit code."""
     import asyncio
 
     from merge_runner.run import estimate_lines as lines
     from merge_runner.run.sweep import unsent
 
-    _say_shutdowns(plan, options)
     expected = asyncio.run(unsent(plan, options, say=say))
     if as_json:
         prompts = {"prompts": lines.shown_prompts(plan)} if show_prompts else {}
@@ -270,15 +261,12 @@ def _estimate(plan: Plan, options: Options, *, show_prompts: bool, as_json: bool
 
 
 def _play(plan: Plan, options: Options, *, whole: bool, yes: bool, as_json: bool) -> int:
-    """Play a plan; return the exit code."""
     import asyncio
 
     from merge_runner.run.estimate_lines import estimate_lines
     from merge_runner.run.interrupt import INTERRUPTED
     from merge_runner.run.summary import as_lines
     from merge_runner.run.sweep import play
-
-    _say_shutdowns(plan, options)
 
     def ask(expected: Estimate) -> None:
         lines = "\n".join(estimate_lines(expected))

@@ -204,7 +204,6 @@ class ClusterRunner:
                 self._lose(assignment, played)
 
     def _keep(self, assignment: Assignment, played: Played) -> None:
-        """Keep the results of a chunk."""
         plan = self._plan
         for model, meter in played.meters.items():
             self.meters[model].add(meter)

@@ -6,8 +6,8 @@ import logging
 import os
 import re
 import signal
-from collections.abc import AsyncIterator, Iterable, Iterator
-from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
+from collections.abc import AsyncIterator, Mapping
+from contextlib import AsyncExitStack, asynccontextmanager
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -31,28 +31,10 @@ VALID = (
 LOGGERS = ("distributed", "distributed.client", "tornado", "tornado.application")
 
 
-@contextmanager
-def _silenced(loggers: Iterable[logging.Logger]) -> Iterator[None]:
-    levels = [(logger, logger.level) for logger in loggers]
-    try:
-        for logger, _ in levels:
-            logger.setLevel(logging.CRITICAL + 1)
-        yield
-    finally:
-        for logger, level in levels:
-            logger.setLevel(level)
-
-
-@contextmanager
-def _environment_restored() -> Iterator[None]:
-    """Restore the environment after a ``with`` block: Dask sets variables for its children."""
-    before = {**os.environ}
-    try:
-        yield
-    finally:
-        for name in {*os.environ} - {*before}:
-            del os.environ[name]
-        os.environ.update(before)
+def _restore_environment(before: Mapping[str, str]) -> None:
+    for name in {*os.environ} - {*before}:
+        del os.environ[name]
+    os.environ.update(before)
 
 
 @asynccontextmanager
@@ -70,10 +52,12 @@ async def connected(where: str) -> AsyncIterator[Client]:
         ) from exc
 
     async with AsyncExitStack() as stack:
-        stack.enter_context(_silenced(map(logging.getLogger, LOGGERS)))
+        for logger in map(logging.getLogger, LOGGERS):
+            stack.callback(logger.setLevel, logger.level)
+            logger.setLevel(logging.CRITICAL + 1)
         scheduler = {"scheduler_file" if match["file"] else "address": where}
         if match["workers"]:
-            stack.enter_context(_environment_restored())
+            stack.callback(_restore_environment, {**os.environ})  # Dask sets some for its children
             os.environ["PYTHONSAFEPATH"] = "1"  # workers import nothing of this folder
             # A terminal's Ctrl-C reaches this process alone, which stops them in order: children
             # inherit what is blocked. The tracker, if it were started meanwhile, would unblock it.

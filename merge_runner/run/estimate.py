@@ -14,7 +14,7 @@ from merge_runner.llm.prices import BYTES_A_TOKEN, cost_usd
 from merge_runner.llm.templates import AnswerCounts, answer_counts, count_by_template
 from merge_runner.prompts.blocks import render_prompt
 from merge_runner.providers import ModelEntry
-from merge_runner.records import SIDES, Usage, canonical_json
+from merge_runner.records import Usage, canonical_json
 from merge_runner.run.options import Options
 from merge_runner.run.plan import Plan, usual_prompts
 from merge_runner.scenarios.merge.geometry import TRACK
@@ -43,7 +43,12 @@ def earlier_answers(plan: Plan, cache: ResponseCache) -> dict[str, Usage | None]
         for name in (name for name, known in requests.items() if known[:2] == request[:2]):
             counts = template.genuine and requests[name] == request
             sums[name] = sums.get(name, AnswerCounts()).plus(answers if counts else AnswerCounts())
-    return {name: _mean(answers) for name, answers in sums.items()}
+    usages: dict[str, Usage | None] = dict.fromkeys(sums)
+    for name, (_, measured, input_tokens, output_tokens) in sums.items():
+        if measured:
+            read, written = round(input_tokens / measured), round(output_tokens / measured)
+            usages[name] = Usage(input_tokens=read, output_tokens=written)
+    return usages
 
 
 def usual_latencies_s(
@@ -71,15 +76,6 @@ def _request_templates(plan: Plan) -> dict[str, tuple[str, str, str, str]]:
         sent = plan.parts.formats[entry.format].request(entry, "")
         requests[name] = entry.id, plan.endpoints[name], sent.path, canonical_json(sent.body)
     return requests
-
-
-def _mean(answers: AnswerCounts) -> Usage | None:
-    if not answers.measured:
-        return None
-    return Usage(
-        input_tokens=round(answers.input_tokens / answers.measured),
-        output_tokens=round(answers.output_tokens / answers.measured),
-    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,10 +252,9 @@ def prompts_of(plan: Plan, arm: Arm) -> dict[str, str]:
     world = World(scenario, plan.parts.conditions[plan.conditions[0]], TRACK)
     rest = (0.25,) * (scenario.plan_actions - scenario.executed_actions)
     seen = world.observe("left")
-    names = {arm.prompt(side) for side in SIDES if arm.full_names[side] in arm.entries}
     return {
         name: render_prompt(seen, rest, prompt=plan.parts.prompts[name], scenario=scenario)
-        for name in sorted(names)
+        for name in sorted({*arm.read_prompts.values()})
     }
 
 

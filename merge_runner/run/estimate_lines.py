@@ -12,33 +12,6 @@ from merge_runner.run.plan import Plan
 from merge_runner.text_safety import first_of
 
 
-def _output_caps(expected: Estimate) -> Iterator[str]:
-    """Yield the output caps, beyond which replies are cut off."""
-    caps = expected.output_caps
-    if caps:
-        same = len({*caps.values()}) == 1
-        most = [f"{n}{'' if same else f' with {model}'}" for model, n in caps.items()]
-        shown = ", ".join(most[:1] if same else most)
-        yield f"        a reply is cut off at {shown} output tokens (max_output_tokens)"
-
-
-def _by_model(expected: Estimate) -> Iterator[str]:
-    if len(expected.usd_by_model) > 1:
-        yield from (
-            f"        {name}: {usd_text(usd)}" for name, usd in expected.usd_by_model.items()
-        )
-
-
-def _by_cap(expected: Estimate) -> Iterator[str]:
-    """Yield the part of the run that the cap pays for, where it does not pay for all."""
-    left_usd, cost_usd = expected.left_usd, expected.cost_usd
-    if left_usd is not None and cost_usd and left_usd < cost_usd:
-        yield (
-            f"        stops at {left_usd:.2f} USD, about {100 * left_usd / cost_usd:.0f} % of it: "
-            f"what {expected.cap_source} leaves"
-        )
-
-
 def prompt_lines(plan: Plan) -> Iterator[str]:
     """Yield the blocks, in order, of each prompt with a text of the study's factors."""
     for name, prompt in plan.parts.prompts.items():
@@ -51,7 +24,7 @@ def shown_prompts(plan: Plan) -> list[dict[str, Any]]:
     readers: dict[tuple[str, str], list[str]] = {}
     for arm in plan.arms:
         for name, text in prompts_of(plan, arm).items():
-            sides = [s for s in SIDES if arm.full_names[s] in arm.entries and arm.prompt(s) == name]
+            sides = [side for side, read in arm.read_prompts.items() if read == name]
             drivers = "both drivers" if len(sides) == len(SIDES) else f"the {sides[0]} driver"
             readers.setdefault((name, text), []).append(f"{drivers} of {arm.label}")
     return [
@@ -82,7 +55,11 @@ def estimate_lines(expected: Estimate) -> Iterator[str]:
     yield f"trials  {expected.trials} to play"
     yield f"calls   about {expected.calls} not stored yet"
     yield f"tokens  {tokens}"
-    yield from _output_caps(expected)
+    if caps := expected.output_caps:
+        same = len({*caps.values()}) == 1
+        most = [f"{n}{'' if same else f' with {model}'}" for model, n in caps.items()]
+        shown = ", ".join(most[:1] if same else most)
+        yield f"        a reply is cut off at {shown} output tokens (max_output_tokens)"
     cost, time = usd_text(expected.cost_usd), f"{expected.minutes} minutes"
     if expected.rounds:
         cost += f" in batches; {usd_text(expected.singly_usd)} and {time} by normal requests"
@@ -91,6 +68,13 @@ def estimate_lines(expected: Estimate) -> Iterator[str]:
             "two days at most"
         )
     yield f"cost    {cost}"
-    yield from _by_model(expected)
-    yield from _by_cap(expected)
+    if len(expected.usd_by_model) > 1:
+        for model, usd in expected.usd_by_model.items():
+            yield f"        {model}: {usd_text(usd)}"
+    left_usd, cost_usd = expected.left_usd, expected.cost_usd
+    if left_usd is not None and cost_usd and left_usd < cost_usd:
+        yield (
+            f"        stops at {left_usd:.2f} USD, about {100 * left_usd / cost_usd:.0f} % of it: "
+            f"what {expected.cap_source} leaves"
+        )
     yield f"time    about {time}{'' if expected.rounds else ' for these calls'}"

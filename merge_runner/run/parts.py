@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from itertools import chain
 from typing import TYPE_CHECKING
 
 from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.llm.formats import FORMATS, WireFormat
 from merge_runner.prompts.blocks import Prompt, prompt_of
-from merge_runner.records import SIDES
 from merge_runner.registry import Catalogue, using
 from merge_runner.results.database import read_database
 from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
@@ -65,7 +63,7 @@ def find_parts(
     Raises UsageError, with a ``hint``, for an unknown name.
     """
     entries = {name: arm.entries.get(name) for arm in arms for name in arm.full_names.values()}
-    prompts = dict.fromkeys(chain.from_iterable(map(_read, arms)))
+    prompts = dict.fromkeys(name for arm in arms for name in arm.read_prompts.values())
     with using(catalogue):
         return Parts(
             {name: CONDITIONS.require(name, hint) for name in conditions},
@@ -74,8 +72,3 @@ def find_parts(
             {entry.format: FORMATS[entry.format] for entry in entries.values() if entry},
             catalogue,
         )
-
-
-def _read(arm: Arm) -> list[str]:
-    """Return the variants of the prompts that language models read in an arm."""
-    return [arm.prompt(side) for side in SIDES if arm.full_names[side] in arm.entries]

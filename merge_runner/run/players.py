@@ -34,7 +34,11 @@ async def open_player(
     first = FirstDecisions()
     if not options.keep_going:
         first = FirstDecisions(MOST_INVALID, one_by_one=rounds is None)
-        _count_stored(first, session, store)
+        labels = plan.by_label()
+        arms = {spec.spec_hash: labels[spec.arm] for spec in session.stored}
+        for spec_hash, side, *decisions in store.decisions_by_spec(arms) if arms else ():
+            if (model := arms[spec_hash].full_names[side]) in plan.entries:
+                first.add(model, *decisions)
     if options.dask is not None:
         client = await stack.enter_async_context(connected(options.dask))
         urls = base_urls(plan.entries)
@@ -48,11 +52,3 @@ async def open_player(
         stack.push_async_callback(rounds.close)
     in_flight = MOST_IN_ROUNDS if options.batch else options.in_flight
     return LocalRunner(plan, clients, in_flight, first, rounds, calls)
-
-
-def _count_stored(first: FirstDecisions, session: Session, store: Store) -> None:
-    labels = session.plan.by_label()
-    arms = {spec.spec_hash: labels[spec.arm] for spec in session.stored}
-    for spec_hash, side, *decisions in store.decisions_by_spec(arms) if arms else ():
-        if (model := arms[spec_hash].full_names[side]) in session.plan.entries:
-            first.add(model, *decisions)

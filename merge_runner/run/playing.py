@@ -59,13 +59,6 @@ class Endings:
             "same command again",
         )
 
-    def note_failed(self) -> None:
-        """Note the calls without a recorded reply, or else the number of failed trials."""
-        session, failed = self.progress.session, self.progress.outcome_counts["failed"]
-        session.fail_by_misses(self.misses)
-        if failed and not self.misses:
-            session.fail(1, f"{failed} trials failed")
-
 
 async def play_and_store(
     progress: Progress, writer: TrialWriter, stopping: Stopping
@@ -75,15 +68,18 @@ async def play_and_store(
     Returns whether the database can be written, and whether the task was cancelled. It cannot if
     Ctrl-C ends the wait for another program that holds it.
     """
-    endings = Endings(progress, writer)
+    session, endings = progress.session, Endings(progress, writer)
     progress.unstored = lambda: writer.problem
     try:
         cancelled = await _play(endings, stopping)
         endings.note_suspended()
     finally:
         progress.ended_at = datetime.now(UTC)
-        is_writable = await _store_rest(progress.session, writer, stopping)
-    endings.note_failed()
+        is_writable = await _store_rest(session, writer, stopping)
+    session.fail_by_misses(endings.misses)
+    failed = progress.outcome_counts["failed"]
+    if failed and not endings.misses:
+        session.fail(1, f"{failed} trials failed")
     return is_writable, cancelled
 
 

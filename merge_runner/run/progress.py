@@ -63,7 +63,6 @@ class Progress:
     doing: Literal["playing", "checking"] = "playing"
 
     def __post_init__(self) -> None:
-        """Count the missing trials."""
         self.todo = Counter(spec.arm for spec in self.session.todo)
 
     def meter(self) -> Meter:
@@ -86,6 +85,8 @@ class Progress:
         shares = self._shares()
         left_s = None if batches else self._left_s(elapsed_s, ended + failed, shares)
         stored = len(self.session.stored)
+        names = {model: f"{model}: " * (len(shares) > 1) for model in shares}
+        decided = [f"{names[m]}about {share:.0%} of the decisions" for m, share in shares.items()]
         before = f" (+{stored} stored before)" if stored else ""
         waiting = self.runner.waiting_for_money
         state = f"{max(0, self.runner.running_trials - waiting)} running{self.runner.place}"
@@ -100,7 +101,7 @@ class Progress:
         rows = [
             *dict.fromkeys(("WARNING", text) for text in self._warnings()),
             ("trials", trials),
-            *(("decided", text) for text in _decided(shares) if ended + failed < total),
+            *(("decided", text) for text in decided if ended + failed < total),
             ("failed", str(failed)),
             ("calls", calls_text(*meter.answered)),
             ("cost", cost),
@@ -177,11 +178,6 @@ class Progress:
             until = f" until {max(ends):%H:%M:%S} UTC" if ends else ""
             texts.append(f"{number} {reason}{until}")
         return first_of(texts, "other reasons", REASONS_SHOWN)
-
-
-def _decided(shares: Mapping[str, float]) -> Iterator[str]:
-    for model, share in shares.items():
-        yield f"{f'{model}: ' * (len(shares) > 1)}about {share:.0%} of the decisions"
 
 
 @asynccontextmanager

@@ -28,8 +28,7 @@ def recorded_plans(file: Path, *, db: Path, trust: bool) -> Iterator[Plan]:
     for row in sweep_rows(read_provenance(file)):
         try:
             name, config = str(row["name"]), dict(json.loads(row["config"]))
-            has_study = "study" in config
-            plan = Plan.model_validate(config) if has_study else None
+            plan = Plan.model_validate(config) if "study" in config else None
         except DAMAGED as exc:
             why = one_line(first_line(exc))
             raise RecordingError(f"{file} does not say what was played: {why}") from exc
@@ -38,19 +37,16 @@ def recorded_plans(file: Path, *, db: Path, trust: bool) -> Iterator[Plan]:
         elif plan.trials > MOST_TRIALS:
             raise RecordingError(f"{file} claims {plan.trials:,} trials")
         else:
-            plan = _with_parts(file, plan, db, trust=trust)
+            # The file is named in the question and in errors.
+            study = plan.study.model_copy(update={"path": file})
+            _, catalogue = load_study(study, trust=trust)
+            parts = find_parts(plan.arms, plan.conditions, catalogue).with_humans_of(db)
+            plan = plan.model_copy(update={"study": study, "parts": parts})
         if (text := plan.model_dump_json()) not in seen:
             seen.add(text)
             yield plan
     if not seen:
         raise RecordingError(f"{file} does not say what was played")
-
-
-def _with_parts(file: Path, plan: Plan, db: Path, *, trust: bool) -> Plan:
-    study = plan.study.model_copy(update={"path": file})  # named in the question and in errors
-    _, catalogue = load_study(study, trust=trust)
-    parts = find_parts(plan.arms, plan.conditions, catalogue).with_humans_of(db)
-    return plan.model_copy(update={"study": study, "parts": parts})
 
 
 def _of_a_known_study(file: Path, name: str, config: dict[str, object], db: Path) -> Plan:

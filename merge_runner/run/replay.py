@@ -30,7 +30,6 @@ class Replay:
     _ahead: dict[int, TrialRecord] = field(default_factory=dict)  # by order, until it is their turn
 
     def __post_init__(self) -> None:
-        """Make the models of the plan."""
         plan, formats = self.plan, self.plan.parts.formats
         self._trials = TrialMaker(plan)
         self._models = {

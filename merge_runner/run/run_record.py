@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
 from merge_runner.audit.checks import Audit, audited_database, check_sweep, sweep_facts
@@ -56,10 +55,18 @@ async def check(
     session: Session, store: Store, sweep_id: str, first: FirstDecisions
 ) -> tuple[dict[str, Any], Audit] | None:
     """Read the rows of an ended run back from the database, and audit them."""
-    ended_with, checked = session.exit_code, None
+    ended_with, checked, options = session.exit_code, None, session.options
+    keys = [spec.key for spec in (*session.stored, *session.todo)]
+
+    def read() -> tuple[dict[str, Any], Audit]:
+        with audited_database(store.path, sweep_id) as connection:
+            facts = sweep_facts(connection, sweep_id)
+            return facts, check_sweep(connection, sweep_id, keys, finished=ended_with == 0)
+
     try:
-        checked = await _read_back(session, store.path, sweep_id)
-        options = session.options
+        if not options.replay:
+            session.ledger.read()
+        checked = await in_thread(read)
         if not (session.exit_code or options.sends_nothing or options.keep_going):
             for line in first.without_a_valid_one():
                 session.fail(NoValidDecision.exit_code, line)
@@ -74,17 +81,3 @@ async def check(
     if session.exit_code != ended_with:
         end(session, store, sweep_id)
     return checked
-
-
-async def _read_back(session: Session, db: Path, sweep_id: str) -> tuple[dict[str, Any], Audit]:
-    keys = [spec.key for spec in (*session.stored, *session.todo)]
-    finished = session.exit_code == 0
-
-    def read() -> tuple[dict[str, Any], Audit]:
-        with audited_database(db, sweep_id) as connection:
-            facts = sweep_facts(connection, sweep_id)
-            return facts, check_sweep(connection, sweep_id, keys, finished=finished)
-
-    if not session.options.replay:
-        session.ledger.read()
-    return await in_thread(read)

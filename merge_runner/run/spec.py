@@ -52,18 +52,14 @@ def spec_text(plan: Plan, arm: Arm, condition: str) -> str:
 
 def _prompt_blocks(plan: Plan, arm: Arm) -> dict[str, str]:
     """Return the digests of the prompt's blocks; a block of one driver alone names its side."""
-    prompts = plan.parts.prompts
-    left, right = (
-        prompts[arm.prompt(side)].digests if arm.full_names[side] in arm.entries else None
-        for side in SIDES
-    )
-    if left is None or right is None:
-        return left or right or {}
-    both = left.items() & right.items()
+    digests = {side: plan.parts.prompts[name].digests for side, name in arm.read_prompts.items()}
+    if len(digests) < len(SIDES):
+        return next(iter(digests.values()), {})
+    both = digests["left"].items() & digests["right"].items()
     return dict(both) | {
         f"{name}@{side}": digest
-        for side, digests in (("left", left), ("right", right))
-        for name, digest in digests.items() - both
+        for side, blocks in digests.items()
+        for name, digest in blocks.items() - both
     }
 
 

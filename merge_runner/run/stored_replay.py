@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, nullcontext, suppress
 from dataclasses import dataclass, field, fields, replace
 from itertools import product
@@ -30,9 +30,8 @@ from merge_runner.records import (
     Attempt,
     CallFailed,
     ChatRequest,
-    Slot,
     Usage,
-    make_request,
+    canonical_json,
 )
 from merge_runner.registry import Catalogue, in_use, require, using
 from merge_runner.results.database import read_database
@@ -42,7 +41,6 @@ from merge_runner.run.parts import find_parts
 from merge_runner.run.plan import Plan
 from merge_runner.run.replay import Replay
 from merge_runner.run.spec import trial_id
-from merge_runner.study.arms import Arm
 from merge_runner.study.parts import declared_catalogue
 from merge_runner.text_safety import one_line
 from merge_runner.trial_records import TrialRecord, TrialSpec
@@ -111,16 +109,11 @@ def check_programs(path: Path, plan: Plan, stored: Sequence[TrialSpec]) -> None:
         name: sorted({*arm.full_names.values()} - {*arm.entries}) for name, arm in arms.items()
     }
     firsts = {spec.spec_hash: spec for spec in reversed(stored) if programs[spec.arm]}
-    by_key = {spec.key: spec for spec in firsts.values()}
-    if not by_key:
+    if not firsts:
         return
-    replies = StoredReplies(plan, arms)
-    replay = Replay(plan, replies)
     with read_database(path) as connection:
-        for key, tables in in_order(connection, by_key):
-            replies.spec, replies.rows = by_key[key], [*tables["calls"].named(key)]
-            record = replay.play_one(replies.spec)
-            driven, states = rows_of(record)["states"], tables["states"]
+        for record, tables in _played(connection, plan, firsts.values()):
+            key, driven, states = record.spec.key, rows_of(record)["states"], tables["states"]
             if record.failed_calls:  # a model saw another situation, and no stored reply is to that
                 step = states.names.index("step")
                 last = max((row[step] for row in driven), default=-1)
@@ -143,7 +136,6 @@ def _audit(
     *,
     finished: bool,
 ) -> Audit:
-    """Audit a sweep; its replies come from a cache, if there is one."""
     problems: list[Finding] = []
     notes: Counter[str] = Counter()
     planned: dict[str, str] = {}
@@ -173,7 +165,9 @@ def _audit(
         specs = _replayable(connection, plan, specs, audit, notes)
         audit.counts["replayed"] = len(specs)
         with using(plan.parts.catalogue):
-            audit.findings += _replay(connection, plan, specs, cache, sweep_id)
+            for record, tables in _played(connection, plan, specs, cache):
+                kind = "replay" if cache is None else "cache"
+                audit.findings += _findings(record, tables, kind, sweep_id)
     audit.notes += [f"not replayed: {count} trials, since {why}" for why, count in notes.items()]
     return audit
 
@@ -227,23 +221,19 @@ def _replayable(
     return [spec for spec in specs if hashes.get(spec.trial_id) == spec.spec_hash]
 
 
-def _replay(
+def _played(
     connection: duckdb.DuckDBPyConnection,
     plan: Plan,
-    specs: Sequence[TrialSpec],
-    cache: ResponseCache | None,
-    sweep_id: str,
-) -> list[Finding]:
-    """Play trials by the replies of a cache, or else the stored ones, and compare their rows."""
-    stored = StoredReplies(plan, plan.by_label())
+    specs: Iterable[TrialSpec],
+    cache: ResponseCache | None = None,
+) -> Iterator[tuple[TrialRecord, Mapping[str, Stored]]]:
+    """Play trials by the replies of a cache, or else the stored ones; yield them and their rows."""
+    stored = StoredReplies(plan)
     replay = Replay(plan, cache or stored)
     by_key = {spec.key: spec for spec in specs}
-    kind = "replay" if cache is None else "cache"
-    findings: list[Finding] = []
     for key, tables in in_order(connection, by_key):
         stored.spec, stored.rows = by_key[key], [*tables["calls"].named(key)]
-        findings += _findings(replay.play_one(stored.spec), tables, kind, sweep_id)
-    return findings
+        yield replay.play_one(stored.spec), tables
 
 
 @dataclass
@@ -251,45 +241,34 @@ class StoredReplies:
     """The replies in the table ``calls``: ``rows`` of one trial."""
 
     plan: Plan
-    arms: dict[str, Arm]
     spec: TrialSpec = field(init=False)
     rows: list[dict[str, Any]] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.arms = self.plan.by_label()
 
     def in_recording(self, _: str) -> bool:
         """Return False: a database is no recording."""
         return False
 
-    def get(self, key: str, _: ChatRequest | None = None) -> CachedCall | None:
+    def get(self, key: str, request: ChatRequest) -> CachedCall | None:
         """Return the call with this key, its replies read anew, or None.
 
         Raises RecordingError where its request does not have the key, and CallFailed where it
         ended without an answer.
         """
-        spec, arm = self.spec, self.arms[self.spec.arm]
         rows = sorted((r for r in self.rows if r["call_key"] == key), key=itemgetter("attempt"))
-        side: Any = rows[0]["side"] if rows else None
-        name = arm.full_names.get(side, "")
-        if name not in arm.entries:
+        if not rows:
             return None
-        entry = arm.entries[name]
-        form = self.plan.parts.formats[entry.format]
-        sent = form.request(entry, "")
         try:
-            request = make_request(
-                provider=entry.provider,
-                endpoint=self.plan.endpoints[name],
-                model=entry.id,
-                path=sent.path,
-                headers=sent.headers,
-                body=json.loads(rows[0]["request"]),
-                slot=Slot(
-                    spec.condition, spec.repetition, side, rows[0]["decision"], spec.sample_set
-                ),
-            )
+            body = canonical_json(json.loads(rows[0]["request"]))
         except DAMAGED as exc:
             raise RecordingError(f"its request cannot be read: {exc}") from exc
-        if request.key != key:
+        slot = request.slot
+        if (body, rows[0]["side"], rows[0]["decision"]) != (request.body, slot.side, slot.decision):
             raise RecordingError("its request and slot do not have the key")
+        arm = self.arms[self.spec.arm]
+        form = self.plan.parts.formats[arm.entries[arm.full_names[slot.side]].format]
         attempts = tuple(_attempt(n, row, form) for n, row in enumerate(rows, 1))
         if attempts[-1].outcome not in ANSWERS:
             message = attempts[-1].error or attempts[-1].outcome

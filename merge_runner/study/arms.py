@@ -61,6 +61,11 @@ class Arm:
         return self.prompts.get(side, self.variant)
 
     @property
+    def read_prompts(self) -> dict[Side, str]:
+        """The prompt variants that language models read, by side."""
+        return {s: self.prompt(s) for s in SIDES if self.full_names[s] in self.entries}
+
+    @property
     def is_mixed(self) -> bool:
         """True if the two drivers differ."""
         return self.sides["left"] != self.sides["right"]
@@ -237,7 +242,6 @@ def _number(entry: ModelEntry, parameter: str) -> float:
 
 
 def _scenario(file: StudyFile, levels: Levels, drivers: ArmDrivers) -> ScenarioConfig:
-    """Return the scenario of these levels for these drivers; raises UsageError."""
     programs = {n: PROGRAMS[n] for s, n in drivers.sides.items() if s not in drivers.entries}
     sides = [f"{PERCEPTION}_{side}" for side in SIDES]
     fields = ScenarioConfig.model_fields.keys() - {*sides}

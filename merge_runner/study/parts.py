@@ -280,7 +280,6 @@ def _run_plugin(name: str, file: str, source: str) -> None:
 
 
 def _variant(name: str, prompt: StudyPrompt) -> Variant:
-    """Return the prompt variant of a study's prompt; raises UsageError."""
     before = blocks_of(prompt.based_on)
     blocks = _changed(name, prompt, before)
     return Variant(
