@@ -163,7 +163,7 @@ def sweep(
         play = partial(_estimate, show_prompts=show_prompts, as_json=as_json)
     else:
         whole = any(size is not None for size in sizes.values())
-        play = partial(_play, whole=whole, yes=yes, as_json=as_json)
+        play = partial(_play_plan, whole=whole, yes=yes, as_json=as_json)
     plans = partial(_plans, selection=selection, options=options, trust=trust)
     # Trials leave no reference cycles, and to search those in memory would hold up the others.
     gc.set_threshold(1_000_000)
@@ -260,7 +260,7 @@ def _estimate(plan: Plan, options: Options, *, show_prompts: bool, as_json: bool
     return 0
 
 
-def _play(plan: Plan, options: Options, *, whole: bool, yes: bool, as_json: bool) -> int:
+def _play_plan(plan: Plan, options: Options, *, whole: bool, yes: bool, as_json: bool) -> int:
     import asyncio
 
     from merge_runner.run.estimate_lines import estimate_lines

@@ -201,7 +201,7 @@ async def begin_chunk(program: str, pickled: bytes, *, dask_worker: Worker) -> P
     state = _state(chunk.run, dask_worker)
     replies = state.replies = RelayedCache(chunk.plan.ledger, chunk.cap)
     replies.put_now(*chunk.recorded, [partial(replies.ledger.add_overruns, chunk.overruns)])
-    state.work = asyncio.create_task(_play(chunk, state))
+    state.work = asyncio.create_task(_play_chunk(chunk, state))
     return await go_on(chunk.run, [], dask_worker=dask_worker)
 
 
@@ -211,7 +211,7 @@ async def go_on(run: str, results: Sequence[Any], *, dask_worker: Worker) -> Pen
     return await state.replies.exchange(results) or await state.work
 
 
-async def _play(chunk: Chunk, state: WorkerRun) -> Played:
+async def _play_chunk(chunk: Chunk, state: WorkerRun) -> Played:
     replies, played = state.replies, Played()
 
     def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:

@@ -125,10 +125,9 @@ def estimate(
     endpoint, and ``latencies_s`` their median latencies, in place of the registry's.
     """
     all_calls = read = written = 0
-    usd = singly_usd = 0.0
-    by_model: defaultdict[str, float] = defaultdict(float)
-    busy_s: defaultdict[str, float] = defaultdict(float)
-    caps: defaultdict[str, int] = defaultdict(int)
+    singly_usd = 0.0
+    by_model, busy_s = defaultdict[str, float](float), defaultdict[str, float](float)
+    caps = defaultdict[str, int](int)
     at_once = min(options.connections, 2 * max(trials, 1))
     for label, arm in plan.by_label().items():
         for name, entry in arm.entries.items():
@@ -141,9 +140,7 @@ def estimate(
             read += number * (usage.input_tokens or 0)
             written += number * (usage.output_tokens or 0)
             singly_usd += number * call_usd
-            arm_usd = number * call_usd * _price_factor(entry, options.batch)
-            usd += arm_usd
-            by_model[model] += arm_usd
+            by_model[model] += number * call_usd * _price_factor(entry, options.batch)
             # An account's limits hold for a model, with whatever parameters it is asked.
             latency_s = latencies_s.get(name, entry.typical_latency_s)
             call_s = max(latency_s / at_once, _limited_s(options, entry, usage, latency_s))
@@ -155,7 +152,7 @@ def estimate(
         calls=all_calls,
         input_tokens=read,
         output_tokens=written,
-        cost_usd=_cents(usd),
+        cost_usd=_cents(sum(by_model.values(), 0.0)),
         singly_usd=_cents(singly_usd),
         minutes=round(max(busy_s.values(), default=0.0) / 60, 1),
         rounds=rounds if options.batch else 0,

@@ -112,14 +112,14 @@ class LocalRunner:
         async with self.first.turn(self.clients.keys() & models):
             self.running_trials += 1
             try:
-                return await self._play(spec)
+                return await self._ask_and_advance(spec)
             finally:
                 self.running_trials -= 1
                 self._open_questions.pop(spec.order, None)
                 for client in self.clients.values():
                     client.budget.leave(spec.order)
 
-    async def _play(self, spec: TrialSpec) -> TrialRecord:
+    async def _ask_and_advance(self, spec: TrialSpec) -> TrialRecord:
         """Ask all pending questions at once; an error of one driver cancels the others."""
         await self._next_round()
         trial = self._trials.make(spec)

@@ -71,7 +71,7 @@ async def play_and_store(
     session, endings = progress.session, Endings(progress, writer)
     progress.unstored = lambda: writer.problem
     try:
-        cancelled = await _play(endings, stopping)
+        cancelled = await _play_until_stopped(endings, stopping)
         endings.note_suspended()
     finally:
         progress.ended_at = datetime.now(UTC)
@@ -83,7 +83,7 @@ async def play_and_store(
     return is_writable, cancelled
 
 
-async def _play(endings: Endings, stopping: Stopping) -> bool:
+async def _play_until_stopped(endings: Endings, stopping: Stopping) -> bool:
     """Play trials until all have ended, or the run is stopped; return whether it is cancelled.
 
     Two tasks, since Ctrl-C stops the trials but lets the calls that are paid for end.
