@@ -57,15 +57,14 @@ def live_clients(
     """
     _check_money(plan, ledger)
     _allow_files(options.connections + SPARE_FILES)
-    connect = _connections(plan, options, {**os.environ, **(urls or {})}, rounds)
     limiters = {} if limiters is None else limiters
     # Models at one endpoint share its pauses: a server that is overloaded is so for all of them.
     pauses = {endpoint: Pause() for endpoint in plan.endpoints.values()}
-    transports = {}
     # Connections and limits belong to a model, with whatever parameters it is asked.
-    for model, name in {plan.registered[name]: name for name in plan.entries}.items():
-        transports[model] = connect(name)
-        stack.push_async_callback(transports[model].close)
+    names = {plan.registered[name]: name for name in plan.entries}
+    env = {**os.environ, **(urls or {})}
+    transports = _connect(names, plan, options, env, stack, rounds)
+    for model, name in names.items():
         rates = options.rates(plan.entries[name])
         rpm, tpm = (limit and max(1, int(limit * share)) for limit in rates)
         pause, place = pauses[plan.endpoints[name]], plan.entries[name].place
@@ -91,40 +90,42 @@ def live_clients(
     return clients
 
 
-def _connections(
-    plan: Plan, options: Options, env: Mapping[str, str], rounds: Rounds | None
-) -> Callable[[str], HttpTransport]:
-    """Return a function that connects to a model's endpoint, and gives the rounds its batch mode.
+def _connect(
+    names: Mapping[str, str],
+    plan: Plan,
+    options: Options,
+    env: Mapping[str, str],
+    stack: AsyncExitStack,
+    rounds: Rounds | None,
+) -> dict[str, HttpTransport]:
+    """Connect to each model's endpoint, and give the rounds its batch mode.
 
     The emulator answers in this process unless it has a URL.
     """
     from merge_runner.llm.http import HttpTransport
 
-    in_process = None
+    in_process, transports = None, {}
     if plan.scripted and not env.get("EMULATOR_BASE_URL"):
         from merge_runner.emulator.handler import Emulator
 
         in_process = Emulator().transport()
-
-    def connect(name: str) -> HttpTransport:
+    for model, name in names.items():
         entry = plan.entries[name]
         endpoint = resolve_endpoint(name, entry, env)
-        transport = HttpTransport(
+        transport = transports[model] = HttpTransport(
             endpoint,
             connections=options.connections,
             most_bytes=int(entry.max_reply_mb * 1e6),
             carrier=in_process if endpoint.provider == "emulator" else None,
         )
+        stack.push_async_callback(transport.close)
         if rounds is not None and batch_terms(entry) is not None:
-            service = SERVICES[entry.format](transport, endpoint, plan.parts.formats[entry.format])
-            rounds.services[plan.registered[name]] = service
-        return transport
-
-    return connect
+            wire = plan.parts.formats[entry.format]
+            rounds.services[model] = SERVICES[entry.format](transport, endpoint, wire)
+    return transports
 
 
 def _check_money(plan: Plan, ledger: Ledger) -> None:
-    """Raise UsageError where a price is unknown under a cap, or the ledger is damaged."""
     for name, entry in plan.entries.items():
         unknown = cost_usd(entry, Usage(input_tokens=1, output_tokens=1)) is None
         if ledger.cap is not None and unknown:

@@ -71,9 +71,7 @@ class Replay:
             if capacity is not None:
                 await capacity()
             await asyncio.sleep(0)
-            self.running_trials = 1
             ended(spec, self.play_one(spec))
-            self.running_trials = 0
 
     async def drain(self) -> None:
         """Do nothing: no call is in flight."""
