@@ -76,26 +76,26 @@ class Trial:
 
     def record(self) -> TrialRecord:
         """Return the trial up to now as a record."""
-        world, failures = self._world, self._failures
-        failed = [side for side in SIDES if side in failures]
+        world = self._world
+        failures = {side: self._failures[side] for side in SIDES if side in self._failures}
         return TrialRecord(
             spec=self._spec,
             status="failed" if failures else world.status or "failed",
             merged_first=None if failures else world.merged_first(),
             end_time_s=world.time_s,
-            error="; ".join(f"{side}: {failures[side]}" for side in failed) or None,
+            error="; ".join(f"{side}: {failure}" for side, failure in failures.items()) or None,
             states=world.states(),
             decisions=tuple(self._rows),
             failed_calls=tuple(
                 FailedCall(
                     self._states[side].number,
                     side,
-                    failures[side].request,
-                    failures[side].attempts,
-                    failures[side].cached_attempts,
-                    missed=isinstance(failures[side], ReplayMiss),
+                    failure.request,
+                    failure.attempts,
+                    failure.cached_attempts,
+                    missed=isinstance(failure, ReplayMiss),
                 )
-                for side in failed
+                for side, failure in failures.items()
             ),
         )
 

@@ -7,6 +7,7 @@ import inspect
 import json
 import shlex
 import sys
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
@@ -24,8 +25,6 @@ from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
 from merge_runner.text_safety import say
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
     from merge_runner.run.estimate import Estimate
     from merge_runner.run.options import Options
     from merge_runner.run.plan import Plan

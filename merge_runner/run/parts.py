@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from merge_runner.drivers.registry import PROGRAMS, Program
@@ -16,9 +17,6 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
 from merge_runner.study.arms import Arm
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from pathlib import Path
-
     from duckdb import DuckDBPyConnection
 
 
