@@ -1,19 +1,9 @@
-"""Records of attempts at calls, and their counts for the display."""
+"""Counts of calls and attempts, for the display."""
 
 from __future__ import annotations
 
 from collections import Counter, deque
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING
-
-from merge_runner.llm.ledger import TOLERANCE_USD
-from merge_runner.records import SCRIPTED_HEADER, Attempt, says_scripted
-
-if TYPE_CHECKING:
-    from merge_runner.llm.budget import Reservation
-    from merge_runner.llm.call import Call
-    from merge_runner.llm.endpoint_state import EndpointState
-    from merge_runner.llm.sender import Sent
 
 
 @dataclass(slots=True)
@@ -49,46 +39,3 @@ class Meter:
         """Add the counts of another meter."""
         for name in (counted.name for counted in fields(self)):
             setattr(self, name, getattr(self, name) + getattr(other, name))
-
-
-def record(
-    call: Call,
-    number: int,
-    sent: Sent,
-    usd: float | None,
-    reservation: Reservation,
-    endpoint: EndpointState,
-    meter: Meter,
-) -> Attempt:
-    """Record and count attempt ``number`` of a call, which has just ended."""
-    outcome = sent.outcome
-    raw, reading = outcome.raw, outcome.reading
-    attempt = Attempt(
-        number=number,
-        outcome=outcome.name,
-        http_status=raw.status if raw else None,
-        model_served=reading.model_served,
-        finish_reason=reading.finish_reason,
-        usage=reading.usage,
-        reply=raw.body if raw else None,
-        error=outcome.message,
-        started_at=sent.began.isoformat(timespec="milliseconds"),
-        latency_s=sent.took_s and round(sent.took_s, 4),
-        cost_usd=usd,
-        scripted=raw is not None and (SCRIPTED_HEADER in raw.headers or says_scripted(raw.body)),
-        batch_id=sent.batch_id,
-    )
-    call.attempts.append(attempt)
-    meter.outcomes[attempt.outcome] += 1
-    meter.cost_usd += usd or 0.0
-    meter.cost_unknown += usd is None
-    if reading.service_tier in endpoint.underpriced_tiers:
-        meter.underpriced[reading.service_tier] += 1
-    # The reservation is 0 where a user has released it meanwhile.
-    if reservation.usd and (usd or 0.0) > reservation.usd + TOLERANCE_USD:
-        meter.notes.append(
-            f"{endpoint.driver}: {call.label.slot}: the reply cost {usd:.4f} USD, and "
-            f"{reservation.usd:.4f} were reserved for it: the server does not keep to the cap of "
-            f"{endpoint.entry.max_output_tokens} output tokens. More is reserved from now on"
-        )
-    return attempt

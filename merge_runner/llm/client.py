@@ -17,21 +17,27 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from merge_runner.drivers.language_model import Question
-from merge_runner.errors import MergeRunnerError, RecordingError, SweepStopped
-from merge_runner.llm.attempts import Meter, record
+from merge_runner.errors import RecordingError, SweepStopped
+from merge_runner.llm.attempts import Meter
 from merge_runner.llm.budget import Budget, Reservation
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.call import LONG_WAIT_S, Call, Calls, Wait
 from merge_runner.llm.delays import TryAgain, next_wait_s
 from merge_runner.llm.endpoint_state import EndpointState
-from merge_runner.llm.http_outcome import AttemptOutcome
-from merge_runner.llm.ledger import CallLabel
+from merge_runner.llm.ledger import TOLERANCE_USD, CallLabel
 from merge_runner.llm.prices import attempt_usd, worst_case
-from merge_runner.llm.probe import Probe
 from merge_runner.llm.recorded import RecordedReplies
-from merge_runner.llm.sender import DirectSender
+from merge_runner.llm.sender import DirectSender, Sent
 from merge_runner.llm.store import Attempts, CachedCall
-from merge_runner.records import Attempt, CallFailed, ChatReply, ChatRequest, Decision
+from merge_runner.records import (
+    SCRIPTED_HEADER,
+    Attempt,
+    CallFailed,
+    ChatReply,
+    ChatRequest,
+    Decision,
+    says_scripted,
+)
 
 if TYPE_CHECKING:
     from merge_runner.llm.batch.rounds import BatchSender
@@ -58,7 +64,7 @@ class LlmClient:
     calls: Calls = field(default_factory=Calls)
     meter: Meter = field(default_factory=Meter)
     replies: RecordedReplies = field(init=False)
-    probe: Probe = field(init=False)
+    _alone: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     def __post_init__(self) -> None:
         """Make the parts that all calls share."""
@@ -66,7 +72,6 @@ class LlmClient:
         self.replies = RecordedReplies(
             endpoint.name, entry, endpoint.identity, endpoint.wire, self.cache, self.meter
         )
-        self.probe = Probe(endpoint, self.calls, self.meter)
 
     async def answer(self, question: Question, *, order: int = 0) -> Decision:
         """Return the decision of the model's reply; lower ``order`` is served first.
@@ -155,9 +160,38 @@ class LlmClient:
         if self.batch is not None and call.pending_batch:
             self.batch.resume(call)
         elif not self.endpoint.verified:
-            async with self.probe.turn(call):
-                return await self._until_answered(call)
+            return await self._probe(call)
         return await self._until_answered(call)
+
+    async def _probe(self, call: Call) -> ChatReply:
+        """Make a call alone until the first accepted reply, so that a wrong key costs one call."""
+        self.calls.wait(call, Wait(f"for the first reply of {self.endpoint.driver}"))
+        await self._alone.acquire()
+        call.wait = None
+        if self.endpoint.verified:
+            self._alone.release()
+            return await self._until_answered(call)
+        call.is_probe = True
+        note = asyncio.get_running_loop().call_later(LONG_WAIT_S, self._note_probe, call)
+        is_released = True
+        try:
+            return await self._until_answered(call)
+        except SweepStopped:
+            is_released = False  # the next call would only be refused in the same way
+            raise
+        finally:
+            note.cancel()
+            if is_released:
+                self._alone.release()
+
+    def _note_probe(self, call: Call) -> None:
+        driver, entry = self.endpoint.driver, self.endpoint.entry
+        left = timedelta(seconds=entry.deadline_s - LONG_WAIT_S)
+        last = f"after {call.last_failure}" if call.own_attempts else "nothing has come yet"
+        self.meter.notes.append(
+            f"{driver}: {call.label.slot}: the first call of this run waits for its reply "
+            f"until {datetime.now(UTC) + left:%H:%M:%S} UTC, {last}"
+        )
 
     async def _quarantine(self, call: Call) -> None:
         key = call.request.key
@@ -226,28 +260,54 @@ class LlmClient:
         with closing(reservation):
             sent = await sender.send(call, number, reservation)
             usd = attempt_usd(sent, call.worst, self.endpoint, sender.price_factor)
-            attempt = record(call, number, sent, usd, reservation, self.endpoint, self.meter)
+            attempt = self._record(call, number, sent, usd, reservation.usd)
+            attempts = tuple(call.attempts)
             error = sent.error or self.endpoint.error_of(call, sent.outcome)
-            return await self._finish(call, reservation, attempt, sent.outcome, error)
-
-    async def _finish(
-        self,
-        call: Call,
-        reservation: Reservation,
-        attempt: Attempt,
-        outcome: AttemptOutcome,
-        error: MergeRunnerError | None,
-    ) -> ChatReply:
-        """Keep the last attempt and book its cost; return its answer, or raise the error."""
-        attempts, key = tuple(call.attempts), call.request.key
-        if error is not None:
-            keep = partial(self.cache.keep_attempts, key, attempts)
-            await reservation.book(attempt, keep)  # before the error, which may end the run
-            raise error
-        answered = CachedCall(call.request, attempts)
-        self.calls.answered.add(key)  # before others can find the reply in the cache
-        kept = await reservation.book(attempt, partial(self.cache.keep, answered))
+            if error is not None:
+                keep = partial(self.cache.keep_attempts, key, attempts)
+                await reservation.book(attempt, keep)  # before the error, which may end the run
+                raise error
+            answered = CachedCall(call.request, attempts)
+            self.calls.answered.add(key)  # before others can find the reply in the cache
+            kept = await reservation.book(attempt, partial(self.cache.keep, answered))
         if kept is not answered:  # an import has stored another reply first, which is used
             return self.replies.read(kept)
-        text = outcome.reading.text
+        text = sent.outcome.reading.text
         return ChatReply(text, attempt.outcome, call.request, attempts, call.earlier_attempts)
+
+    def _record(
+        self, call: Call, number: int, sent: Sent, usd: float | None, reserved_usd: float
+    ) -> Attempt:
+        """Record and count attempt ``number`` of a call, which has just ended."""
+        outcome, meter, endpoint = sent.outcome, self.meter, self.endpoint
+        raw, reading = outcome.raw, outcome.reading
+        attempt = Attempt(
+            number=number,
+            outcome=outcome.name,
+            http_status=raw.status if raw else None,
+            model_served=reading.model_served,
+            finish_reason=reading.finish_reason,
+            usage=reading.usage,
+            reply=raw.body if raw else None,
+            error=outcome.message,
+            started_at=sent.began.isoformat(timespec="milliseconds"),
+            latency_s=sent.took_s and round(sent.took_s, 4),
+            cost_usd=usd,
+            scripted=raw is not None
+            and (SCRIPTED_HEADER in raw.headers or says_scripted(raw.body)),
+            batch_id=sent.batch_id,
+        )
+        call.attempts.append(attempt)
+        meter.outcomes[attempt.outcome] += 1
+        meter.cost_usd += usd or 0.0
+        meter.cost_unknown += usd is None
+        if reading.service_tier in endpoint.underpriced_tiers:
+            meter.underpriced[reading.service_tier] += 1
+        # The reservation is 0 where a user has released it meanwhile.
+        if reserved_usd and (usd or 0.0) > reserved_usd + TOLERANCE_USD:
+            meter.notes.append(
+                f"{endpoint.driver}: {call.label.slot}: the reply cost {usd:.4f} USD, and "
+                f"{reserved_usd:.4f} were reserved for it: the server does not keep to the cap of "
+                f"{endpoint.entry.max_output_tokens} output tokens. More is reserved from now on"
+            )
+        return attempt
