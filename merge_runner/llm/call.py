@@ -11,7 +11,7 @@ from merge_runner.llm.ledger import CallLabel
 from merge_runner.records import Attempt, CallFailed, ChatReply, ChatRequest, Usage
 
 if TYPE_CHECKING:
-    from merge_runner.llm.batch.notes import Batch
+    from merge_runner.llm.batch.lifecycle import Batch
 
 LONG_WAIT_S = 5.0  # a shorter wait is over before a note of it is read
 

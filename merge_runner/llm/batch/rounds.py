@@ -18,9 +18,11 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 
+from pydantic import ValidationError
+
 from merge_runner.errors import RecordingError
-from merge_runner.llm.batch.lifecycle import Lifecycle, no_result
-from merge_runner.llm.batch.notes import PREFIX, Batch, BatchNote, BatchRequest, noted_batches
+from merge_runner.llm.batch.lifecycle import PREFIX, Batch, BatchNote, BatchRequest, no_result
+from merge_runner.llm.batch.service import BatchService
 from merge_runner.llm.budget import Reservation
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.call import Call, Wait
@@ -41,7 +43,9 @@ class Rounds:
 
     A run that does not ``submit`` only takes what earlier runs have submitted. ``batches`` are all
     that calls of its ``models`` wait in, by mark, the oldest first; ``pending`` has, by key of a
-    call, the batch in which its last attempt waits since an earlier run.
+    call, the batch in which its last attempt waits since an earlier run. ``max_calls`` is set for a
+    model after its provider has rejected a batch as too large; such a model has one open batch at a
+    time.
     """
 
     def __init__(
@@ -52,21 +56,25 @@ class Rounds:
         submits: bool,
         say: Callable[[str], None],
     ) -> None:
+        self.cache = cache
         self.submits = submits
-        self._cache = cache
-        self._forming: list[BatchRequest] = []
-        self.batches, last = noted_batches(cache, models)
-        self._numbers = itertools.count(last + 1)
-        self._lifecycle = Lifecycle(cache, self.batches, say, submits)
-        self.services = self._lifecycle.services
-        self.pending: dict[str, Batch] = {}
-        for batch in self.batches.values():
-            self.pending |= dict.fromkeys(batch.note.lines, batch)
-        self.pending = {key: b for key, b in self.pending.items() if not self._has_ended(key, b)}
-        ended = self.batches.keys() - {batch.note.mark for batch in self.pending.values()}
-        cache.run_now([partial(cache.remove, PREFIX + mark) for mark in ended])
-        for mark in ended:
-            del self.batches[mark]
+        self.say = say
+        self.services: dict[str, BatchService] = {}
+        self.max_calls: dict[str, int] = {}
+        self._forming: defaultdict[str, list[BatchRequest]] = defaultdict(list)
+        notes = []
+        for name in cache.names(PREFIX):
+            with contextlib.suppress(RecordingError, ValidationError):  # a damaged note is ignored
+                notes.append(BatchNote.model_validate_json(cache.read(name) or ""))
+        notes.sort(key=lambda note: (note.number, note.submitted_at))
+        self._numbers = itertools.count(max((note.number for note in notes), default=0) + 1)
+        noted = [Batch(self, note) for note in notes if note.model in models]
+        last = {key: batch for batch in noted for key in batch.note.lines}
+        self.pending = {key: b for key, b in last.items() if not self._has_ended(key, b)}
+        is_open = {*self.pending.values()}
+        self.batches = {batch.note.mark: batch for batch in noted if batch in is_open}
+        ended = [PREFIX + batch.note.mark for batch in noted if batch not in is_open]
+        cache.run_now([partial(cache.remove, name) for name in ended])
 
     async def outcome_of(
         self,
@@ -80,9 +88,13 @@ class Rounds:
 
         Raises TrialSuspended where its money cannot be reserved.
         """
-        batch = batch or await self._next_round(request, number, reservation, model)
         while True:
-            await asyncio.shield(batch.work or self._lifecycle.start(batch))
+            if batch is None:
+                next_batch: asyncio.Future[Batch] = asyncio.get_running_loop().create_future()
+                waiting = BatchRequest(request, number, reservation, next_batch)
+                self._forming[model].append(waiting)
+                batch = await next_batch
+            await asyncio.shield(batch.work or batch.start())
             if without_money := batch.suspended.get(request.key):
                 raise without_money
             outcome = batch.results.pop(request.key, batch.default)
@@ -91,7 +103,7 @@ class Rounds:
             if outcome is not None:
                 self.pending.pop(request.key, None)
                 return outcome, batch
-            batch = await self._next_round(request, number, reservation, model)
+            batch = None
 
     async def watch(self, is_idle: Callable[[], bool]) -> None:
         """Close each round as soon as all trials wait, by ``is_idle``."""
@@ -99,7 +111,7 @@ class Rounds:
             await asyncio.sleep(IDLE_POLL_S)
             for _ in range(IDLE_TURNS):
                 await asyncio.sleep(0)
-                if not (self._forming and is_idle()):
+                if not (any(self._forming.values()) and is_idle()):
                     break
             else:
                 self._close_round()
@@ -109,7 +121,17 @@ class Rounds:
         return [
             f"{len(note.lines)} calls of {note.model} wait in batch {note.batch_id or 'to be'} "
             f"since {note.submitted_at:%H:%M:%S} UTC"
-            for note in (batch.note for batch in self._lifecycle.open_batches())
+            for note in (batch.note for batch in self.open_batches())
+        ]
+
+    def open_batches(self, model: str | None = None) -> list[Batch]:
+        """Return the batches that have not ended: they take room at their provider."""
+        return [
+            batch
+            for batch in self.batches.values()
+            if (work := batch.work) and model in (None, batch.note.model)
+            # A batch whose task was cancelled goes on at its provider.
+            if work.cancelled() or not work.done()
         ]
 
     async def close(self) -> None:
@@ -121,33 +143,20 @@ class Rounds:
 
     def _has_ended(self, key: str, batch: Batch) -> bool:
         with contextlib.suppress(RecordingError):  # damaged: its attempts are unknown
-            entry, attempts = self._cache.look_up(key)
+            entry, attempts = self.cache.look_up(key)
             outcomes = {attempt.number: attempt.outcome for attempt in attempts}
             return entry is not None or outcomes.get(batch.note.lines[key], "unknown") != "unknown"
         return False
 
-    async def _next_round(
-        self, request: ChatRequest, number: int, reservation: Reservation, model: str
-    ) -> Batch:
-        batch: asyncio.Future[Batch] = asyncio.get_running_loop().create_future()
-        self._forming.append(BatchRequest(request, number, reservation, model, batch))
-        return await batch
-
     def _close_round(self) -> None:
         """Submit the gathered requests in batches, each of one model."""
-        by_model: defaultdict[str, list[BatchRequest]] = defaultdict(list)
-        for attempt in self._forming:
-            if not attempt.batch.done():  # its call is not given up
-                by_model[attempt.model].append(attempt)
-        self._forming = []
-        max_calls = self._lifecycle.max_calls
-        for model, requests in by_model.items():
-            most = max_calls.get(model, MAX_CALLS)
-            if model in max_calls:  # one batch at a time; the others wait for the next round
-                now = 0 if self._lifecycle.open_batches(model) else most
-                self._forming += requests[now:]
-                del requests[now:]
-            for at in range(0, len(requests), most):
+        for model, gathered in self._forming.items():
+            requests = [each for each in gathered if not each.batch.done()]  # done: it is given up
+            most, now = self.max_calls.get(model, MAX_CALLS), len(requests)
+            if model in self.max_calls:  # one batch at a time; the others wait for the next round
+                now = 0 if self.open_batches(model) else most
+            self._forming[model] = requests[now:]
+            for at in range(0, len(requests[:now]), most):
                 self._submit(model, requests[at : at + most])
 
     def _submit(self, model: str, requests: Sequence[BatchRequest]) -> None:
@@ -158,8 +167,8 @@ class Rounds:
             submitted_at=datetime.now(UTC),
             lines={attempt.request.key: attempt.number for attempt in requests},
         )
-        batch = self.batches[note.mark] = Batch(note)
-        self._lifecycle.start(batch, requests)
+        batch = self.batches[note.mark] = Batch(self, note)
+        batch.start(requests)
         for attempt in requests:
             attempt.batch.set_result(batch)
 
