@@ -88,14 +88,6 @@ class ResponseCache(CallStore):
         """Store the attempts of a call that has no answer yet. Runs in a transaction."""
         self.replace(UNANSWERED + key, ATTEMPTS.dump_json(attempts).decode(), execute)
 
-    def _unanswered(self, key: str) -> Attempts:
-        return attempts_of(self.read(UNANSWERED + key) or "[]")
-
-    def all_unanswered(self) -> dict[str, Attempts]:
-        """Return the attempts of all calls without an answer, by call key."""
-        keys = (name.removeprefix(UNANSWERED) for name in self.names(UNANSWERED))
-        return {key: self._unanswered(key) for key in keys}
-
     def entries(self, left_out: list[str] | None = None) -> Iterator[CachedCall]:
         """Yield all verified entries, of the folder and of the recording.
 
@@ -142,9 +134,10 @@ class ResponseCache(CallStore):
         Returns the names of what was damaged.
         """
         damaged = []
-        for name, check in ((key, self._entry), (UNANSWERED + key, self._unanswered)):
+        for name, check in ((key, partial(verified, key)), (UNANSWERED + key, attempts_of)):
             try:
-                check(key)
+                if (text := self.read(name)) is not None:
+                    check(text)
             except RecordingError:
                 damaged.append(name)
                 self._quarantine_row(name, execute)

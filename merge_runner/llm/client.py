@@ -246,9 +246,8 @@ class LlmClient:
         sender: DirectSender | BatchSender = self.direct
         if self.batch is not None and self.batch.takes(call):
             sender = self.batch
-        label, key = call.label, call.request.key
-        if sender.price_factor != 1.0:
-            label = label._replace(worst_usd=label.worst_usd * sender.price_factor)
+        key, worst_usd = call.request.key, call.label.worst_usd * sender.price_factor
+        label = call.label._replace(worst_usd=worst_usd)
         if self.calls.stopping or not (call.trials or call.pending_batch):
             raise self.calls.given_up(call)
         if call.pending_batch:

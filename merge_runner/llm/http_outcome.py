@@ -113,7 +113,7 @@ class RawReply:
 
     @property
     def kind(self) -> str:
-        """Kind of a body that is no answer: a name of ``rejections.REASONS``, or ``text``."""
+        """Kind of a body that is no answer: a name of ``endpoint_state.REASONS``, or ``text``."""
         if self.payload is not None:
             return "other_format"
         if self._is("content-type", "text/event-stream") or _EVENTS.match(self.body):
@@ -162,7 +162,7 @@ class AttemptOutcome(NamedTuple):
     ``accept`` it as the answer, ``retry`` after ``delay_s`` (``pause``: all calls to the endpoint
     wait), ``fail`` this call, or stop the sweep because the ``quota`` is exhausted or the endpoint
     has ``rejected`` the key or the model. Without a ``raw`` reply, ``charged`` says whether the
-    attempt may have been billed, and ``reason`` why there is none, for ``rejections.reason_of``.
+    attempt may have been billed, and ``reason``, of ``endpoint_state.REASONS``, why there is none.
     """
 
     action: Action

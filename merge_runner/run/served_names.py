@@ -64,9 +64,9 @@ def _is_newest(cache: ResponseCache, model: str, endpoint: str) -> bool:
 async def _served_name(name: str, entry: ModelEntry, *, say: Callable[[str], None]) -> str:
     """Return the one model that a server lists; raises ProviderDown and UsageError."""
     # Imported here, since no replay needs them, and httpx takes long to load.
+    from merge_runner.llm.endpoint_state import if_nobody, set_base_url
     from merge_runner.llm.http import LIST_TIMEOUT_S, listed_models
     from merge_runner.llm.http_outcome import TransportFailure
-    from merge_runner.llm.rejections import if_nobody, set_base_url
 
     endpoint = resolve_endpoint(name, entry)
     driver = driver_name(name, endpoint.identity)

@@ -4,10 +4,10 @@ from datetime import date
 import pytest
 
 from merge_runner.errors import UsageError
+from merge_runner.llm.endpoint_state import if_nobody
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import url_of
 from merge_runner.llm.models import read_models, shutdown_notes, with_parameter
-from merge_runner.llm.rejections import if_nobody
 from merge_runner.providers import (
     PROVIDERS,
     ModelEntry,

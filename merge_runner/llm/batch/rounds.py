@@ -28,7 +28,6 @@ from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.call import Call, Wait
 from merge_runner.llm.http_outcome import AttemptOutcome
 from merge_runner.llm.sender import Sent
-from merge_runner.records import ChatRequest
 
 # Poll interval of the idle check: only idleness closes a round, never the time.
 IDLE_POLL_S = 0.05
@@ -77,17 +76,13 @@ class Rounds:
         cache.run_now([partial(cache.remove, name) for name in ended])
 
     async def outcome_of(
-        self,
-        request: ChatRequest,
-        number: int,
-        reservation: Reservation,
-        model: str,
-        batch: Batch | None,
+        self, call: Call, number: int, reservation: Reservation, model: str
     ) -> tuple[AttemptOutcome, Batch]:
-        """Return the outcome of an attempt in the ``batch`` where it waits, or in the next round.
+        """Return the outcome of an attempt in the batch where it waits, or in the next round.
 
         Raises TrialSuspended where its money cannot be reserved.
         """
+        request, batch = call.request, call.pending_batch
         while True:
             if batch is None:
                 next_batch: asyncio.Future[Batch] = asyncio.get_running_loop().create_future()
@@ -196,9 +191,7 @@ class BatchSender:
     async def send(self, call: Call, number: int, reservation: Reservation) -> Sent:
         """Wait for the outcome of attempt ``number`` in its batch or in the next round."""
         call.wait = Wait(f"for batches of {self.model}", blocked=True, charged=True)
-        outcome, batch = await self.rounds.outcome_of(
-            call.request, number, reservation, self.model, call.pending_batch
-        )
+        outcome, batch = await self.rounds.outcome_of(call, number, reservation, self.model)
         call.wait, call.pending_batch, call.bypass_batch = None, None, True
         note = batch.note
         return Sent(outcome, note.submitted_at, batch_id=note.batch_id or None, error=batch.error)

@@ -290,7 +290,9 @@ async def test_a_call_in_flight_that_nobody_waits_for_any_more_is_not_tried_agai
     client.direct.transport.open.set()
     await asyncio.wait([call.task])
     assert len(client.direct.transport.sent) == 1
-    (attempts,) = cache.all_unanswered().values()
+    assert cache.names("attempts ") == [f"attempts {call.request.key}"]
+    entry, attempts = cache.look_up(call.request.key)
+    assert entry is None
     assert outcomes(attempts) == ["overloaded"]
 
 

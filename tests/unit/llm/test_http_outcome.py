@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from merge_runner.errors import UsageError
 from merge_runner.llm.delays import server_delay_s
+from merge_runner.llm.endpoint_state import reason_of, why_rejected
 from merge_runner.llm.formats import FORMATS, Reading, WireFormat, WireRequest
 from merge_runner.llm.http_outcome import RawReply, judge, may_be_charged
-from merge_runner.llm.rejections import reason_of, why_rejected
 from merge_runner.providers import ModelEntry
 from merge_runner.records import Usage
 from tests.support.cases import by_format, cases, table
