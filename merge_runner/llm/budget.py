@@ -29,7 +29,7 @@ from functools import partial
 
 from merge_runner.errors import TrialSuspended
 from merge_runner.llm.durable import Execute, ResultT
-from merge_runner.llm.ledger import TOLERANCE_USD, CallLabel, Ledger, reserved_usd_of
+from merge_runner.llm.ledger import TOLERANCE_USD, CallLabel, Ledger
 from merge_runner.llm.store import both
 from merge_runner.records import Attempt
 
@@ -60,13 +60,6 @@ class Reservation:
         self.budget.open_reservations += 1
         self.budget.queued_usd += self.usd if self.queued else 0.0
         self._take(self.usd)
-
-    @classmethod
-    def resume(cls, budget: Budget, trial: int, key: str, label: CallLabel) -> Reservation:
-        """Return the reservation of an attempt that an earlier run, of any sweep, has begun."""
-        return cls(
-            budget, trial, key, label, reserved_usd_of(budget.ledger.store, key), queued=False
-        )
 
     async def begin(self, number: int) -> None:
         """Reserve in the ledger, right before the attempt is sent.

@@ -24,7 +24,7 @@ from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.call import LONG_WAIT_S, Call, Calls, Wait
 from merge_runner.llm.delays import TryAgain, next_wait_s
 from merge_runner.llm.endpoint_state import EndpointState
-from merge_runner.llm.ledger import TOLERANCE_USD, CallLabel
+from merge_runner.llm.ledger import TOLERANCE_USD, CallLabel, reserved_usd_of
 from merge_runner.llm.prices import attempt_usd, worst_case
 from merge_runner.llm.recorded import RecordedReplies
 from merge_runner.llm.sender import DirectSender, Sent
@@ -157,8 +157,10 @@ class LlmClient:
             call.wait = None
         if call.damaged:
             await self._quarantine(call)
-        if self.batch is not None and call.pending_batch:
-            self.batch.resume(call)
+        if call.pending_batch:  # its attempt there is not over
+            end = call.pending_batch.note.lines[call.request.key]
+            call.attempts = [a for a in call.attempts if a.number < end]
+            call.earlier_attempts = len(call.attempts)
         elif not self.endpoint.verified:
             return await self._probe(call)
         return await self._until_answered(call)
@@ -251,15 +253,16 @@ class LlmClient:
         if self.calls.stopping or not (call.trials or call.pending_batch):
             raise self.calls.given_up(call)
         if call.pending_batch:
-            reservation = Reservation.resume(self.budget, call.order, key, label)
+            usd = reserved_usd_of(self.cache, key)  # by an earlier run, of any sweep
+            reservation = Reservation(self.budget, call.order, key, label, usd, queued=False)
         else:
             call.wait = Wait(NO_MONEY, blocked=True)
             reservation = await self.budget.reserve(call.trials, key, label, is_probe=call.is_probe)
         number = len(call.attempts) + 1
         with closing(reservation):
             sent = await sender.send(call, number, reservation)
-            usd = attempt_usd(sent, call.worst, self.endpoint, sender.price_factor)
-            attempt = self._record(call, number, sent, usd, reservation.usd)
+            cost_usd = attempt_usd(sent, call.worst, self.endpoint, sender.price_factor)
+            attempt = self._record(call, number, sent, cost_usd, reservation.usd)
             attempts = tuple(call.attempts)
             error = sent.error or self.endpoint.error_of(call, sent.outcome)
             if error is not None:

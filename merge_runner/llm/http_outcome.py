@@ -134,15 +134,14 @@ class RawReply:
 
 
 class TransportFailure(MergeRunnerError):
-    """An attempt without a reply; ``outcome`` names the failure in the table of calls.
+    """An attempt without a reply, with its ``outcome``.
 
     ``sent`` is False if the request was certainly not sent, and so cannot be billed.
-    AttemptOutcome explains ``action`` and ``reason``.
     """
 
     def __init__(
         self,
-        outcome: str,
+        name: str,
         message: str,
         *,
         sent: bool = True,
@@ -150,10 +149,7 @@ class TransportFailure(MergeRunnerError):
         reason: str | None = None,
     ) -> None:
         super().__init__(message)
-        self.outcome = outcome
-        self.sent = sent
-        self.action = action
-        self.reason = reason
+        self.outcome = AttemptOutcome(action, name, message, charged=sent, reason=reason)
 
 
 class AttemptOutcome(NamedTuple):

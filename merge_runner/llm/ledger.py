@@ -182,23 +182,21 @@ class Ledger:
         return committed_usd
 
     def refresh(self, execute: Execute) -> None:
-        """Sum after all earlier writes, some of which read() might miss. Runs in a transaction."""
-        self._sum_once(execute)
-        self.committed_usd = self._in_transaction_usd
+        """Sum, once before the first change of this ledger in a transaction.
 
-    def _sum_once(self, execute: Execute) -> None:
-        """Sum before the first change of this ledger in a transaction."""
+        This counts all earlier writes, some of which read() might miss.
+        """
         if self.store.summed is not self:
             self._in_transaction_usd = self._sum(execute(_SUMS, (self.scope, self._others)))
             self.store.summed = self
+        self.committed_usd = self._in_transaction_usd
 
     def reserve(
         self, key: str, number: int, usd: float, label: CallLabel, execute: Execute
     ) -> bool:
         """Reserve an attempt's worst case; False if it exceeds the cap. Runs in a transaction."""
-        self._sum_once(execute)
+        self.refresh(execute)
         if self.cap is not None and (self._in_transaction_usd + usd > self.cap.usd + TOLERANCE_USD):
-            self.committed_usd = self._in_transaction_usd
             return False
         since = datetime.now(UTC).isoformat(timespec="milliseconds")
         place = (label.driver, label.slot, label.worst_usd, since, "in flight")
@@ -218,7 +216,7 @@ class Ledger:
         if usd is None:  # it may have been charged
             execute(_KEEP, (attempt.outcome, key, attempt.number))
             return
-        self._sum_once(execute)
+        self.refresh(execute)
         closed = execute(_CLOSE, (key, attempt.number)).fetchall()
         # No row: a user has released it. The reservation of a batch is of the sweep that sent it.
         scope, reserved_usd, worst_usd = closed[0] if closed else (self.scope, usd, usd)

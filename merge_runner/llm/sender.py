@@ -61,9 +61,7 @@ class DirectSender:
             raw = await self.transport.send(call.request, attempt=number, timeout_s=timeout_s)
             outcome = judge(raw, self.wire)
         except TransportFailure as exc:
-            outcome = AttemptOutcome(
-                exc.action, exc.outcome, str(exc), charged=exc.sent, reason=exc.reason
-            )
+            outcome = exc.outcome
         took_s = clock_s() - began_s
         call.left_s -= took_s
         usage = outcome.reading.usage

@@ -77,7 +77,7 @@ async def _served_name(name: str, entry: ModelEntry, *, say: Callable[[str], Non
         listed = await listed_models(endpoint)
         models = ", ".join(listed) or "no model"
     except TransportFailure as exc:
-        if exc.outcome == "no_connection":
+        if exc.outcome.name == "no_connection":
             raise ProviderDown(f"{driver}: {exc}: {if_nobody(entry)}") from exc
         wrong = f"; if that is another server, {set_base_url(entry)}"
         listed, models = [], f"models that it does not list ({exc}{wrong})"

@@ -181,13 +181,6 @@ class BatchSender:
         is_new = self.rounds.submits and not call.bypass_batch
         return is_new or call.pending_batch is not None
 
-    def resume(self, call: Call) -> None:
-        """Remove a pending batch's attempt from the recorded attempts of a call."""
-        if call.pending_batch is not None:
-            end = call.pending_batch.note.lines[call.request.key]
-            call.attempts = [a for a in call.attempts if a.number < end]
-            call.earlier_attempts = len(call.attempts)
-
     async def send(self, call: Call, number: int, reservation: Reservation) -> Sent:
         """Wait for the outcome of attempt ``number`` in its batch or in the next round."""
         call.wait = Wait(f"for batches of {self.model}", blocked=True, charged=True)

@@ -197,8 +197,8 @@ class BatchService(ABC):
         except TransportFailure as exc:
             # A reply that is refused for its content will be the same next time.
             kinds: dict[str, FailureKind] = {"rejected": "rejected", "fail": "lost"}
-            kind = kinds.get(exc.action, "again")
-            raise BatchFailed(kind, str(exc), sent=exc.sent) from exc
+            kind = kinds.get(exc.outcome.action, "again")
+            raise BatchFailed(kind, str(exc), sent=exc.outcome.charged) from exc
         if 200 <= raw.status < 300:
             return raw
         failure = self._failure_of(raw.error, gone)

@@ -222,7 +222,7 @@ async def test_no_reply_in_time_is_a_timeout_also_where_it_stalls_in_its_body(em
     hanging = await emulator(FaultPlan(rates={"hang": 1.0}))
     async with raw_server(b'HTTP/1.1 200 OK\r\ncontent-length: 99\r\n\r\n{"id": ') as stalling:
         for url in (f"{hanging}/v1", stalling.url):
-            assert (await failed(endpoint_at(url), timeout_s=0.1)).outcome == "timeout"
+            assert (await failed(endpoint_at(url), timeout_s=0.1)).outcome.name == "timeout"
 
 
 async def test_a_timeout_gives_its_connection_back(recorder):
@@ -242,13 +242,14 @@ async def test_a_timeout_gives_its_connection_back(recorder):
 async def test_a_broken_connection_is_a_lost_one(emulator, fault):
     url = await emulator(FaultPlan(rates={fault: 1.0}))
     failure = await failed(endpoint_at(f"{url}/v1"))
-    assert (failure.outcome, failure.sent) == ("connection_lost", True)
+    assert failure.outcome[:2] == ("retry", "connection_lost")
+    assert failure.outcome.charged
     assert str(failure)
 
 
 async def test_a_refused_connection_cannot_be_charged(dead_port):
     failure = await failed(endpoint_at(f"http://127.0.0.1:{dead_port}"))
-    assert (failure.outcome, failure.sent) == ("no_connection", False)
+    assert (failure.outcome.name, failure.outcome.charged) == ("no_connection", False)
 
 
 OK = b"HTTP/1.1 200 OK\r\n"
@@ -274,7 +275,7 @@ async def test_a_reply_that_cannot_be_read_is_a_transport_failure(raw, why):
         failure = await failed(endpoint_at(url))
     assert why in str(failure)
     if why:
-        assert (failure.reason, failure.sent) == ("unreadable_reply", True)
+        assert (failure.outcome.reason, failure.outcome.charged) == ("unreadable_reply", True)
 
 
 async def test_connections_are_kept_alive_while_a_model_thinks(recorder, monkeypatch):
@@ -309,7 +310,8 @@ async def test_a_proxy_that_does_not_connect_has_sent_nothing(
     async with server_that_says(answer_of_the_proxy) as url:
         monkeypatch.setenv("HTTPS_PROXY", url)
         told = await failed(endpoint_at("https://llm.invalid/v1"))
-    assert (told.outcome, told.action, told.sent) == (outcome, action, False)
+    assert told.outcome[:2] == (action, outcome)
+    assert not told.outcome.charged
     assert words in str(told)
 
 

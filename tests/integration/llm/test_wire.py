@@ -26,7 +26,7 @@ async def ask(transport, number=0, timeout_s=5.0):
     try:
         reply = await transport.send(a_request(number), attempt=1, timeout_s=timeout_s)
     except TransportFailure as exc:
-        return exc.outcome
+        return exc.outcome.name
     return json.loads(reply.body)["choices"][0]["message"]["content"]
 
 

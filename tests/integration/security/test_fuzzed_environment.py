@@ -75,7 +75,7 @@ async def asked(variables):
     with pytest.raises(TransportFailure) as failure:
         await transport.send(a_request(), attempt=1, timeout_s=5)
     await transport.close()
-    return failure.value.outcome
+    return failure.value.outcome.name
 
 
 @given(ENVIRONMENTS)

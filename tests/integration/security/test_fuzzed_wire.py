@@ -64,7 +64,7 @@ def answered():
         try:
             return (await transport.send(a_request(), attempt=1, timeout_s=0.1)).status
         except TransportFailure as exc:
-            return exc.outcome
+            return exc.outcome.name
 
     async def say(talk, _):
         await talk.say(answers[0])
