@@ -67,7 +67,6 @@ class LlmClient:
     _alone: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     def __post_init__(self) -> None:
-        """Make the parts that all calls share."""
         endpoint, entry = self.endpoint, self.endpoint.entry
         self.replies = RecordedReplies(
             endpoint.name, entry, endpoint.identity, endpoint.wire, self.cache, self.meter
@@ -280,7 +279,6 @@ class LlmClient:
     def _record(
         self, call: Call, number: int, sent: Sent, usd: float | None, reserved_usd: float
     ) -> Attempt:
-        """Record and count attempt ``number`` of a call, which has just ended."""
         outcome, meter, endpoint = sent.outcome, self.meter, self.endpoint
         raw, reading = outcome.raw, outcome.reading
         attempt = Attempt(

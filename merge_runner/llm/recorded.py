@@ -56,7 +56,6 @@ class RecordedReplies:
     own_names: frozenset[str | None] = field(init=False)
 
     def __post_init__(self) -> None:
-        """Derive the names that a reply may give its model."""
         self.own_names = frozenset({None, self.entry.id, *self.entry.aliases})
 
     def answer(self, question: Question) -> Decision:

@@ -146,7 +146,7 @@ class Rounds:
     def _close_round(self) -> None:
         """Submit the gathered requests in batches, each of one model."""
         for model, gathered in self._forming.items():
-            requests = [each for each in gathered if not each.batch.done()]  # done: it is given up
+            requests = [r for r in gathered if not r.batch.done()]  # their calls are not given up
             most, now = self.max_calls.get(model, MAX_CALLS), len(requests)
             if model in self.max_calls:  # one batch at a time; the others wait for the next round
                 now = 0 if self.open_batches(model) else most
