@@ -8,11 +8,13 @@ from tests.support.studies import SCENARIO, Drive, Said, played
 
 NO_PLAN = Said(failure="no_array")
 EXAMPLES = {
-    "both insisted": ("N_0_0", (0.5,) * 5, (0.4,) * 5, None),
-    "both gave way": ("N_0_0", (-0.5,) * 3, (-0.55,) * 3, None),
-    "one too little": ("N_0_0", (), (0.12,) * 4, None),
-    "no action": ("N_0_0", (), (0.02,) * 5, None),
-    "invalid plan": ("N_0_0", (0.5,) * 5, (0.4,) * 5, {1: NO_PLAN}),
+    "nobody braked, both sped up": ("N_0_0", (0.5,) * 5, (0.4,) * 5, None),
+    "both braked": ("N_0_0", (-0.5,) * 3, (-0.55,) * 3, None),
+    "nobody braked, one sped up": ("N_0_0", (), (0.12,) * 4, None),
+    "nobody braked or sped up": ("N_0_0", (), (0.02,) * 5, None),
+    # Its vehicle is still faster than at the start when they collide.
+    "one braked": ("N_0_0", (0.5,) * 5, (0.5, 0.5, -0.3), None),
+    "no valid plan": ("N_0_0", (0.5,) * 5, (0.4,) * 5, {1: NO_PLAN}),
     "near miss": ("N_0_0", (0.12,) * 3, (-0.1,) * 3, None),
     "long wait": ("L_4_0", (-0.9,) * 3 + (0.0, 0.3), (-1.0,) * 3, None),
     None: ("L_4_0", (0.4,) * 3, (-0.4,) * 3, None),

@@ -15,7 +15,7 @@ from merge_runner.scenarios.merge.world import World
 from merge_runner_analysis import wording
 from merge_runner_analysis.published import published
 from merge_runner_analysis.stats.regressions import GAP_MARGIN_M
-from merge_runner_analysis.web import export, report, search
+from merge_runner_analysis.web import export, report
 from merge_runner_analysis.web.pages import conditions
 from merge_runner_analysis.web.trial import account
 from tests.support.harness import PROJECT
@@ -25,15 +25,16 @@ ENTRY = ModelEntry(provider="local", format="openai-chat", max_output_tokens=1)
 SEEN = [World(UNSET, CONDITIONS[n], TRACK).observe(s) for n in HUMAN_CONDITIONS for s in SIDES]
 AWAY_M = [seen.distance_to_merge_m for seen in SEEN]
 PASSES = 100 * published("human_ceiling").set_index(["n", "indicator", "rule"])["share"]
+ACTS_MPS2 = account.HOLDS * UNSET.max_acceleration_mps2
 CLAIMS = f"""
 batches: at most {rounds.MAX_CALLS:,} requests. At most {players.MOST_IN_ROUNDS:,} trials
 batches: no batch can be created for {lifecycle.OUTAGE_S / 60:g} minutes
 batches: by its name for {sum(lifecycle.ARRIVAL_S):g} s
 explorer: pages of up to {export.MOST:,} trials
 explorer: traces of up to {conditions.MOST} trials
-explorer: beyond {search.HOLDS * 100:g} % of the maximum
-explorer: initial speed by at least {account.ACTED_MPS:g} m/s
-explorer: gap below {account.NEAR_GAP_M:g} m, or a time to collision below {account.NEAR_TTC_S:g} s
+explorer: beyond {account.HOLDS * 100:g} % of the maximum
+glossary: beyond {account.HOLDS * 100:g} % of the greatest acceleration (usually {ACTS_MPS2:g} m/s²)
+glossary: gap below {account.NEAR_GAP_M:g} m, or a time to collision below {account.NEAR_TTC_S:g} s
 models: waits {delays.FIRST_BACKOFF_S:g} s, doubled each time up to {delays.LONGEST_BACKOFF_S:g} s
 models: (default {ENTRY.timeout_s:g}), of a call with its retries and waits ({ENTRY.deadline_s:g})
 models: longer replies are refused ({ENTRY.max_reply_mb:g})

@@ -13,9 +13,6 @@ UNKNOWN = "no meaning is known here"
 PLAIN = {
     "collided": "crashed",
     "timeout": "timed out",
-    "no action": "neither acted",
-    "one too little": "different actions",
-    "invalid plan": "no valid plan",
     "fallbacks": "some without a valid plan",
     "no decision": "nobody decided",
     "mocks": "mock models",

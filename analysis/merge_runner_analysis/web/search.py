@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from merge_runner_analysis.web.reading import records
+from merge_runner_analysis.web.trial.account import HOLDS
 from merge_runner_analysis.web.trial_index import TrialIndex, facets_of, where_of
 
 PAGE = 50
@@ -15,8 +16,6 @@ LONGEST = 65_536  # characters of a text that are searched
 MOST_TERMS, LONGEST_QUERY = 12, 300
 TERM = re.compile(r'"([^"]*)"?|([^\s"]+)')
 SHOWN, BEFORE = 600, 200  # characters that are shown of a text, and of these before a match
-# Within this part of the greatest acceleration a driver holds its speed, beyond it goes or brakes.
-HOLDS = 0.08
 FACETS = ("tactical", "planned", "driven", "switch", "failure", "sweep", "model", "variant",
           "condition", "outcome", "account", "tag")  # fmt: skip
 # In figures: the least or the most of a mean, as a part of the greatest acceleration.

@@ -37,7 +37,7 @@ def accounts(tmp_path_factory):
 @pytest.mark.parametrize(
     ("account", "heading", "too_late"),
     [
-        ("both insisted", "Why it crashed", [(1.6, "left"), (2.0, "right")]),
+        ("nobody braked, both sped up", "Why it crashed", [(1.6, "left"), (2.0, "right")]),
         ("near miss", "Why it came close", []),
         ("long wait", "Why it took so long", []),
         (None, "", []),

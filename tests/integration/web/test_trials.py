@@ -43,7 +43,10 @@ def accounts(tmp_path_factory):
     """A trial of each account by o3, and one each of two other drivers and a human pair."""
     path = tmp_path_factory.mktemp("accounts") / "t.duckdb"
     write_study(path, [*(drive(account) for account in EXAMPLES), CLOSING_IN])
-    others = [played(drive("both insisted", "o4")), played(drive("no action", "human"))]
+    others = [
+        played(drive("nobody braked, both sped up", "o4")),
+        played(drive("nobody braked or sped up", "human")),
+    ]
     Store(path).write("sweep-1", others, patience_s=5)
     as_humans(path)
     return path
@@ -92,15 +95,17 @@ def test_each_trial_has_its_account_by_which_it_is_counted_filtered_and_download
     assert counts == {
         **{("o3", "baseline", account): 1 for account in EXAMPLES if account},
         ("o5", "baseline", "near miss"): 1,
-        ("o4", "baseline", "both insisted"): 1,
-        ("human", None, "no action"): 1,
+        ("o4", "baseline", "nobody braked, both sped up"): 1,
+        ("human", None, "nobody braked or sped up"): 1,
     }
-    assert ("both insisted", 2) in trial_index.facets({})["account"]
+    assert ("nobody braked, both sped up", 2) in trial_index.facets({})["account"]
     client = client_of(accounts)
     page = Page(client.get("/trials?account=near+miss&model=o3").text)
     assert ("near miss (1)" in page.text, len(page.to("/trials/o3/"))) == (True, 1)
-    rows = csv.DictReader(io.StringIO(client.get("/trials.csv?account=both+insisted").text))
-    assert [row["account"] for row in rows] == ["both insisted"] * 2
+    rows = csv.DictReader(
+        io.StringIO(client.get("/trials.csv?account=nobody+braked,+both+sped+up").text)
+    )
+    assert [row["account"] for row in rows] == ["nobody braked, both sped up"] * 2
 
 
 def test_the_list_follows_the_database_beside_which_it_leaves_nothing_and_a_long_one_stands(
@@ -132,14 +137,14 @@ def test_the_list_follows_the_database_beside_which_it_leaves_nothing_and_a_long
 def test_a_collision_that_cannot_be_judged_is_listed_without_an_account_until_another_is_stored(
     tmp_path, lacking
 ):
-    path = write_study(tmp_path / "t.duckdb", [drive("no action")])
+    path = write_study(tmp_path / "t.duckdb", [drive("nobody braked or sped up")])
     damage(path, lacking)
     trial_index = read(path)
     (row,) = trial_index.every({})
     assert (row["outcome"], row["account"]) == ("collided", None)
-    Store(path).write("sweep-1", [played(drive("invalid plan", "o4"))], patience_s=5)
+    Store(path).write("sweep-1", [played(drive("no valid plan", "o4"))], patience_s=5)
     trial_index.refresh()
-    assert {row["account"] for row in trial_index.counts({}, "account")} == {"invalid plan", None}
+    assert {row["account"] for row in trial_index.counts({}, "account")} == {"no valid plan", None}
 
 
 def test_people_and_each_driver_are_summed_up_apart(listing):

@@ -2,16 +2,22 @@
 
 import pytest
 
-from merge_runner_analysis.web.trial.account import Mark, account
+from merge_runner.config import ScenarioConfig
+from merge_runner_analysis.web.trial.account import Mark, account, collision_class
 from tests.support.crashes import EXAMPLES, course_of, crash, decided, drive
 from tests.support.studies import played
 
 WORDS = {
-    "both insisted": "Both insisted: both had sped up. At 2.0 s, the last moment at which one "
-    "driver alone could have avoided it (the right one, by braking), the left "
-    "vehicle was 2.5 m/s faster and the right one 2.0 m/s faster than at the start; 0.5 m/s or "
-    "more count as acting.",
-    "no action": "Neither acted.",
+    "nobody braked, both sped up": "Nobody braked, both sped up: the left driver sped up and never "
+    "braked, the right one sped up and never braked. Accelerations beyond 0.2 m/s² count.",
+    "one braked": "One braked: the left driver sped up and never braked, the right one sped up, "
+    "and first braked at 2.0 s. Accelerations beyond 0.2 m/s² count.",
+    "both braked": "Both braked: the left driver first braked at 0.0 s, the right one first braked",
+    "nobody braked, one sped up": "Nobody braked, one sped up: the left driver neither braked nor "
+    "sped up, the right one sped up and never braked.",
+    "nobody braked or sped up": "Nobody braked or sped up: the left driver neither braked nor sped",
+    "no valid plan": "A driver drove without a valid plan when its braking could last have helped: "
+    "the left driver sped up and never braked, the right one",
     "near miss": "It came close: the gap was 0.42 m at the first merge, then the time to collision "
     "fell to 0.90 s.",
     "long wait": "The first vehicle reached the merge point after 12.50 s: 2 times as long as at "
@@ -37,7 +43,7 @@ def test_an_account_begins_with_what_the_trial_is_an_example_of(name):
 
 
 def test_of_each_driver_it_says_what_would_have_helped():
-    left, right = told("both insisted").sentences[1:]
+    left, right = told("nobody braked, both sped up").sentences[1:]
     assert left == (
         "Until 1.6 s the left driver could have avoided it by braking at 2.0 m/s² from then on."
     )
@@ -62,7 +68,7 @@ def test_of_each_driver_it_says_what_would_have_helped():
     ],
 )  # fmt: skip
 def test_what_would_have_helped_is_said_of_how_the_vehicle_drove(side, left, right, mark, text):
-    found = account(*crash("N_0_0", left, right), {"account": "one too little"})
+    found = account(*crash("N_0_0", left, right), {"account": "both braked"})
     assert (side, mark) in [(one.side, one.text) for one in found.marks]
     at_s, doing = text
     said = f"Until {at_s} s the {side} driver could have avoided it by {doing} from then on."
@@ -71,19 +77,19 @@ def test_what_would_have_helped_is_said_of_how_the_vehicle_drove(side, left, rig
 
 def test_a_last_moment_to_speed_up_is_named_and_marked_apart_from_those_to_brake():
     plans = (0.2, 0.2, 0.0, -0.6, 0.2, -0.6), (-0.2, -0.4, -0.2, 0.6, 0.2, 0.0)
-    found = account(*crash("N_0_0", *plans), {"account": "one too little"})
-    until = "At 6.4 s, the last moment at which one driver alone could have avoided it"
-    assert f"{until} (the left one, by speeding up)," in found.sentences[0]
+    found = account(*crash("N_0_0", *plans), {"account": "both braked"})
+    by = "the left driver could have avoided it by speeding up as hard as it could."
+    assert found.sentences[-1] == f"Until 6.4 s {by}"
     assert Mark(pytest.approx(6.4), "left", "last chance", "last moment to speed up") in found.marks
 
 
 def test_a_change_of_mind_is_marked_once():
-    course, decisions = crash(*EXAMPLES["both insisted"])
+    course, decisions = crash(*EXAMPLES["nobody braked, both sped up"])
     for decision in decisions:
         at = decision["decision"]
         decision["tactical"] = ("Y", "M", "M")[at] if decision["side"] == "left" else "M"
         decision["fallback"] = (decision["side"], at) == ("right", 1)
-    found = account(course, decisions, {"account": "both insisted"})
+    found = account(course, decisions, {"account": "nobody braked, both sped up"})
     assert found.marks == [
         Mark(0.0, "left", "choice", "chooses to yield"),
         Mark(0.0, "right", "choice", "chooses to merge"),
@@ -92,3 +98,16 @@ def test_a_change_of_mind_is_marked_once():
         Mark(1.6, "left", "last chance", "last moment to brake"),
         Mark(2.0, "right", "last chance", "last moment to brake"),
     ]
+
+
+def test_a_vehicle_that_only_rolls_does_not_brake_and_may_roll_on():
+    drag = ScenarioConfig(resistance="human")
+    rolling = crash("N_0_0", (0.0,) * 12, (0.0,) * 12, scenario=drag)
+    assert rolling[0].driven_mps2("left", 0) == pytest.approx(-1.0)
+    assert collision_class(*rolling) == "nobody braked or sped up"
+    # Less than the resistance of 1 m/s² keeps a vehicle from speeding up.
+    slower = crash("N_0_0", (0.2,) * 12, (0.2, 0.2, -0.09) + (0.2,) * 9, scenario=drag)
+    assert collision_class(*slower) == "one braked"
+    plans = (0.6, 0.0, 0.2, 0.0, 0.2), (0.0, 0.6, -0.2, -0.4, 0.2)
+    found = account(*crash("N_0_0", *plans, scenario=drag), {"account": "one braked"})
+    assert "could have avoided it by letting the vehicle roll from then on" in found.sentences[2]

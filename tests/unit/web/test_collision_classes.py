@@ -17,10 +17,11 @@ from merge_runner_analysis.web.trial.account import (
     COLLISIONS,
     SPEEDING_UP,
     collision_class,
-    judged_at,
+    last_escape,
 )
 from tests.support.crashes import EXAMPLES, NO_PLAN, crash
 
+BOTH_SPED_UP = "nobody braked, both sped up"
 INSISTING = ("N_0_0", (0.5,) * 5, (0.4,) * 5)
 SCENARIOS = {
     "usual": ScenarioConfig(),
@@ -30,8 +31,8 @@ SCENARIOS = {
 }
 
 # Supplement S1 of doi 10.1093/pnasnexus/pgae420: causes of the collisions in 990 human and 990
-# simulated trials. "Same action" is both insisted or both gave way, "no action" both passive, and
-# "one too little" one passive or too little.
+# simulated trials. "Same action" is that both sped up or both slowed down, "no action" that both
+# were passive, and "one too little" that one was passive or did too little.
 PUBLISHED = Path(__file__).with_name("collision_accounts.csv")
 
 
@@ -55,12 +56,12 @@ def braked(course, condition, side, since, mps2):
 
 
 @pytest.mark.parametrize("account", COLLISIONS)
-def test_a_collision_is_told_by_what_both_had_done_when_it_could_last_be_avoided(account):
+def test_a_collision_is_told_by_who_braked_and_who_sped_up_before_it(account):
     assert collision_class(*crash(*EXAMPLES[account])) == account
 
 
 @pytest.mark.parametrize(
-    ("at", "account"), [(0, "both insisted"), (1, "invalid plan"), (2, "both insisted")]
+    ("at", "account"), [(0, BOTH_SPED_UP), (1, "no valid plan"), (2, BOTH_SPED_UP)]
 )
 def test_an_invalid_plan_counts_only_where_it_was_driven_at_the_last_chance(at, account):
     course, decisions = crash(*INSISTING, {at: NO_PLAN})
@@ -68,18 +69,21 @@ def test_an_invalid_plan_counts_only_where_it_was_driven_at_the_last_chance(at, 
     assert collision_class(course, decisions) == account
 
 
-def test_what_is_done_after_the_last_chance_changes_no_class():
-    before, after = ((0.0,) * seconds + (1.0,) * 3 for seconds in (2, 3))
-    course, decisions = crash("N_0_0", after, after)
-    assert course.times_s[judged_at(course)] == pytest.approx(2.2)
-    assert course.change_mps("left", course.last) == 0.5
-    assert collision_class(course, decisions) == "no action"
-    assert collision_class(*crash("N_0_0", before, before)) == "both insisted"
+def test_who_braked_in_the_last_step_or_after_speeding_up_has_braked():
+    for plan in ((0.4, 0.5, 0.5), (0.4, 0.4, -0.09), (-0.09, 0.5, 0.5)):
+        course, decisions = crash("N_0_0", (0.3,) * 5, plan)
+        assert course.speeds_mps["right"][-1] > course.speeds_mps["right"][0]
+        braked = -0.09 in plan
+        assert collision_class(course, decisions) == ("one braked" if braked else BOTH_SPED_UP)
+    gentle = (0.4, 0.4, -0.07)
+    assert collision_class(*crash("N_0_0", (0.3,) * 5, gentle)) == BOTH_SPED_UP
 
 
 @pytest.mark.parametrize("rules", SCENARIOS)
 @pytest.mark.parametrize("side", SIDES)
-@pytest.mark.parametrize("account", ["both insisted", "one too little", "no action"])
+@pytest.mark.parametrize(
+    "account", [BOTH_SPED_UP, "nobody braked, one sped up", "nobody braked or sped up"]
+)
 def test_braking_as_told_avoids_it_in_the_world_and_a_step_later_nothing_does(account, side, rules):
     condition, left, right, _ = EXAMPLES[account]
     course, _ = crash(condition, left, right, scenario=SCENARIOS[rules])
@@ -96,8 +100,8 @@ def test_who_braked_as_hard_as_it_could_can_only_have_sped_up():
     weak = ScenarioConfig(max_acceleration_mps2=0.8)
     course, decisions = crash("N_0_0", (-1.0,) * 8, (-1.0,) * 8, scenario=weak)
     assert course.last_chance("left", BRAKING) is None
-    assert course.last_chance("left", SPEEDING_UP) == judged_at(course)
-    assert collision_class(course, decisions) == "both gave way"
+    assert course.last_chance("left", SPEEDING_UP) == last_escape(course)[0]
+    assert collision_class(course, decisions) == "both braked"
 
 
 def test_the_published_accounts_are_those_of_all_published_collisions():

@@ -18,12 +18,14 @@ from merge_runner.records import SIDES, Side, other_side
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.geometry import Track
 from merge_runner.scenarios.merge.vehicle import advance, net_acceleration
-from merge_runner_analysis.wording import number
+from merge_runner_analysis.wording import capital, number
 
 BRAKING, SPEEDING_UP = -1.0, 1.0
 """The hardest actions, as a plan normalises them."""
 # Halved so often, the strongest action is known to 0.01 m/s^2.
 BISECTIONS = 8
+HOLDS = 0.08
+"""Part of the greatest acceleration up to which a driver holds its speed: more brakes or goes."""
 # Below it a vehicle keeps its speed.
 STEADY_MPS2 = 0.05
 # Two clocks agree to this many seconds.
@@ -48,14 +50,31 @@ class Course:
         """The number of the last sample."""
         return len(self.times_s) - 1
 
-    def change_mps(self, side: Side, sample: int) -> float:
-        """Return a vehicle's change of speed since the start of control."""
-        return self.speeds_mps[side][sample] - self.speeds_mps[side][0]
-
     def driven_mps2(self, side: Side, sample: int) -> float:
         """Return a vehicle's acceleration from a sample, which is not the last one, to the next."""
         (before_mps, after_mps) = self.speeds_mps[side][sample : sample + 2]
         return (after_mps - before_mps) / (self.times_s[sample + 1] - self.times_s[sample])
+
+    def commanded_mps2(self, side: Side, sample: int) -> float:
+        """Return what a driver did from a sample to the next: without the vehicle's resistance."""
+        speed = self.speeds_mps[side][sample]
+        rolling_mps2 = net_acceleration(0.0, speed, self.scenario.resistance)
+        return self.driven_mps2(side, sample) - rolling_mps2
+
+    @property
+    def acts_mps2(self) -> float:
+        """The acceleration beyond which a driver brakes or speeds up."""
+        return HOLDS * self.scenario.max_acceleration_mps2
+
+    def braked_at(self, side: Side) -> int | None:
+        """Return the first sample from which a driver brakes; a vehicle that rolls only slows."""
+        samples = range(self.last)
+        return next((i for i in samples if self.commanded_mps2(side, i) < -self.acts_mps2), None)
+
+    def sped_up_at(self, side: Side) -> int | None:
+        """Return the first sample from which a vehicle speeds up."""
+        samples = range(self.last)
+        return next((i for i in samples if self.driven_mps2(side, i) > self.acts_mps2), None)
 
     def avoided(self, side: Side, action: float, since: int) -> bool:
         """Return whether a side avoids the collision by driving one action from a sample on."""
@@ -106,13 +125,16 @@ class Course:
             yield position
 
 
-BOTH_INSISTED, BOTH_GAVE_WAY = "both insisted", "both gave way"
-ONE_TOO_LITTLE, NO_ACTION, INVALID_PLAN = "one too little", "no action", "invalid plan"
-COLLISIONS = (BOTH_INSISTED, BOTH_GAVE_WAY, ONE_TOO_LITTLE, NO_ACTION, INVALID_PLAN)
+NO_VALID_PLAN, ONE_BRAKED, BOTH_BRAKED = "no valid plan", "one braked", "both braked"
+# By the number of drivers that sped up.
+NOBODY_BRAKED = (
+    "nobody braked or sped up",
+    "nobody braked, one sped up",
+    "nobody braked, both sped up",
+)
+COLLISIONS = (*NOBODY_BRAKED, ONE_BRAKED, BOTH_BRAKED, NO_VALID_PLAN)
 NEAR_MISS, LONG_WAIT = "near miss", "long wait"
 
-ACTED_MPS = 0.5
-"""From this change of speed on a driver has acted: what makes a contribution in ``joint``, too."""
 NEAR_TTC_S = 1.5
 """Below this time to collision an encounter is commonly called critical: A. R. A. van der Horst, A
 time-based analysis of road user behaviour in normal and critical encounters (TU Delft, 1990)."""
@@ -140,28 +162,16 @@ Decided = Sequence[Mapping[str, Any]]
 
 
 def collision_class(course: Course, decisions: Decided) -> str:
-    """Return the class of a collision.
+    """Return the class of a collision: how many drivers braked, at any time up to it.
 
-    It is judged at the last sample from which one driver alone could still have avoided it, by
-    braking or speeding up as hard as the vehicle can. ``invalid plan``: a driver drove on an older
-    plan, or none, when its own braking could last have helped. Else by what the drivers had done
-    with their speeds until that sample, from ACTED_MPS on: both gained (``both insisted``), both
-    lost (``both gave way``), neither (``no action``), or not the same (``one too little``).
+    Where nobody did, it says how many sped up. ``no valid plan`` goes before: a driver drove on an
+    older plan, or none, when its own braking could last have helped.
     """
     if any(_drove_no_plan_of_its_own(course, decisions, side) for side in SIDES):
-        return INVALID_PLAN
-    until = judged_at(course)
-    changes = [course.change_mps(side, until) for side in SIDES]
-    ways = {(change >= ACTED_MPS) - (change <= -ACTED_MPS) for change in changes}
-    if len(ways) > 1:
-        return ONE_TOO_LITTLE
-    return {-1: BOTH_GAVE_WAY, 0: NO_ACTION, 1: BOTH_INSISTED}[ways.pop()]
-
-
-def judged_at(course: Course) -> int:
-    """Return the last sample from which one driver alone avoids the collision, or the end."""
-    until, _, _ = last_escape(course)
-    return until
+        return NO_VALID_PLAN
+    braked = sum(course.braked_at(side) is not None for side in SIDES)
+    sped_up = sum(course.sped_up_at(side) is not None for side in SIDES)
+    return (NOBODY_BRAKED[sped_up], ONE_BRAKED, BOTH_BRAKED)[braked]
 
 
 def last_escape(course: Course) -> tuple[int, Side | None, float]:
@@ -189,13 +199,7 @@ def _drove_no_plan_of_its_own(course: Course, decisions: Decided, side: Side) ->
 
 SAYS = {"M": "merge", "Y": "yield"}
 HEADINGS = {NEAR_MISS: "Why it came close", LONG_WAIT: "Why it took so long"}
-MEANINGS = {
-    BOTH_INSISTED: "Both insisted: both had sped up",
-    BOTH_GAVE_WAY: "Both gave way: both had slowed down",
-    ONE_TOO_LITTLE: "One braked and the other did not: too little, too late",
-    NO_ACTION: "Neither acted",
-    INVALID_PLAN: "A driver drove without a valid plan when its braking could last have helped",
-}
+UNPLANNED = "a driver drove without a valid plan when its braking could last have helped"
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,27 +240,25 @@ def account(course: Course, decisions: Decided, trial: Mapping[str, Any]) -> Acc
     else:
         chances = {side: course.last_chance(side, BRAKING) for side in SIDES}
         avoidable = (_avoidable(course, side, chance) for side, chance in chances.items())
-        sentences = [_collision(course, name), *avoidable]
+        sentences = [_collision(course, name), *avoidable, *_by_speeding_up(course)]
     marks = sorted(_marks(course, decisions, chances), key=lambda mark: mark.time_s)
     return Account(HEADINGS.get(name, "Why it crashed"), sentences, marks)
 
 
 def _collision(course: Course, name: str) -> str:
-    at, escaping, action = last_escape(course)
-    changes = [course.change_mps(side, at) for side in SIDES]
-    meaning = MEANINGS[name]
-    if name == ONE_TOO_LITTLE and min(changes) > -ACTED_MPS:
-        meaning = "One sped up, and nobody braked"
-    left, right = (f"{abs(mps):.1f} m/s {'faster' if mps >= 0 else 'slower'}" for mps in changes)
-    by = "braking" if action == BRAKING else "speeding up"
-    when = f"{course.times_s[at]:.1f} s, the last moment at which one driver alone could have "
-    when += f"avoided it (the {escaping} one, by {by})"
-    if escaping is None:
-        when = "the end; nobody alone could have avoided it"
+    left, right = (_actions(course, side) for side in SIDES)
     return (
-        f"{meaning}. At {when}, the left vehicle was {left} and the right one {right} than "
-        f"at the start; {ACTED_MPS:g} m/s or more count as acting."
+        f"{capital(UNPLANNED if name == NO_VALID_PLAN else name)}: the left driver {left}, the "
+        f"right one {right}. Accelerations beyond {course.acts_mps2:g} m/s² count."
     )
+
+
+def _actions(course: Course, side: Side) -> str:
+    braked, sped_up = course.braked_at(side), course.sped_up_at(side)
+    if braked is None:
+        return "neither braked nor sped up" if sped_up is None else "sped up and never braked"
+    before = "sped up, and " if sped_up is not None and sped_up < braked else ""
+    return f"{before}first braked at {course.times_s[braked]:.1f} s"
 
 
 def _avoidable(course: Course, side: Side, chance: int | None) -> str:
@@ -270,16 +272,26 @@ def _avoidable(course: Course, side: Side, chance: int | None) -> str:
     )
 
 
+def _by_speeding_up(course: Course) -> Iterator[str]:
+    """Yield who could have avoided it by speeding up, if later than anybody by braking."""
+    at, side, action = last_escape(course)
+    if action == SPEEDING_UP:
+        until = f"Until {course.times_s[at]:.1f} s the {side} driver could have avoided it by"
+        yield f"{until} speeding up as hard as it could."
+
+
 def _braking(course: Course, side: Side, chance: int) -> tuple[str, str]:
     """Return the braking that avoids the collision from a sample on, compared with the driven.
 
     Two texts: for a sentence, rounded up, and for a mark.
     """
     least_mps2 = ceil(course.least_mps2(side, BRAKING, chance) * 10 - TICK_S) / 10
-    braked_mps2 = -course.driven_mps2(side, chance)
+    braked_mps2 = -course.commanded_mps2(side, chance)
     if not least_mps2:
-        if braked_mps2 <= -STEADY_MPS2:
+        if course.driven_mps2(side, chance) >= STEADY_MPS2:
             return "not speeding up any further", "last moment to stop speeding up"
+        if course.scenario.resistance != "none":
+            return "letting the vehicle roll", "last moment to let the vehicle roll"
         return "keeping the speed that it had", "last moment to keep its speed"
     if braked_mps2 < STEADY_MPS2:
         return f"braking at {least_mps2:.1f} m/s²", "last moment to brake"

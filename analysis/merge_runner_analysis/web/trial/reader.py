@@ -33,8 +33,9 @@ TASKS = f"""
 SELECT trial_id, spec_hash, source, spec
 FROM (FROM trials {OF_THEM}) LEFT JOIN specs USING (spec_hash)
 """  # noqa: S608 # constants
-# Recordings do not describe their task: collisions were judged by the outlines, at 20 Hz.
-HUMAN_TASK = {"collision_rule": "rectangle", "step_s": 0.05}
+# Recordings do not describe their task: collisions were judged by the outlines, at 20 Hz, and a
+# vehicle whose pedals are released slows down.
+HUMAN_TASK = {"collision_rule": "rectangle", "step_s": 0.05, "resistance": "human"}
 
 
 @dataclass(frozen=True, slots=True)
