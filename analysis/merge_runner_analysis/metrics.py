@@ -115,10 +115,10 @@ COLLISIONS = Metric(
 )
 BOXES = Metric(
     name="collided_boxes_percent",
-    label="coll. boxes",
+    label="coll. outlines",
     unit="%",
-    meaning="share of ended trials with a collision by the rule of the human experiment: boxes "
-    "that overlap, checked at 20 Hz",
+    meaning="share of ended trials with a collision by the rule of the human experiment: "
+    "outlines that overlap, checked at 20 Hz",
     value="collided_boxes",
     estimator="proportion",
     trials="ended",
@@ -221,7 +221,7 @@ for _name, (_label, _meaning) in SURROGATES.items():
 RULES_NOTE = (
     f"{COLLISIONS.heading}: by the rule of the trials' scenario, in the paper centres closer than "
     f"a vehicle length at a step of 0.2 s; {BOXES.heading}: by the rule of the human experiment, "
-    "boxes that overlap, checked at 20 Hz, the one by which drivers are compared with humans. A "
+    "outlines that overlap, checked at 20 Hz, the one by which drivers are compared with humans. A "
     "rate with undecided trials has no value and is not compared; its interval holds whether all "
     "of them collide or none (Manski 1989)"
 )

@@ -5,9 +5,8 @@ A trial that one rule ended, before the other rule saw a collision, is undecided
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from itertools import pairwise
-from math import ceil, hypot
+from collections.abc import Mapping
+from math import hypot
 from typing import Any
 
 import duckdb
@@ -17,15 +16,11 @@ from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
 from merge_runner.results.frames import frame
 from merge_runner.results.instance import SETTINGS
-from merge_runner.scenarios.merge.collision import rectangles_overlap
-from merge_runner.scenarios.merge.geometry import TRACK
-from merge_runner.scenarios.merge.vehicle import advance
 from merge_runner.text_safety import first_line, quoted
 from merge_runner_analysis.metrics import JUDGED, LEFT_FIRST, METRICS, Metric
+from merge_runner_analysis.outlines import first_overlap
 from merge_runner_analysis.published import human_outcomes
 
-# The rule of the human experiment is boxes that overlap, checked at this rate.
-LOOKS_HZ = 20
 # Samples at or next to which boxes can overlap: with centres closer in the plane than the diagonal
 # of a box and the way that they can come nearer within a step.
 NEAR = """
@@ -41,8 +36,6 @@ FROM (
         FROM vehicle_pairs WHERE spec_hash IN ({specs}))
 ) WHERE across_m ** 2 + along_m ** 2 < ({reach_m} + nearer_m) ** 2 GROUP BY ALL
 """
-# Step, time, and of the left and the right vehicle the travelled distance and the speed.
-Sample = tuple[int, float, float, float, float, float]
 
 
 def with_metrics(connection: duckdb.DuckDBPyConnection, trials: str) -> pd.DataFrame:
@@ -93,7 +86,7 @@ def judged(
         for name in trials.loc[ended & ~human, "spec_hash"].unique()
     }
     near = connection.execute(_near(tasks)).fetchall()
-    overlapped = {tuple(key) for *key, samples in near if _overlap(tasks[key[1]], samples)}
+    overlapped = {tuple(key) for *key, samples in near if first_overlap(tasks[key[1]], samples)}
     keys = pd.MultiIndex.from_frame(trials[["trial_id", "spec_hash"]])
     boxes = pd.Series(keys.isin(overlapped), trials.index, dtype="boolean")
     # A trial that another rule ended stays undecided where its trace shows no overlap.
@@ -109,27 +102,3 @@ def _near(tasks: Mapping[str, ScenarioConfig]) -> str:
     reach_m = max(hypot(task.vehicle_length_m, task.vehicle_width_m) for task in configs)
     names = ", ".join(map(quoted, tasks)) or "NULL"
     return NEAR.format(specs=names, step_s=step_s, reach_m=reach_m + added_m + 0.01)
-
-
-def _overlap(config: ScenarioConfig, samples: Sequence[Sample]) -> bool:
-    """Return whether boxes overlap at any sample, or at 20 Hz between samples of a step."""
-    size = (config.vehicle_length_m, config.vehicle_width_m)
-    looks = [(left_m, right_m) for _, _, left_m, _, right_m, _ in samples]
-    for before, now in pairwise(samples):
-        if now[0] == before[0] + 1:
-            left = _looks_between(before[2:4], now[2:4], now[1] - before[1])
-            looks += zip(left, _looks_between(before[4:], now[4:], now[1] - before[1]), strict=True)
-    return any(rectangles_overlap(TRACK, *look, *size) for look in looks)
-
-
-def _looks_between(
-    before: tuple[float, ...], now: tuple[float, ...], step_s: float
-) -> Iterator[float]:
-    """Yield a vehicle's positions at 20 Hz within a step of constant acceleration."""
-    (before_m, before_mps), (now_m, now_mps) = before, now
-    acceleration = (now_mps - before_mps) / step_s
-    if now_mps <= 0 and now_m > before_m:  # it stopped the vehicle before the end of the step
-        acceleration = before_mps**2 / (-2 * (now_m - before_m))
-    looks = ceil(step_s * LOOKS_HZ - 1e-6)
-    for look in range(1, looks):
-        yield advance(before_m, before_mps, acceleration, step_s * look / looks)[0]

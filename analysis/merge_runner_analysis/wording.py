@@ -105,7 +105,7 @@ CHANGED = {
 }
 # The collision rules that trials may be played by, as sentences name them, and their meaning.
 PLAYED_RULES = {
-    "euclid2d": "the paper's rule",
+    "euclid2d": "the rule of centres",
     "rectangle": "people's rule",
     "shared_lane": "the rule of the shared lane",
 }
@@ -115,6 +115,12 @@ RULES_MEAN = {
     "shared_lane": "the vehicles are less than a length apart once one is in the shared lane",
 }
 PEOPLES_RULE = "the vehicles' outlines overlap, checked every 0.05 s"
+# How outlines overlap in a trial that is no crash by the rule that was played.
+NO_CRASH_YET = {
+    "euclid2d": "vehicles at an angle touch with a corner while their centres are still a length "
+    "apart",
+    "shared_lane": "outlines can overlap before the shared lane begins",
+}
 CORRECTED = "p is corrected (Holm) for"
 # Of a rehearsal, with the planted effects.
 PLANTED = "planted in the mock model for this rehearsal"
@@ -189,9 +195,9 @@ class Why(Enum):
         "and {} %"
     )
     UNDECIDED_BOXES = (
-        "by people's rule {0} to {1} of {2} trials crashed: {0} surely did, and of {3} that "
-        "another crash rule ended it is not known. A study played by people's rule (collision_rule "
-        '= "rectangle") decides them'
+        "by people's rule {0} to {1} of {2} trials crashed: in {0} the outlines overlapped, and of "
+        "{3} that another crash rule ended before it is not known. A study played by people's rule "
+        '(collision_rule = "rectangle") decides them'
     )
     # Comparisons with humans.
     OF_HUMANS = "humans: {}"

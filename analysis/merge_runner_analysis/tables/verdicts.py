@@ -49,7 +49,7 @@ VERDICT_COLUMNS = (
     Column("kind", "kind", meaning="language model, program or mock model"),
     Optional("measure", "measure"),
     Optional("n", "n", "count", "trials that the estimate rests on"),
-    Optional("k", "k", "count", "trials that collided", BOXES.column),
+    Optional("k", "k", "count", "trials that crashed by people's rule", BOXES.column),
     Optional("undecided", "undecided", "count", "ended by another rule"),
     Column("estimate", "estimate", "number", "in the unit of the measure"),
     Optional("ci", "CI", "interval", "95 %; with a margin (I4, I5) at the level of the row"),

@@ -6,6 +6,7 @@ import base64
 import json
 from collections.abc import Callable
 from functools import cached_property, lru_cache
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -17,7 +18,9 @@ from merge_runner.text_safety import first_line
 from merge_runner_analysis.cache import cached, digest_of, finished, present_state, stamp_of
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.tables import make_tables
-from merge_runner_analysis.tables.model import from_text, to_text
+from merge_runner_analysis.tables.formats import shown_value
+from merge_runner_analysis.tables.model import Column, Table, from_text, to_text
+from merge_runner_analysis.wording import MEASURES
 
 if TYPE_CHECKING:
     from merge_runner_analysis.study import StudyResults
@@ -175,7 +178,17 @@ class Numbers:
             for source in explained.sources
             for trial in (source.numerator if counts else source.trials)
         ]
-        return {"explained": explained, "trials": trials}
+        title = _title(table, row, next(of for of in table.columns if of.name == column))
+        return {"explained": explained, "trials": trials, "title": title}
+
+
+def _title(table: Table, row_id: str, column: Column) -> str:
+    """Return a cell in words: ``o3, baseline, crashes: trials that collided``."""
+    row = next(row for row in table.rows if row.id == row_id)
+    heads = takewhile(lambda of: of.kind == "text", table.columns)
+    names = [shown_value(of, row) for of in heads if of.name != "kind"]
+    labels = (MEASURES[name].label if name in MEASURES else name for name in names)
+    return f"{', '.join(filter(None, labels))}: {column.meaning or column.heading}"
 
 
 @lru_cache(1)

@@ -20,6 +20,7 @@ from merge_runner_analysis.wording import (
     HUMANS,
     LANGUAGE_MODEL,
     MOCK,
+    NO_CRASH_YET,
     PROGRAM,
     TABLE,
     by_group,
@@ -148,7 +149,8 @@ def noted(
 def by_condition(site: Site, scope: Scope, drivers: Sequence[Driver]) -> dict[str, Any]:
     """Return counts by condition, of the drivers' trials and of the humans' as published.
 
-    ``crash`` is the drivers' collision rule in words. A count is None if a condition was not
+    ``crash`` is the drivers' collision rule in words, and ``no_crash_yet`` says how trials can be
+    crashes by people's rule alone. A count is None if a condition was not
     driven. Without a driver the conditions are the humans'.
     """
     rows = site.trial_index.counts(scope.trials(), "model", "variant", "condition")
@@ -162,6 +164,7 @@ def by_condition(site: Site, scope: Scope, drivers: Sequence[Driver]) -> dict[st
     rules = site.trial_index.ask(RULES, played_by, default.collision_rule, default.step_s)
     return {
         "names": names,
+        "no_crash_yet": [NO_CRASH_YET[row["rule"]] for row in rules if row["rule"] in NO_CRASH_YET],
         "crash": crash_text([(row["rule"], row["steps_s"]) for row in rules]),
         "humans": [known.get(name) for name in names],
         "rows": [(driver, [counted.get((*key, name)) for name in names]) for driver, key in of],

@@ -42,7 +42,8 @@ class Likeness:
     """One measure of a driver beside people's: a verdict, and what was counted.
 
     A count has ``k`` and ``n``, any other value a ``text``; ``row`` is the verdict's row. Where the
-    count is by another rule than people's, ``by_people`` has the bounds by theirs.
+    count is by another rule than people's, ``surely`` counts crashes by theirs, and ``by_people``
+    is the rest of a sentence on them.
     """
 
     word: str
@@ -51,6 +52,7 @@ class Likeness:
     n: int | None
     text: str
     row: str
+    surely: int = 0
     by_people: str = ""
 
 
@@ -173,14 +175,14 @@ def _likeness(cell: Cell) -> Likeness:
     row = str(values["row"])
     if counted := values.get("counted"):
         k, n = map(int, str(counted).split(" of "))
-        text, by_people = unbroken(f"{number(100 * k / n)} %"), ""
+        text, surely, by_people = unbroken(f"{number(100 * k / n)} %"), 0, ""
         if undecided := values.get("undecided"):
             surely = values["k"] or 0
-            bounds = f"{surely} to {surely + undecided} of {n}, {share(values)} %"
-            by_people = unbroken(f"{bounds} by people's rule")
+            bounds = unbroken(f"to {surely + undecided} of {n}, {share(values)} %")
+            by_people = f"{bounds} by people's rule: {RULES_MEAN['rectangle']}"
             (rule,) = (of for of, name in PLAYED_RULES.items() if name == values["counted_by"])
             text += f" by the rule played here: {RULES_MEAN[rule]}"
-        return Likeness(word, is_open, k, n, text, row, by_people)
+        return Likeness(word, is_open, k, n, text, row, surely, by_people)
     estimate = values.get("estimate")
     known = cell.measure.name == "gap" and estimate is not None
     ends = brackets(values.get("ci"))

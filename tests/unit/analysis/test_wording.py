@@ -56,7 +56,7 @@ def driver(finished=110, *, collided=0, undecided=None, **states):
         "gap": row("gap", "inconclusive", n=finished),
     }
     raw = f"{collided + (undecided or 0)} of {n + (undecided or 0)}"
-    rows["collisions"] |= {"counted": raw, "counted_by": "the paper's rule"}
+    rows["collisions"] |= {"counted": raw, "counted_by": "the rule of centres"}
     for name, people in PEOPLE.items():
         rows[name] |= {"human_counted": people}
     for place, (name, state) in enumerate(states.items(), 1):
@@ -91,7 +91,7 @@ WILD = driver(86, collisions="unlike", gap="unlike", collided=24)
         (
             {"o3": driver(gap="unlike", undecided=33)},
             "o3 differs from people: it left a gap of 1.00 [0.50, 1.50] m, people of 2.00 m.",
-            "o3 crashed in 33 of 143 trials by the paper's rule, in 0 to 33 by people's rule; "
+            "o3 crashed in 33 of 143 trials by the rule of centres, in 0 to 33 by people's rule; "
             "people in 28 of 990.",
         ),
         (
@@ -248,8 +248,8 @@ def test_crashes_that_another_rule_decides_are_said_by_both():
     assert crashes(of) == "crashed in 2 of 10 trials; people in 5 of 90"
     cut_off = of | {"undecided": 4, "counted": "6 of 14", "counted_by": PLAYED_RULES["euclid2d"]}
     assert crashes(cut_off) == (
-        "crashed in 6 of 14 trials by the paper's rule, in 2 to 6 by people's rule; people in 5 of "
-        "90"
+        "crashed in 6 of 14 trials by the rule of centres, in 2 to 6 by people's rule; people in 5 "
+        "of 90"
     )
 
 
@@ -283,8 +283,8 @@ def test_several_drivers_are_told_together():
         (driver(95, collided=15), "crashed in 15 of 110 trials; people in 28 of 990"),
         (
             driver(7, collided=3, undecided=12),
-            "crashed in 15 of 22 trials by the paper's rule, in 3 to 15 by people's rule; people "
-            "in 28 of 990",
+            "crashed in 15 of 22 trials by the rule of centres, in 3 to 15 by people's rule; "
+            "people in 28 of 990",
         ),
         (
             driver(109, collided=1, collisions="unlike"),

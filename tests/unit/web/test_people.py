@@ -140,11 +140,13 @@ def test_trials_that_are_not_counted_have_a_reason(of, says):
 
 def test_crashes_that_another_rule_ended_are_given_by_peoples_rule_first():
     values = {"measure": "collisions", "state": OPEN, "n": 98, "k": 2, "undecided": 12, "row": "a",
-              "ended": 110, "counted": "14 of 110", "counted_by": "the paper's rule"}  # fmt: skip
+              "ended": 110, "counted": "14 of 110",
+              "counted_by": "the rule of centres"}  # fmt: skip
     cell = Cell(MEASURES["collisions"], values, None, "", "", "", "")
     shown = likeness_of(replace(driver("a"), cells={"collisions": cell}))["collisions"]
-    assert shown.by_people.replace("\xa0", " ") == (
-        "2 to 14 of 110, 1.82 to 12.73 % by people's rule"
+    assert (shown.surely, shown.by_people.replace("\xa0", " ")) == (
+        2,
+        "to 14 of 110, 1.82 to 12.73 % by people's rule: the vehicles' outlines overlap",
     )
     assert (shown.k, shown.n, shown.text.replace("\xa0", " ")) == (
         14,

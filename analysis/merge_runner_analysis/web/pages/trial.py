@@ -21,6 +21,7 @@ from merge_runner_analysis.web.trial.prompt_parts import parts_of
 from merge_runner_analysis.web.trial.reader import Trial, read_trials
 from merge_runner_analysis.web.trial.replay import VIEW_BOX, account_of, plan_chart, replay_data
 from merge_runner_analysis.web.trial.sentences import (
+    by_peoples_rule,
     facts,
     judged_text,
     outcome_text,
@@ -91,6 +92,7 @@ def _page(site: Site, row: Row, trial: Trial, template: str) -> str:
         panels=panels(site, row, trial),
         row=row,
         outcome=outcome_text(row),
+        by_peoples_rule=by_peoples_rule(row, trial),
         facts=facts(row),
         study_words=study_words(row, trial),
         judged=judged_text(trial.scenario),

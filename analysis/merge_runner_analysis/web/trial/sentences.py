@@ -5,11 +5,21 @@ from __future__ import annotations
 from merge_runner.config import ScenarioConfig
 from merge_runner.prompts.blocks import title_of
 from merge_runner.records import SIDES
-from merge_runner_analysis.web.phrases import condition_text
+from merge_runner_analysis.outlines import first_overlap
+from merge_runner_analysis.web.phrases import clock, condition_text
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.trial.prompt_parts import words_of
 from merge_runner_analysis.web.trial.reader import Trial, controlled
-from merge_runner_analysis.wording import money, number
+from merge_runner_analysis.wording import (
+    NO_CRASH_YET,
+    PLAYED_RULES,
+    RULES_MEAN,
+    capital,
+    money,
+    number,
+)
+
+MOVED = ("position_m", "velocity_mps")
 
 
 def outcome_text(row: Row) -> str:
@@ -28,6 +38,36 @@ def outcome_text(row: Row) -> str:
     when = "" if row["time_to_merge_s"] is None else f", after {number(row['time_to_merge_s'])} s"
     gap = "" if row["gap_m"] is None else f", with a gap of {number(row['gap_m'])} m"
     return f"The {other} vehicle yielded: the {first} one reached the merge point first{when}{gap}."
+
+
+def by_peoples_rule(row: Row, trial: Trial) -> str:
+    """Say whether a trial is a crash by people's rule; empty where that was played, or for none.
+
+    Both rules are named where they disagree.
+    """
+    task, rule = trial.scenario, trial.scenario.collision_rule
+    if rule == "rectangle" or row["status"] == "failed" or len(trial.states) < len(SIDES):
+        return ""
+    left, right = (trial.states[side] for side in SIDES)
+    columns = left["time_s"], *(of[name] for of in (left, right) for name in MOVED)
+    samples = [(i, *sample) for i, sample in enumerate(zip(*columns, strict=False))]
+    overlap = first_overlap(task, samples)
+    if row["status"] == "collided":
+        if overlap:
+            return f"By people's rule it crashed, too, at {clock(overlap.time_s)} s."
+        return "Not known by people's rule: the outlines had not overlapped when the trial ended."
+    if overlap is None:
+        return ""
+    at, length = clock(overlap.time_s), task.vehicle_length_m
+    texts = [
+        f"By people's rule it crashed at {at} s: the outlines overlapped, with the centres "
+        f"{number(overlap.apart_m)} m apart",
+        f"By {PLAYED_RULES[rule]}, which was played, it did not: a crash is when "
+        f"{RULES_MEAN[rule]} ({length:g} m), checked every {task.step_s:g} s",
+        rule in NO_CRASH_YET and overlap.apart_m >= length and capital(NO_CRASH_YET[rule]),
+        row["gap_m"] is not None and "The gap is that at the first merge",
+    ]
+    return " ".join(f"{text}." for text in texts if text)
 
 
 def judged_text(scenario: ScenarioConfig) -> str:

@@ -1,5 +1,6 @@
-"""Collisions of models by the paper's rule and by that of the humans, side by side."""
+"""Collisions of models by the rule of centres and by that of the humans, side by side."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from merge_runner_analysis.stats.measures import counts
 from merge_runner_analysis.stats.score_interval import wilson
 from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables import make_tables
+from tests.support.serving import Page, client_of
 from tests.support.studies import Drive, changed, write_study
 
 # So strong vehicles reach the end of the track within one plan.
@@ -51,6 +53,28 @@ def test_each_trial_is_judged_by_both_rules(study):
     assert counts(group, BOXES) == (1, 2)
 
 
+def test_a_trial_s_page_says_how_both_rules_can_disagree_and_a_link_lists_what_one_counts(study):
+    with client_of(study.db) as client:
+        pages = [
+            Page(client.get(f"/trials/o3/baseline/{name}").text).text
+            for name in ("N_0_0/rep01", "L_4_0/rep02", "L_4_0/rep05")
+        ]
+        disagree = (
+            "By people's rule it crashed at 4.1 s: the outlines overlapped, with the centres "
+            "4.76 m apart. By the rule of centres, which was played, it did not: a crash is when "
+            "the vehicles' centres are closer than a vehicle length (4.5 m), checked every 0.2 s. "
+            "Vehicles at an angle touch with a corner while their centres are still a length apart."
+        )
+        unknown = "Not known by people's rule: the outlines had not overlapped when the trial ended"
+        assert [unknown in page for page in pages] == [True, False, False]
+        assert [disagree in page for page in pages] == [False, True, False]
+        assert not re.search("people's rule", pages[2])
+        (to,) = [to for to, _ in Page(client.get("/").text).to("/trials") if "%3Ak" in to]
+        of_link = Page(client.get(to).text)
+        assert "o3, Baseline, crashes: trials that crashed by people's rule = 1." in of_link.text
+        assert [text for _, text in of_link.to("/trials/o3/")] == ["L_4_0 · 02"]
+
+
 def test_a_trial_that_failed_has_not_collided_by_any_rule(tmp_path):
     """Its boxes had overlapped before the call that was not answered."""
     path = write_study(tmp_path / "failed.duckdb", HAND_MADE, STRONG)
@@ -71,8 +95,8 @@ def test_both_rates_stand_in_the_tables_with_what_is_left_out(study):
         (indicators, "o3/baseline/collided_boxes_percent"),
     ):
         note = next(row.note for row in table.rows if row.id == row_id)
-        assert "by people's rule 1 to 4 of 5 trials crashed: 1 surely did, and of 3 that" in note
-        assert any("boxes that overlap, checked at 20 Hz" in note for note in table.notes)
+        assert "by people's rule 1 to 4 of 5 trials crashed: in 1 the outlines overlap" in note
+        assert any("outlines that overlap, checked at 20 Hz" in note for note in table.notes)
     by_disc = next(r for r in indicators.rows if r.id == "o3/baseline/collided_percent")
     assert by_disc.note == ""
 

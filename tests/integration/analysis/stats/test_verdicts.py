@@ -142,7 +142,7 @@ def test_with_undecided_trials_there_is_no_p_and_n_is_that_of_the_decided_ones(t
     untested = ("estimate", "difference", "difference_ci", "level", "p", "p_holm", "detectable")
     assert {row.values[name] for name in untested} == {None}
     assert row.values["state"] == "inconclusive"
-    assert notes_with(table, "by the paper's rule, in 2 to 6 by people's rule")
+    assert notes_with(table, "by the rule of centres, in 2 to 6 by people's rule")
 
 
 def test_a_replayed_human_is_not_judged(tmp_path):
