@@ -28,11 +28,14 @@ TABLE = "verdicts"
 HUMANS, LANGUAGE_MODEL, PROGRAM, MOCK = "humans", "language model", "program", "mock"
 # States. A trait is shown by its own test; the others need a difference with a corrected p < .05.
 SHOWN, WEAKER, STRONGER, UNLIKE, OPEN = "shown", "weaker", "stronger", "unlike", "inconclusive"
-DIFFERS = frozenset({WEAKER, STRONGER, UNLIKE})
+# Of a slope that is unlike people's: its interval lies on the other side of 0, or includes 0.
+OPPOSITE, UNDIRECTED = "opposite", "undirected"
+DIFFERS = frozenset({WEAKER, STRONGER, UNLIKE, OPPOSITE, UNDIRECTED})
 ENOUGH = 20  # trials with an outcome; fewer, or fewer than half of those that ended, say nothing
 ALPHA = 0.05  # of all tests; importing it would load pandas, which no page needs
 # Measures in which a difference has a direction, and the sign of more.
 SIGNS = {"headway": 1, "velocity": -1, "collisions": 1, "gap": 1, "gap-headway": 1}
+SLOPES = frozenset({"headway", "velocity", "gap-headway"})
 # So far from people, in points and in m, a driver still is like them.
 MARGINS = {"collisions": 5.0, "gap": 1.0}
 # States in words, on every page and in every table for people; of MARGINS with a direction.
@@ -48,9 +51,11 @@ OF_TRAIT = {
     SHOWN: TENDENCY,
     WEAKER: "weaker than people's",
     STRONGER: "stronger than people's",
+    OPPOSITE: "opposite to people's",
+    UNDIRECTED: "unlike people's, in no clear direction",
 }
 DIRECTIONS = {
-    **dict.fromkeys(("headway", "velocity", "gap-headway"), OF_TRAIT),
+    **dict.fromkeys(SLOPES, OF_TRAIT),
     "collisions": {WEAKER: "fewer than people's", STRONGER: "more than people's"},
     "gap": {WEAKER: "smaller than people's", STRONGER: "larger than people's"},
 }
@@ -62,7 +67,9 @@ VERDICT_RULES = (
     "one goes first more often, with p below .05 in a logistic regression (Firth) over all trials "
     "that finished, not by the counts; and no difference from people is shown",
     "More, fewer, larger, smaller, weaker or stronger: a difference is shown, with p below .05, "
-    "corrected (Holm) for all tests of a driver{tests}; of a tendency, in that regression's slope",
+    "corrected (Holm) for all tests of a driver{tests}; of a tendency, in that regression's slope. "
+    "Such a slope is opposite if its interval lies beyond 0, and in no clear direction if it "
+    "includes 0",
     "Cannot tell: neither is shown",
     f"No verdict: fewer than {ENOUGH} trials are counted, or fewer than half of those that ended",
 )
@@ -277,6 +284,9 @@ MEASURES = {
                 SHOWN: "the one ahead goes first, as with people",
                 WEAKER: "who goes first depends less on who is ahead than with people",
                 STRONGER: "who goes first depends more on who is ahead than with people",
+                OPPOSITE: "the one behind tends to go first, with people the one ahead",
+                UNDIRECTED: "neither the one ahead nor the one behind clearly tends to go first, "
+                "with people the one ahead",
             },
         ),
         Measure(
@@ -293,6 +303,9 @@ MEASURES = {
                 SHOWN: "the faster one yields, as with people",
                 WEAKER: "who goes first depends less on who is slower than with people",
                 STRONGER: "who goes first depends more on who is slower than with people",
+                OPPOSITE: "the faster one tends to go first, with people the slower one",
+                UNDIRECTED: "neither the slower nor the faster one clearly tends to go first, with "
+                "people the slower one",
             },
         ),
         Measure(
@@ -333,6 +346,10 @@ MEASURES = {
             {
                 WEAKER: "each metre that one is ahead adds less to its gap than to people's",
                 STRONGER: "each metre that one is ahead adds more to its gap than to people's",
+                OPPOSITE: "each metre that one is ahead makes its gap smaller ({of} m), people's "
+                "larger ({humans} m)",
+                UNDIRECTED: "each metre that one is ahead changes its gap in no clear direction "
+                "({of} m), and makes people's larger ({humans} m)",
             },
         ),
         Measure(
@@ -392,14 +409,18 @@ def shown_state(values: Values) -> str:
     """Return a state as sentences and marks show it: too few trials are inconclusive.
 
     A difference that surely lies within its margin is like people's; one in a measure of SIGNS has
-    a direction.
+    a direction. A slope has that of people, the opposite one, or none that its interval shows.
     """
     state = str(values.get("state") or "")
     if state and not suffice(values.get("n") or 0, values.get("ended") or 0):
         return OPEN
     if _is_within(values):
         return SHOWN
-    if state == UNLIKE and (sign := SIGNS.get(str(values["measure"]))):
+    if state == UNLIKE and (sign := SIGNS.get(measure := str(values["measure"]))):
+        if measure in SLOPES and (ci := values.get("ci")):
+            low, high = sorted(sign * end for end in ci)
+            if low <= 0:
+                return OPPOSITE if high < 0 else UNDIRECTED
         return STRONGER if sign * distance(values) > 0 else WEAKER
     return state
 

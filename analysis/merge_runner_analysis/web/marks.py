@@ -11,8 +11,10 @@ from merge_runner_analysis.tables.model import Row
 from merge_runner_analysis.wording import (
     MEASURES,
     OPEN,
+    OPPOSITE,
     SHOWN,
     STRONGER,
+    UNDIRECTED,
     UNLIKE,
     WEAKER,
     Measure,
@@ -23,7 +25,13 @@ from merge_runner_analysis.wording import (
     verdict_word,
 )
 
-SHAPES = {SHOWN: "like", WEAKER: "weaker", STRONGER: "stronger", UNLIKE: "unlike", OPEN: "open"}
+SHAPES = {
+    SHOWN: "like",
+    WEAKER: "weaker",
+    STRONGER: "stronger",
+    **dict.fromkeys((UNLIKE, OPPOSITE, UNDIRECTED), "unlike"),
+    OPEN: "open",
+}
 
 
 @dataclass(frozen=True, slots=True)

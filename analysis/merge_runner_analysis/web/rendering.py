@@ -26,6 +26,7 @@ from merge_runner_analysis.wording import (
     PEOPLES_RULE,
     SHOWN,
     TENDENCY,
+    UNLIKE,
     VERDICT_RULE,
     VERDICTS,
     capital,
@@ -99,6 +100,7 @@ def environment(
     )
     verdicts = {SHAPES[state]: words for state, words in VERDICTS.items()}
     verdicts[SHAPES[SHOWN]] += f", or the {TENDENCY}"
+    verdicts[SHAPES[UNLIKE]] += ", or opposite"
     made.globals.update(at=at, policy=policy, inlined=inlined or {}, style=STYLE, **shared)
     made.globals.update(verdict_shapes=verdicts, verdict_rule=capital(VERDICT_RULE))
     made.globals.update(peoples_rule=PEOPLES_RULE, sums_apart=APART, middle=MIDDLE)

@@ -16,8 +16,8 @@ from merge_runner_analysis.headlines import (
     is_constant,
     sentence,
 )
+from merge_runner_analysis.web.marks import SHAPES
 from merge_runner_analysis.wording import (
-    DIFFERS,
     LANGUAGE_MODEL,
     MEASURES,
     OPEN,
@@ -26,9 +26,11 @@ from merge_runner_analysis.wording import (
     RULES_MEAN,
     SHOWN,
     STRONGER,
+    UNLIKE,
     WEAKER,
     differs,
     money,
+    shown_state,
     verdict_word,
 )
 
@@ -328,7 +330,7 @@ def test_an_interval_beside_a_margin_names_its_level_where_that_is_not_95_percen
         ),
         (
             driver(velocity="unlike"),
-            "Who goes first depends more on who is slower than with people (side by side, the",
+            "The faster one tends to go first, with people the slower one (side by side,",
         ),
         (driver(gap="unlike"), "Leaves a gap of 1.00 m, smaller than people (2.00 m)"),
         (driver(50, collided=50, collisions="unlike"), "Crashed in 50 of 100 trials, less often"),
@@ -347,7 +349,7 @@ def any_driver(draw):
     for name, measure in MEASURES.items():
         p_holm = draw(st.floats(0, 1))
         own = [SHOWN] if measure.trait.endswith(")") else [OPEN]
-        states = sorted(DIFFERS) if p_holm < 0.05 else [*own, OPEN]
+        states = [STRONGER, UNLIKE, WEAKER] if p_holm < 0.05 else [*own, OPEN]
         if name in {"collisions", "gap"}:
             states = ["unlike"] if p_holm < 0.05 else [OPEN]
         values = rows.get(name, row(name, n=finished))
@@ -377,7 +379,6 @@ def test_no_sentence_claims_a_direction_that_the_corrected_p_does_not_carry(of):
         ("gap", (-1.0, -0.5), "like people"),
         ("gap", (-1.1, -0.5), "smaller than people's"),
         ("headway", (-0.1, -0.01), "weaker than people's"),
-        ("velocity", (0.01, 0.1), "weaker than people's"),
         ("held", (0.1, 0.2), "unlike people's"),
     ],
 )
@@ -385,6 +386,41 @@ def test_within_a_margin_a_driver_is_like_people_wherever_that_is_said(measure, 
     of = row(measure, "unlike", difference=sum(ci) / 2, difference_ci=ci, p_holm=0.01)
     assert verdict_word(of) == says
     assert differs(of) is (says != "like people")
+
+
+@pytest.mark.parametrize(
+    ("measure", "estimate", "ci", "word", "says"),
+    [
+        ("gap-headway", 0.05, (0.01, 0.09), "weaker than people's",
+         "Each metre that one is ahead adds less to its gap than to people's"),
+        ("gap-headway", 0.5, (0.4, 0.6), "stronger than people's",
+         "Each metre that one is ahead adds more to its gap than to people's"),
+        ("gap-headway", -0.31, (-0.62, 0.003), "unlike people's, in no clear direction",
+         "Each metre that one is ahead changes its gap in no clear direction (−0.31 m), and makes "
+         "people's larger (0.17 m)"),
+        ("gap-headway", -0.31, (-0.62, -0.003), "opposite to people's",
+         "Each metre that one is ahead makes its gap smaller (−0.31 m), people's larger (0.17 m)"),
+        ("headway", -1.0, (-2.0, -0.1), "opposite to people's",
+         "The one behind tends to go first, with people the one ahead"),
+        ("headway", -1.0, (-2.0, 0.0), "unlike people's, in no clear direction",
+         "Neither the one ahead nor the one behind clearly tends to go first"),
+        ("velocity", 1.0, (0.1, 2.0), "opposite to people's",
+         "The faster one tends to go first, with people the slower one"),
+        ("velocity", 0.1, (-0.5, 0.5), "unlike people's, in no clear direction",
+         "Neither the slower nor the faster one clearly tends to go first"),
+        ("velocity", -0.1, (-0.5, -0.01), "weaker than people's",
+         "Who goes first depends less on who is slower than with people"),
+    ],
+)  # fmt: skip
+def test_a_slope_unlike_people_s_has_their_direction_the_opposite_or_none(
+    measure, estimate, ci, word, says
+):
+    human = {"headway": 1.1, "velocity": -3.3, "gap-headway": 0.17}[measure]
+    of = row(measure, "unlike", estimate=estimate, ci=ci, human=human, p_holm=0.01,
+             difference=estimate - human)  # fmt: skip
+    assert (verdict_word(of), differs(of)) == (word, True)
+    assert sentence({"collisions": row("collisions", None, n=0), measure: of}).startswith(says)
+    assert SHAPES[shown_state(of)] == {"w": "weaker", "s": "stronger"}.get(word[0], "unlike")
 
 
 @pytest.mark.parametrize(
