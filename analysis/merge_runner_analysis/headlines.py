@@ -227,7 +227,8 @@ def _others(driver: str, other: str, rows: Mapping[str, Values], *, of_left: boo
         shown.append(
             f"{more if values['difference'] > 0 else less} ({' against '.join(sides)} {unit})"
         )
-    parts = [f"Compared with {other}, {driver} {joined(shown)}."] if shown else []
+    against = f"Compared with {other}, with situations weighted alike for both,"
+    parts = [f"{against} {driver} {joined(shown)}."] if shown else []
     parts += [f"No difference is shown in {joined(unshown)}."] if unshown else []
     return " ".join(parts)
 

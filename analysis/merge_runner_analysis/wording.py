@@ -68,8 +68,8 @@ VERDICT_RULES = (
     "that finished, not by the counts; and no difference from people is shown",
     "More, fewer, larger, smaller, weaker or stronger: a difference is shown, with p below .05, "
     "corrected (Holm) for all tests of a driver{tests}; of a tendency, in that regression's slope. "
-    "Such a slope is opposite if its interval lies beyond 0, and in no clear direction if it "
-    "includes 0",
+    "A slope with such a difference is opposite if its interval lies on the other side of 0, and "
+    "in no clear direction if it includes 0",
     "Cannot tell: neither is shown",
     f"No verdict: fewer than {ENOUGH} trials are counted, or fewer than half of those that ended",
 )
@@ -325,7 +325,7 @@ MEASURES = {
             "m",
             GAP.column,
             "difference within 1 m by its interval; else corrected p below .05",
-            "{it} left a gap of {driver} m, people of {people} m",
+            "{it} left a gap of {driver} m (mean of its trials), people of {people} m",
             (0.0, 8.0),
             {
                 SHOWN: "leaves a gap of {of} m, like people ({humans} m)",

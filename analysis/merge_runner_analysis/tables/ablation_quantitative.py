@@ -38,7 +38,8 @@ def metric_table(name: str, groups: list[Group], place: str, *notes: str) -> Tab
         if metric.estimator == "median":
             of = f"{metric.trials} trials that have the measure"
             meaning = f"median over the {of}: {meaning}"
-            columns.append(Optional(f"{metric.name}_n", "n", "count", of, rests_on=rests_on))
+            heading = f"n, {metric.label}"
+            columns.append(Optional(f"{metric.name}_n", heading, "count", of, rests_on=rests_on))
         columns += [
             Column(metric.name, metric.heading, kind, meaning, counts, rests_on=rests_on),
             interval(f"{metric.name}_ci", f"of {metric.label}", rests_on=rests_on),

@@ -26,7 +26,11 @@ def comparison(study: StudyResults, driver: str, reference: str) -> Table:
         "comparison",
         (
             Column("measure", "measure"),
-            *(Optional(f"{name}{end}", name, "count") for end in SUFFIXES for name in ("k", "n")),
+            *(
+                Optional(f"{name}{end}", f"{name} ref." if end else name, "count")
+                for end in SUFFIXES
+                for name in ("k", "n")
+            ),
             *(Optional(f"value{end}", f"value{end}", "number") for end in SUFFIXES),
             *DIFFERENCE,
         ),

@@ -32,6 +32,7 @@ KINDS = {
     PROGRAM: ("Programs", "compute their plans; asked nobody"),
     MOCK: ("Mock models", "a script answered in a model's name; in no conclusion"),
 }
+BY_DIFFERENCE = "difference"  # an order of conditions
 # Where each driver's decisions were asked, and what was sent with them, as the specs say it.
 ASKED = """
 SELECT model, variant, coalesce(any_value(spec->>'$.left.endpoint'), '') AS endpoint,
@@ -146,12 +147,15 @@ def noted(
     return [(of, heading, note) for (heading, note), of in names.items()]
 
 
-def by_condition(site: Site, scope: Scope, drivers: Sequence[Driver]) -> dict[str, Any]:
+def by_condition(
+    site: Site, scope: Scope, drivers: Sequence[Driver], order: str = ""
+) -> dict[str, Any]:
     """Return counts by condition, of the drivers' trials and of the humans' as published.
 
     ``crash`` is the drivers' collision rule in words, and ``no_crash_yet`` says how trials can be
-    crashes by people's rule alone. A count is None if a condition was not
-    driven. Without a driver the conditions are the humans'.
+    crashes by people's rule alone. A count is None if a condition was not driven. Without a driver
+    the conditions are the humans'. In the order BY_DIFFERENCE the one in
+    which a driver's share of crashes is furthest from people's comes first.
     """
     rows = site.trial_index.counts(scope.trials(), "model", "variant", "condition")
     counted = {(row["model"], row["variant"], row["condition"]): _merged(row) for row in rows}
@@ -159,16 +163,29 @@ def by_condition(site: Site, scope: Scope, drivers: Sequence[Driver]) -> dict[st
     known = {name: _merged(counts._asdict()) for name, counts in human_counts().items()}
     played = {name for *key, name in counted if tuple(key) in [driver for _, driver in of]}
     names = ordered(played or known)
+    if order == BY_DIFFERENCE:
+        in_it = {name: [counted.get((*key, name)) for _, key in of] for name in names}
+        names.sort(key=lambda name: _apart(known.get(name), in_it[name]), reverse=True)
     played_by = ["/".join(key) for _, key in of]
     default = ScenarioConfig()
     rules = site.trial_index.ask(RULES, played_by, default.collision_rule, default.step_s)
     return {
         "names": names,
+        "by_difference": order == BY_DIFFERENCE,
         "no_crash_yet": [NO_CRASH_YET[row["rule"]] for row in rules if row["rule"] in NO_CRASH_YET],
         "crash": crash_text([(row["rule"], row["steps_s"]) for row in rules]),
         "humans": [known.get(name) for name in names],
         "rows": [(driver, [counted.get((*key, name)) for name in names]) for driver, key in of],
     }
+
+
+def _apart(human: Row | None, drivers: Sequence[Row | None]) -> float:
+    """Return the largest difference of a driver's share of crashes from people's; -1 for none."""
+    if human is None:
+        return -1.0
+    shares = [of["collided"] / of["ended"] for of in drivers if of and of["ended"]]
+    people = human["collided"] / human["ended"]
+    return max((abs(share - people) for share in shares), default=-1.0)
 
 
 def _merged(row: Row) -> Row:

@@ -12,6 +12,7 @@ import pytest
 
 from merge_runner.errors import UsageError
 from merge_runner.results.store import query
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner_analysis.headlines import headline, sentence
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import StudyResults
@@ -176,8 +177,12 @@ def test_a_driver_stands_beside_another(client, db):
     verdicts, _, by_condition = text.partition("Situation by situation")
     drawn = re.findall(r'class="o" href="#(\w+)" x="([\d.]+)%"', verdicts)
     assert {shape for shape, _ in drawn} == {"other", "beyond"}
-    # Outside its axis it is an arrow, and no value at the end.
-    assert (("beyond", "100.0") in drawn, ("other", "100.0") in drawn) == (True, False)
+    # Outside its axis it has an arrow, and its own mark stands beside that.
+    arrow = r'<use class="(.)" href="#beyond" x="100.0%" y="\d+%"/>\s*'
+    mark = r'<use class="\1" href="#(\w+)" x="100.0%" y="\d+%" transform="translate\(-15 0\)"/>'
+    beyond = re.findall(arrow + mark, verdicts)
+    assert {("d", "open"), ("o", "other")} <= {*beyond}
+    assert len(beyond) == verdicts.count('href="#beyond" x="100.0%"')
     left_first = re.search(r"Left goes first <small>.*?</tr>", by_condition, re.DOTALL)[0]
     sql = (
         "SELECT round(100 * avg((merged_first = 'left')::INT), 2) FROM trials "
@@ -189,6 +194,39 @@ def test_a_driver_stands_beside_another(client, db):
     assert left_first.count('class="band"') == left_first.count('href="#other"') == 11
     numbers = [words for _, words in Page(client.get("/drivers").text).to("/trials?")]
     assert sum(words.isdigit() for words in numbers) == 3
+
+
+def test_a_note_is_at_its_mark_and_below_and_a_page_without_notes_explains_none(client, db):
+    notes = {
+        row.note
+        for row in table_of(db, "verdicts").rows
+        if row.groups[0] == "o3/baseline" and row.note and "I5" not in row.note
+    }
+    assert notes
+    for address in ("/drivers?variant=baseline", "/drivers/o3?variant=baseline&with=o4"):
+        page = client.get(address).text
+        assert "† has a note: point at it, or see below" in page
+        at_mark = {unescape(note) for note in re.findall(r'<abbr title="([^"]*)">†</abbr>', page)}
+        assert notes <= at_mark
+        below = words_of(page.partition('<ul class="notes">')[2])
+        assert all(note[1:].replace("-", "−") in below.replace("-", "−") for note in notes)
+    assert "†" not in client.get("/drivers/human").text
+
+
+def test_situations_come_in_their_usual_order_or_by_the_difference_from_people(client):
+    page = client.get("/?variant=baseline").text
+    (link,) = [to for to, text in Page(page).to("/?") if text == "by difference from people"]
+    for address in (link, "/drivers/o3?variant=baseline&order=difference"):
+        by_difference = client.get(address.partition("#")[0]).text
+        heads = by_difference.partition("Situation by situation")[2]
+        order = re.findall(r'href="/conditions/([^"?]*)', heads)[:11]
+        # It crashed there in each of 2 trials, and in one of 2 side by side.
+        assert order[:2] == [WORST, "N_0_0"]
+        assert sorted(order) == sorted(HUMAN_CONDITIONS)
+        path = address.partition("?")[0]
+        assert Page(by_difference).to(f"{path}?variant=baseline#by-condition")
+    usual = re.findall(r'href="/conditions/([^"?]*)', page.partition("by situation")[2])[:11]
+    assert usual == list(HUMAN_CONDITIONS)
 
 
 def test_a_driver_that_is_not_judged_has_no_verdict_and_missing_decisions_are_counted(tmp_path):

@@ -92,7 +92,8 @@ WILD = driver(86, collisions="unlike", gap="unlike", collided=24)
         ),
         (
             {"o3": driver(gap="unlike", undecided=33)},
-            "o3 differs from people: it left a gap of 1.00 [0.50, 1.50] m, people of 2.00 m.",
+            "o3 differs from people: it left a gap of 1.00 [0.50, 1.50] m (mean of its trials), "
+            "people of 2.00 m.",
             "o3 crashed in 33 of 143 trials by the rule of centres, in 0 to 33 by people's rule; "
             "people in 28 of 990.",
         ),
@@ -188,7 +189,10 @@ def test_two_drivers_are_told_apart_with_names_and_numbers():
         "a crashed in 42 of 110 trials, b in 84 of 110. In the same situations a crashed less "
         "often, by 38.64 points [27.00, 50.00]; corrected p = 0.001."
     )
-    smaller = "Compared with b, a leaves a smaller gap (3.10 against 4.20 m)."
+    smaller = (
+        "Compared with b, with situations weighted alike for both, a leaves a smaller gap (3.10 "
+        "against 4.20 m)."
+    )
     assert rest == f"{smaller} No difference is shown in how often the left vehicle goes first."
     assert "how often it goes first." in apart("a", "b", rows, of_left=False)[1]
     claim, _ = apart("a", "b", rows | {"collided_percent": crashed | {"p_corrected": 0.4}},

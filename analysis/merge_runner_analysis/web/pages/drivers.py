@@ -37,8 +37,21 @@ def drivers_page(site: Site, params: Mapping[str, str]) -> str:
     kinds = by_kind([driver for driver in drivers if unmarked(driver.name) in chosen])
     trials_counted = partial(counted, conditions=by_condition(site, bar.scope, drivers))
     return site.render(
-        "drivers.html", view="drivers", kinds=kinds, trials_counted=trials_counted, **values
+        "drivers.html",
+        view="drivers",
+        kinds=kinds,
+        trials_counted=trials_counted,
+        notes=noted(
+            [driver for of_kind in kinds.values() for driver in of_kind],
+            {name: measure.label for name, measure in MEASURES.items() if _is_shown(site, name)},
+        ),
+        **values,
     )
+
+
+def _is_shown(site: Site, measure: str) -> bool:
+    """Return whether the list has a column for a measure: I5 needs imported recordings."""
+    return measure != "held" or site.trial_index.has_humans
 
 
 def driver_page(site: Site, name: str, params: Mapping[str, str]) -> str:
@@ -63,7 +76,7 @@ def driver_page(site: Site, name: str, params: Mapping[str, str]) -> str:
     if driver and other_driver:
         job, is_awaited, apart = compared(site, driver, other_driver, scope)
     both = [shown for shown in (driver, other_driver) if shown]
-    conditions = by_condition(site, scope, both)
+    conditions = by_condition(site, scope, both, order=params.get("order", ""))
     # The humans' and the drivers' share of trials in which left goes first, by condition.
     shares = (
         [rate(cell["left_first"], cell["merged"]) if cell else rate(0, 0) for cell in cells]
@@ -78,6 +91,7 @@ def driver_page(site: Site, name: str, params: Mapping[str, str]) -> str:
         compared=job if is_awaited else None,
         apart=apart,
         linked=True,
+        unordered={key: kept for key, kept in params.items() if key != "order"},
         others=[(other, other) for other in by_name if other != name],
         **values | {"human": humans_of(values["table"], driver)},
         awaited=awaited,

@@ -133,7 +133,7 @@ def home_page(site: Site, params: Mapping[str, str]) -> str:
     older = [job.older for job in (values["computed"], *jobs)]
     now = standing, site.trial_index.state, site.trial_index.copies.is_locked, older
     seen = news_of(now, params.get("seen", ""))
-    conditions = by_condition(site, scope, shown)
+    conditions = by_condition(site, scope, shown, order=params.get("order", ""))
     names = [driver.name for driver in shown]
     short = short_names(names)
     # The people's values are those in the first driver's conditions.
