@@ -12,19 +12,11 @@ from merge_runner.study.arms import MODEL, OPPONENT, PROMPT, SELF
 from merge_runner_analysis.metrics import COLLISIONS, GAP, LEFT_FIRST, RMSE
 from merge_runner_analysis.tables.model import Row
 from merge_runner_analysis.web.effect_rows import (
-    amount,
-    count_of,
+    Measured,
     estimate_text,
     is_copied,
-    is_interaction,
-    is_shown,
     is_tested,
-    level_text,
-    metric_of,
-    name_of,
-    test_text,
-    unit_of,
-    value_of,
+    measured,
 )
 from merge_runner_analysis.wording import (
     CHANGED,
@@ -33,7 +25,6 @@ from merge_runner_analysis.wording import (
     FEW,
     METRIC_NAMES,
     SAME_TRIALS,
-    TIMES,
     capital,
     joined,
 )
@@ -52,38 +43,40 @@ def answered(rows: Sequence[Row], driver: str = EGO[0], planted: str = "") -> tu
     is no other driver, and then says so.
     """
     # Where models alone vary, their comparison answers.
-    rows = [row for row in rows if not (row.values["factor"] == MODEL and row.values["primary"])]
-    unscripted = [row for row in rows if not row.values.get("drivers")]
+    asked = [row for row in rows if not (row.values["factor"] == MODEL and row.values["primary"])]
+    effects = [*map(measured, asked)]
+    unscripted = [row for row in effects if not row.values.get("drivers")]
     rehearsed = "" if unscripted else "In a rehearsal with a mock model, "
-    rows = unscripted or rows
+    effects = unscripted or effects
     primary = sorted(
-        (row for row in rows if is_tested(row) and row.values.get("primary")),
-        key=lambda row: value_of(row, "p"),
+        (row for row in effects if is_tested(row) and row.values.get("primary")),
+        key=lambda row: row.values["p"],
     )
     why = UNREAD if rehearsed else SAME_TRIALS
-    copied = [f"{level_text(row)} is {why}" for row in rows if is_copied(row)]
+    copied = [f"{row.level} is {why}" for row in effects if is_copied(row)]
     if not primary:
         return capital(rehearsed + f"{'; '.join(copied)}.") if copied else "", ""
     if few := _too_few(primary):
         return capital(rehearsed + few), ""
-    sure = [row for row in primary if is_shown(row)]
+    sure = [row for row in primary if row.is_shown]
     what = changed(primary[0])
     claim = f"no change of {what} is shown by {joined(factors_named(primary))}."
     if sure:
         claim = f"{sure[0].values['factor']} changes {what}: {_both(sure[0], driver)}."
+    least = "" if sure else sizes(primary)
     rest = [
         *_of_primary(sure, [row for row in primary if row not in sure]),
         *(f"{capital(text)}." for text in copied),
-        "" if sure else _seen(primary),
-        *_of_others(rows, primary, driver),
+        f"The study had 80 % power for an effect of {least}." if least else "",
+        *_of_others(effects, primary, driver),
         f"{capital(planted)}." if rehearsed and planted else "",
     ]
     return capital(rehearsed + claim), " ".join(filter(None, rest))
 
 
-def _too_few(primary: Sequence[Row]) -> str:
+def _too_few(primary: Sequence[Measured]) -> str:
     """Return how many trials the levels with too few have, or nothing."""
-    counts = {id(row): [count_of(row, name) for name in ("n", "n_reference")] for row in primary}
+    counts = {id(row): [row.values[name] for name in ("n", "n_reference")] for row in primary}
     few = [row for row in primary if min(counts[id(row)]) < ENOUGH]
     if not few:
         return ""
@@ -93,95 +86,83 @@ def _too_few(primary: Sequence[Row]) -> str:
     return f"too few trials to say {asked}: {trials} a level."
 
 
-def _of_primary(sure: Sequence[Row], unshown: Sequence[Row]) -> Iterator[str]:
+def _of_primary(sure: Sequence[Measured], unshown: Sequence[Measured]) -> Iterator[str]:
     """Yield sentences on the primary tests; the first sure one is the claim's."""
     for row in sure[:1]:
-        yield f"The difference is {test_text(row).replace('], ', '] (95 % interval), ')}."
+        yield f"The difference is {row.test.replace('], ', '] (95 % interval), ')}."
     for row in sure[1:]:
-        yield f"{capital(level_text(row))} changes it, too: {test_text(row)}."
+        yield f"{capital(row.level)} changes it, too: {row.test}."
     yield from _not_shown(unshown)
 
 
-def _of_others(rows: Sequence[Row], primary: Sequence[Row], driver: str) -> Iterator[str]:
+def _of_others(rows: Sequence[Measured], primary: Sequence[Measured], driver: str) -> Iterator[str]:
     """Yield sentences on interactions in the primary measure, and on changes of other measures.
 
     They are the most visible changes; without a shown primary effect at least one.
     """
-    shown = [row for row in rows if is_shown(row) and row not in primary]
+    shown = [row for row in rows if row.is_shown and row not in primary]
     for row in shown:
-        if is_interaction(row) and metric_of(row) == metric_of(primary[0]):
-            yield f"{_named(row)} interact: {test_text(row)}."
+        if row.is_interaction and row.metric == primary[0].metric:
+            names = capital(" and ".join(row.factors))
+            yield f"{names} interact: {row.test}."
     also = [
         row
         for row in shown
-        if not is_interaction(row)
-        and row.values["factor"] != MODEL
-        and metric_of(row) in METRIC_NAMES
+        if not row.is_interaction and row.values["factor"] != MODEL and row.metric in METRIC_NAMES
     ]
-    also.sort(key=lambda row: (_seen_first(row), value_of(row, "p")))
-    seen = [row for row in also if metric_of(row) in SEEN][:FEW]
-    for row in seen or also[: not any(map(is_shown, primary))]:
-        yield f"{capital(str(row.values['factor']))} changes {changed(row)}: {_both(row, driver)}."
+    ranks = {metric: rank for rank, metric in enumerate(SEEN)}
+    also.sort(key=lambda row: (ranks.get(row.metric, len(SEEN)), row.values["p"]))
+    seen = [row for row in also if row.metric in SEEN][:FEW]
+    for row in seen or also[: not any(row.is_shown for row in primary)]:
+        yield f"{capital(row.values['factor'])} changes {changed(row)}: {_both(row, driver)}."
 
 
-def _seen_first(row: Row) -> int:
-    """Return the rank of an effect's measure: the most visible one is the first."""
-    return SEEN.index(metric_of(row)) if metric_of(row) in SEEN else len(SEEN)
-
-
-def _not_shown(rows: Sequence[Row]) -> Iterator[str]:
+def _not_shown(rows: Sequence[Measured]) -> Iterator[str]:
     """Yield sentences on primary tests without an effect; of more than FEW the first alone."""
     if len(rows) > FEW:
         yield (
             f"{len(rows)} levels are not shown to change {changed(rows[0])}; "
-            f"{level_text(rows[0])} comes nearest: "
-            f"{test_text(rows[0])}."
+            f"{rows[0].level} comes nearest: {rows[0].test}."
         )
         return
     for row in rows:
-        level, what = capital(level_text(row)), changed(row)
-        yield f"{level} is not shown to change {what}: {test_text(row)}."
+        level, what = capital(row.level), changed(row)
+        yield f"{level} is not shown to change {what}: {row.test}."
 
 
-def _seen(rows: Sequence[Row]) -> str:
-    """Return the minimum detectable effects in a sentence."""
-    least = sizes(rows)
-    return f"The study had 80 % power for an effect of {least}." if least else ""
-
-
-def sizes(rows: Sequence[Row]) -> str:
+def sizes(rows: Sequence[Measured]) -> str:
     """Return the detectable effect of each factor, or only the largest of more than FEW factors.
 
     A factor with several levels has its largest one.
     """
-    least: dict[str, Row] = {}
+    least: dict[str, Measured] = {}
     for row in rows:
-        factor = str(row.values["factor"])
+        factor = row.values["factor"]
         if row.values.get("detectable") is not None:
             known = [row, *filter(None, [least.get(factor)])]
-            least[factor] = max(known, key=lambda row: value_of(row, "detectable"))
+            least[factor] = max(known, key=lambda row: row.values["detectable"])
     if not least:
         return ""
     if len(least) > FEW:
-        factor = max(least, key=lambda name: value_of(least[name], "detectable"))
+        factor = max(least, key=lambda name: least[name].values["detectable"])
         least = {"any factor": least[factor]}
     first, *others = (
-        (amount(row, value_of(row, "detectable")), f" ({factor})") for factor, row in least.items()
+        (row.amount(row.values["detectable"]), f" ({factor})") for factor, row in least.items()
     )
-    unit = unit_of(rows[0])
+    unit = rows[0].unit
     return ", ".join([f"{first[0]} {unit}{first[1] * bool(others)}", *map("".join, others)])
 
 
-def factors_named(rows: Iterable[Row]) -> list[str]:
+def factors_named(rows: Iterable[Measured]) -> list[str]:
     """Return the names of the factors of effects, each once."""
-    return list(dict.fromkeys(str(row.values["factor"]) for row in rows))
+    return list(dict.fromkeys(row.values["factor"] for row in rows))
 
 
-def _both(row: Row, driver: str) -> str:
+def _both(row: Measured, driver: str) -> str:
     """Return ``in the same situations, the left driver goes first in 63.00 % with hurry=yes``."""
     factor, level, base = (row.values[name] for name in ("factor", "level", "reference"))
     of, reference = (estimate_text(row, name) for name in ("estimate", "estimate_reference"))
-    if metric_of(row) == LEFT_FIRST.name:
+    if row.metric == LEFT_FIRST.name:
         return (
             f"in the same situations {driver} goes first in {of} of finished trials with "
             f"{factor}={level} and in {reference} with {factor}={called(factor, base)}"
@@ -196,10 +177,6 @@ def called(factor: object, level: object) -> str:
     return title_of(str(level)) if factor == PROMPT else str(level)
 
 
-def changed(row: Row) -> str:
+def changed(row: Measured) -> str:
     """Return an effect's measure as a claim names it: ``who goes first``."""
-    return CHANGED.get(metric_of(row), name_of(row))
-
-
-def _named(row: Row) -> str:
-    return capital(str(row.values["factor"]).replace(TIMES, " and "))
+    return CHANGED.get(row.metric, row.name)

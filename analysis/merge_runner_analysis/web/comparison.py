@@ -9,18 +9,15 @@ from typing import Any
 from merge_runner.records import SIDES
 from merge_runner_analysis.headlines import LEFT_GOES_FIRST, apart, is_constant
 from merge_runner_analysis.metrics import COLLISIONS, LEFT_FIRST
-from merge_runner_analysis.tables.model import Row, Table, from_text
+from merge_runner_analysis.tables.model import Table, from_text
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.effect_rows import (
-    amount,
+    Measured,
     difference_mark,
     ends_of,
-    interval_text,
-    is_shown,
-    metric_of,
-    name_of,
+    estimate_text,
+    rows_of,
     unbroken,
-    unit_of,
 )
 from merge_runner_analysis.web.judged import Driver
 from merge_runner_analysis.web.marks import Mark
@@ -95,10 +92,10 @@ def comparison_of(
     if not table.rows:
         return None
     # The most visible measure is the first.
-    rows = sorted(table.rows, key=lambda row: metric_of(row) != COLLISIONS.name)
-    claim, rest = apart(*names, {metric_of(row): row.values for row in rows}, of_left=of_left)
+    rows = sorted(rows_of(table), key=lambda row: row.metric != COLLISIONS.name)
+    claim, rest = apart(*names, {row.metric: row.values for row in rows}, of_left=of_left)
     seen = [
-        f"{_name(row, of_left)} {_with_unit(row, 'detectable')}"
+        f"{_name(row, of_left)} {row.with_unit(row.values['detectable'])}"
         for row in rows
         if row.values["detectable"] is not None and not is_constant(row.values)
     ]
@@ -112,9 +109,9 @@ def comparison_of(
     )
 
 
-def _name(row: Row, of_left: bool) -> str:
-    if metric_of(row) != LEFT_FIRST.name:
-        return name_of(row)
+def _name(row: Measured, of_left: bool) -> str:
+    if row.metric != LEFT_FIRST.name:
+        return row.name
     return LEFT_GOES_FIRST if of_left else "goes first, before its opponent"
 
 
@@ -130,10 +127,9 @@ def trials_of(driver: Driver, scope: Scope) -> TrialsOf:
         field, more = named.get(what, ("trials", {}))
         if facts.get(field) == count:
             return every | more
-        # A finished trial has a gap, and an ended one is in the row of crashes.
-        for cell in driver.cells.values():
-            if what[:2] != "k " and cell.values["n"] == count and cell.measure.name == "gap":
-                return {"cell": f"verdicts/{cell.values['row']}:n", **scope.part}
+        gap = driver.cells.get("gap")  # each finished trial has one
+        if gap and not what.startswith("k ") and gap.values["n"] == count:
+            return {"cell": f"verdicts/{gap.values['row']}:n", **scope.part}
         return None
 
     return filter_of
@@ -144,34 +140,27 @@ def no_trials(_what: str, _count: int) -> Filter:
     return None
 
 
-def _difference(row: Row, trials: tuple[TrialsOf, TrialsOf], name: str) -> Difference:
-    values: Any = row.values
+def _difference(row: Measured, trials: tuple[TrialsOf, TrialsOf], name: str) -> Difference:
+    values = row.values
     is_tested = values["difference"] is not None and not is_constant(values)
-    end = ends_of([row])[metric_of(row)] if is_tested else 0.0
+    end = ends_of([row])[row.metric] if is_tested else 0.0
     return Difference(
         capital(name),
         [_side(row, of, to) for of, to in zip(("", "_reference"), trials, strict=True)],
-        unbroken(_with_unit(row, "difference", sign="+")) if is_tested else "–",
-        unbroken(interval_text(row)) if is_tested else "",
+        unbroken(row.difference) if is_tested else "–",
+        unbroken(row.interval) if is_tested else "",
         difference_mark(row, end) if is_tested and values["p_corrected"] is not None else None,
-        unbroken(f"{amount(row, end)} {unit_of(row)}"),
+        unbroken(row.with_unit(end)),
         p_value(values["p"] if is_tested else None),
         p_value(values["p_corrected"] if is_tested else None),
-        is_shown(row),
+        row.is_shown,
         row.note.replace(f"{values['measure']}: ", "") or SAME * is_constant(values),
     )
 
 
-def _side(row: Row, of: str, filter_of: TrialsOf) -> dict[str, Any]:
-    values: Any = row.values
-    metric, k, n, value = metric_of(row), *(values[f"{name}{of}"] for name in ("k", "n", "value"))
-    unit = unit_of(row).replace("points", "%")
-    text = number(None) if value is None else unbroken(f"{amount(row, value)} {unit}")
+def _side(row: Measured, of: str, filter_of: TrialsOf) -> dict[str, Any]:
+    metric = row.metric
+    k, n, value = (row.values[f"{name}{of}"] for name in ("k", "n", "value"))
+    text = number(None) if value is None else unbroken(estimate_text(row, f"value{of}"))
     k_trials = None if k is None else filter_of(f"k {metric}", k)
     return {"text": text, "k": k, "n": n, "k_trials": k_trials, "n_trials": filter_of(metric, n)}
-
-
-def _with_unit(row: Row, name: str, sign: str = "") -> str:
-    values: Any = row.values
-    plus = sign if values[name] > 0 else ""
-    return f"{plus}{amount(row, values[name])} {unit_of(row)}"

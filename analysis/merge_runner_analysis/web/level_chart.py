@@ -9,8 +9,7 @@ from math import ceil, floor, log10
 from merge_runner.prompts.blocks import title_of
 from merge_runner.study.arms import MODEL, PROMPT
 from merge_runner_analysis.metrics import LEFT_FIRST
-from merge_runner_analysis.tables.model import Row
-from merge_runner_analysis.web.effect_rows import interval_of, value_of
+from merge_runner_analysis.web.effect_rows import Measured
 from merge_runner_analysis.wording import TIMES, brackets, number
 
 # The shapes that tell drivers apart in a chart, and more of them are not drawn.
@@ -54,7 +53,7 @@ class Chart:
 
 
 def level_chart(
-    title: str, rows: Sequence[Row], shapes: dict[str, str], metric: str
+    title: str, rows: Sequence[Measured], shapes: dict[str, str], metric: str
 ) -> Chart | None:
     """Return a chart of the levels of these rows, a point for each driver, on one axis."""
     drawn = [
@@ -67,15 +66,14 @@ def level_chart(
     if not drawn:
         return None
     percent = metric.endswith("_percent")
-    ends = [end for row in drawn for end in (interval_of(row) or (value_of(row, "value"),))]
+    ends = [end for row in drawn for end in (row.values.get("ci") or (row.values["value"],))]
     low, high, step = _axis(min(ends), max(ends))
     if percent:  # the interval of a difference may end beyond
         low, high = max(low, 0.0), min(high, 100.0)
 
-    levels: dict[tuple[str, str], list[Row]] = {}
+    levels: dict[tuple[str, str], list[Measured]] = {}
     for row in drawn:
-        level = str(row.values["factor"]), str(row.values["level"])
-        levels.setdefault(level, []).append(row)
+        levels.setdefault((row.values["factor"], row.values["level"]), []).append(row)
     names = {(f, name): title_of(name) if f == PROMPT else name for f, name in levels}
     indent = 0.0 if TIMES in next(iter(levels))[0] else INDENT
     left = min(WIDTH / 2, indent + max(LEFT, LETTER * max(map(len, names.values()))))
@@ -106,13 +104,13 @@ def level_chart(
     )
 
 
-def _point(row: Row, shapes: dict[str, str], x: Callable[[float], float], y: float) -> Point:
-    ci, value = interval_of(row), value_of(row, "value")
-    driver, k, n = (row.values.get(name) for name in ("driver", "k", "n"))
+def _point(row: Measured, shapes: dict[str, str], x: Callable[[float], float], y: float) -> Point:
+    ci, value = row.values.get("ci"), row.values["value"]
+    driver, k, n = (row.values[name] for name in ("driver", "k", "n"))
     counts = "" if k is None else f"{k} of {n}, "
     says = f"{driver or 'all drivers'}: {counts}{number(value)} {brackets(ci)}".rstrip()
     ends = None if ci is None else (x(ci[0]), x(ci[1]))
-    return Point(shapes.get(str(driver), SHAPES[0]), x(value), ends, y, says)
+    return Point(shapes.get(driver, SHAPES[0]), x(value), ends, y, says)
 
 
 def _axis(low: float, high: float) -> tuple[float, float, float]:

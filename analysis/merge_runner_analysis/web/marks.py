@@ -49,7 +49,6 @@ class Mark:
 class Cell:
     """A verdict on a page; ``words`` is its full text, with its note."""
 
-    measure: Measure
     values: Values
     mark: Mark | None
     text: str
@@ -118,7 +117,6 @@ def _cell(measure: Measure, values: Values) -> Cell:
     whole = share(values) if values.get("undecided") else f"{number(value)} {ends}".rstrip()
     parts = [f"{whole} {measure.unit}", word, f"n = {values['n']}", values["note"]]
     return Cell(
-        measure,
         values,
         mark(measure, values),
         share(values) if values.get("undecided") else number(value),

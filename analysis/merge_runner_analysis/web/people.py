@@ -68,7 +68,7 @@ def other_differences(driver: Driver) -> str:
 
 def likeness_of(driver: Driver) -> dict[str, Likeness]:
     """Return the likeness of a driver by measure; empty where it is not judged."""
-    return {name: _likeness(driver.cells[name]) for name in HEADINGS if name in driver.cells}
+    return {name: _likeness(name, driver.cells[name]) for name in HEADINGS if name in driver.cells}
 
 
 def counted(driver: Driver, conditions: Mapping[str, Any]) -> str:
@@ -169,7 +169,7 @@ def verdict_rules(drivers: Sequence[Driver], gap: Mapping[str, Any]) -> list[str
     return [likeness, *others]
 
 
-def _likeness(cell: Cell) -> Likeness:
+def _likeness(measure: str, cell: Cell) -> Likeness:
     values = cell.values
     word, is_open = verdict_word(values), shown_state(values) in ("", OPEN)
     row = str(values["row"])
@@ -184,7 +184,7 @@ def _likeness(cell: Cell) -> Likeness:
             text += f" by the rule played here: {RULES_MEAN[rule]}"
         return Likeness(word, is_open, k, n, text, row, surely, by_people)
     estimate = values.get("estimate")
-    known = cell.measure.name == "gap" and estimate is not None
+    known = measure == "gap" and estimate is not None
     ends = brackets(values.get("ci"))
     if estimate is not None and ends == brackets((estimate, estimate)):
         ends = "in every trial"

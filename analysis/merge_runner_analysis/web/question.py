@@ -12,30 +12,17 @@ from typing import Any
 
 from merge_runner.study.arms import MODEL, OPPONENT
 from merge_runner_analysis.metrics import COLLISIONS, LEFT_FIRST
-from merge_runner_analysis.tables.model import Row, Table
+from merge_runner_analysis.tables.model import Table
 from merge_runner_analysis.web.claims import SEEN, answered, called, changed, factors_named, sizes
 from merge_runner_analysis.web.effect_rows import (
-    amount,
-    count_of,
+    Measured,
     difference_mark,
-    difference_text,
     ends_of,
     estimate_text,
-    factors_of,
-    interval_of,
-    interval_text,
     is_copied,
-    is_interaction,
-    is_none_or_all,
-    is_shown,
     is_tested,
-    level_text,
-    metric_of,
-    name_of,
-    test_text,
+    rows_of,
     unbroken,
-    unit_of,
-    value_of,
 )
 from merge_runner_analysis.web.level_chart import SHAPES, Chart, level_chart
 from merge_runner_analysis.web.marks import Mark
@@ -122,46 +109,49 @@ def answer_of(effects: Table | None, levels: Table | None) -> Answer | None:
     """Return the answer; None without a table, or where the study asks about no factor."""
     if effects is None or levels is None:
         return None
-    who = _note(levels, LEFT[1]) or _note(levels, EGO[1])
+    rows, who = rows_of(effects), _note(levels, LEFT[1]) or _note(levels, EGO[1])
     driver, _ = LEFT if who == LEFT[1] else EGO
     claim, rest = answered(effects.rows, driver, _note(effects, PLANTED))
     if not claim:
         return None
     # A driver that is not judged has a row without values.
-    known = [row for row in levels.rows if row.values.get("factor")]
-    asked = [row for row in effects.rows if row.values.get("primary")]
-    primary = min(asked, key=lambda row: value_of(row, "p") if is_tested(row) else 1.0)
-    metric, names = metric_of(primary), factors_named(asked)
-    of_metric = [row for row in effects.rows if metric_of(row) == metric]
+    known = [row for row in rows_of(levels) if row.values.get("factor")]
+    asked = [row for row in rows if row.values.get("primary")]
+    primary = min(asked, key=lambda row: row.values["p"] if is_tested(row) else 1.0)
+    metric, names = primary.metric, factors_named(asked)
+    of_metric = [row for row in rows if row.metric == metric]
     tested = [row for row in of_metric if is_tested(row)]
-    others = [row for row in effects.rows if _is_other(row, metric)]
+    others = [row for row in rows if _is_other(row, metric)]
     shapes = _shapes(known)
     short = short_names([*shapes])
-    shown = [row for row in known if not _untested(asked) & factors_of(row)]
-    single = [row for row in shown if len(factors_of(row)) == 1]
+    tested_factors = factors_named(row for row in asked if not is_copied(row))
+    untested = {*names} - {*tested_factors}
+    shown = [row for row in known if untested.isdisjoint(row.factors)]
+    single = [row for row in shown if len(row.factors) == 1]
     if is_adjusted := len(shapes) < 2:
         single = _adjusted(single, of_metric)
-    crossed = [row for row in shown if len(factors_of(row)) > 1]
+    crossed = [row for row in shown if len(row.factors) > 1]
+    crossing = ", ".join(crossed[0].factors) if crossed else ""
     charts = [
         level_chart("By factor", single, shapes, metric),
-        level_chart(_crossing_of(shown), crossed, shapes, metric),
+        level_chart(f"In combination: {crossing}", crossed, shapes, metric),
     ]
     sides = {row.id: row for row in known}
     return Answer(
         f"{'Does' if len(names) == 1 else 'Do'} {joined(names)} change {changed(primary)}?",
         unbroken(claim),
         unbroken(rest),
-        capital(name_of(primary)),
-        any(end < 0 or end > 100 for row in single for end in interval_of(row) or ())
+        capital(primary.name),
+        any(end < 0 or end > 100 for row in single for end in row.values.get("ci") or ())
         and metric.endswith("_percent"),
         [(short[driver], shape) for driver, shape in shapes.items()],
-        _counted(_of_one_factor(shown, [*shapes]), metric, effects.rows),
+        _counted(_of_one_factor(shown, [*shapes]), metric, rows),
         capital(who),
         _note(effects, CORRECTED),
         [chart for chart in charts if chart],
         is_adjusted,
         (OPPONENT if OPPONENT in names else names[-1]) if len(names) > 1 else "",
-        unbroken(_interactions(tested, {str(row.values["factor"]) for row in known})),
+        unbroken(_interactions(tested, known)),
         _changes(tested, sides, metric, _words(effects)),
         _changes(others, sides, metric, {}),
         unbroken(_could([*tested, *others])),
@@ -180,56 +170,58 @@ def _words(effects: Table) -> dict[str, str]:
     return dict(note.split(": ", 1) for note in notes)
 
 
-def _is_other(row: Row, metric: str) -> bool:
+def _is_other(row: Measured, metric: str) -> bool:
     """Return whether an effect is shown besides those on the study's ``metric``."""
+    shares = {row.values.get(name) for name in ("estimate", "estimate_reference")}
     return (
-        metric_of(row) in {LEFT_FIRST.name, *SEEN} - {metric}
-        and not is_interaction(row)
+        row.metric in {LEFT_FIRST.name, *SEEN} - {metric}
+        and not row.is_interaction
         and is_tested(row)
-        and not is_none_or_all(row)
         and row.values["factor"] != MODEL
+        # A share that is 0 % at both levels, or 100 %, is no news.
+        and not (row.unit == "points" and shares in ({0.0}, {100.0}))
     )
 
 
-def _shapes(levels: Sequence[Row]) -> dict[str, str]:
+def _shapes(levels: Sequence[Measured]) -> dict[str, str]:
     """Return the shape of each driver in charts; empty where there are too many."""
-    drivers = dict.fromkeys(str(row.values["driver"]) for row in levels if row.values["driver"])
+    drivers = dict.fromkeys(row.values["driver"] for row in levels if row.values["driver"])
     return dict(zip(drivers, SHAPES, strict=False)) if len(drivers) <= len(SHAPES) else {}
 
 
-def _interactions(rows: Sequence[Row], drawn: set[str]) -> str:
+def _interactions(rows: Sequence[Measured], drawn: Sequence[Measured]) -> str:
     """Describe the interactions of factors whose combinations are drawn."""
-    crossed = {name for names in drawn if TIMES in names for name in names.split(TIMES)}
+    crossed = {name for row in drawn if len(row.factors) > 1 for name in row.factors}
     texts = []
     for row in rows:
-        if is_interaction(row) and crossed >= {*str(row.values["factor"]).split(TIMES)}:
-            what = "they interact" if is_shown(row) else "no interaction is shown"
-            texts.append(f"{row.values['factor']}: {what}, {test_text(row)}.")
+        if row.is_interaction and crossed.issuperset(row.factors):
+            what = "they interact" if row.is_shown else "no interaction is shown"
+            texts.append(f"{row.values['factor']}: {what}, {row.test}.")
     return " ".join(texts)
 
 
-def _could(rows: Sequence[Row]) -> str:
+def _could(rows: Sequence[Measured]) -> str:
     """Return the minimum detectable effects by measure: ``goes first 4.26 points (hurry)``."""
-    names = dict.fromkeys(map(name_of, rows))
-    least = {name: sizes([row for row in rows if name_of(row) == name]) for name in names}
+    names = dict.fromkeys(row.name for row in rows)
+    least = {name: sizes([row for row in rows if row.name == name]) for name in names}
     return "; ".join(f"{name} {size}" for name, size in least.items() if size)
 
 
-def _adjusted(levels: Sequence[Row], effects: Sequence[Row]) -> list[Row]:
+def _adjusted(levels: Sequence[Measured], effects: Sequence[Measured]) -> list[Measured]:
     """Return levels with their values in the effects; the interval is that of the difference.
 
     A reference has a row for each value that it has beside other levels, and no interval.
     """
-    adjusted: dict[tuple[str, str], Row] = {}
+    adjusted: dict[tuple[str, str], Measured] = {}
     for row in levels:
         name = f"{row.values['factor']}={row.values['level']}"
         for effect in effects:
-            if is_interaction(effect) or effect.values.get("estimate") is None:
+            if effect.is_interaction or effect.values.get("estimate") is None:
                 continue
-            base = value_of(effect, "estimate_reference")
+            base = effect.values["estimate_reference"]
             values: dict[str, Any] = {"k": None}
-            if name == level_text(effect):
-                ends = interval_of(effect)
+            if name == effect.level:
+                ends = effect.values.get("ci")
                 ci = ends and tuple(base + end for end in ends)
                 values |= {"value": effect.values["estimate"], "ci": ci}
             elif name == f"{effect.values['factor']}={_reference(effect)}":
@@ -242,32 +234,32 @@ def _adjusted(levels: Sequence[Row], effects: Sequence[Row]) -> list[Row]:
     return [*adjusted.values()]
 
 
-def _reference(row: Row) -> str:
+def _reference(row: Measured) -> str:
     """Return the reference of an effect, marked as its level is."""
     mark = " [scripted]"
     return f"{row.values['reference']}{mark * str(row.values['level']).endswith(mark)}"
 
 
 def _changes(
-    rows: Sequence[Row], sides: dict[str, Row], primary: str, words: dict[str, str]
+    rows: Sequence[Measured], sides: dict[str, Measured], primary: str, words: dict[str, str]
 ) -> list[Change]:
     """Return the effects with both sides of each; effects on one measure share an axis.
 
     ``words`` has those of levels, of which it is said once.
     """
     ends = ends_of(rows)
-    return [_change(row, sides, ends[metric_of(row)], primary, words) for row in rows]
+    return [_change(row, sides, ends[row.metric], primary, words) for row in rows]
 
 
 def _change(
-    row: Row, sides: dict[str, Row], end: float, primary: str, words: dict[str, str]
+    row: Measured, sides: dict[str, Measured], end: float, primary: str, words: dict[str, str]
 ) -> Change:
-    of, base, metric = row.values["level"], row.values["reference"], metric_of(row)
-    factor = str(row.values["factor"])
+    of, base, metric = row.values["level"], row.values["reference"], row.metric
+    factor = row.values["factor"]
     is_own = metric == primary
     reference, level = (
         None
-        if is_interaction(row)
+        if row.is_interaction
         else _side(
             Side(unbroken(estimate_text(row, name)), called(factor, side) if is_own else str(side)),
             sides.get(f"{factor}={side}"),
@@ -276,34 +268,34 @@ def _change(
         )
         for name, side in (("estimate_reference", _reference(row)), ("estimate", of))
     )
-    detail = ""
-    if is_interaction(row):  # whose id has the level of the second factor, too
-        first, second = factor.split(TIMES)
+    if row.is_interaction:  # whose id has the level of the second factor, too
+        first, second = row.factors
         level_name, at = str(of).split(TIMES)
         otherwise = str(base).split(TIMES)[1]
         detail = (
             f"effect of {first}={level_name} with {second}={at}, less that with "
             f"{second}={otherwise}"
         )
-    detail = detail or (called(factor, of) if is_own else f"{factor}: {called(factor, of)}")
-    if of_level := words.get(level_text(row).removesuffix(" [scripted]")):
+    else:
+        detail = called(factor, of) if is_own else f"{factor}: {called(factor, of)}"
+    if of_level := words.get(row.level.removesuffix(" [scripted]")):
         detail += f": {of_level}"
     return Change(
-        capital(factor) if is_own else capital(name_of(row)),
+        capital(factor if is_own else row.name),
         detail,
         reference,
         level,
-        f"{difference_text(row)} {unit_of(row)}",
-        interval_text(row),
-        p_value(value_of(row, "p_corrected")),
-        is_shown(row),
+        row.difference,
+        row.interval,
+        p_value(row.values["p_corrected"]),
+        row.is_shown,
         difference_mark(row, end),
-        f"{amount(row, end)} {unit_of(row)}",
+        row.with_unit(end),
         row.id,
     )
 
 
-def _side(side: Side, counts: Row | None, is_own: bool, metric: str) -> Side:
+def _side(side: Side, counts: Measured | None, is_own: bool, metric: str) -> Side:
     """Return one side of an effect, with its counts by a row of ``levels``."""
     columns = ("k", "n") if is_own else ("crashed", "ended")
     if counts is None or not (is_own or metric == COLLISIONS.name):
@@ -316,30 +308,18 @@ def _side(side: Side, counts: Row | None, is_own: bool, metric: str) -> Side:
     return replace(side, k=k, n=n, halves=halves, row=counts.id, columns=columns)
 
 
-def _untested(primary: Sequence[Row]) -> set[str]:
-    """Return the factors whose levels all have the same trials as their reference."""
-    tested = [row for row in primary if not is_copied(row)]
-    return {*factors_named(primary)} - {*factors_named(tested)}
-
-
-def _crossing_of(levels: Sequence[Row]) -> str:
-    """Return ``In combination: hurry, persona``."""
-    crossed = [str(row.values["factor"]) for row in levels if len(factors_of(row)) > 1]
-    return f"In combination: {', '.join(crossed[0].split(TIMES))}" if crossed else ""
-
-
-def _counted(levels: Sequence[Row], metric: str, effects: Sequence[Row]) -> str:
+def _counted(levels: Sequence[Measured], metric: str, effects: Sequence[Measured]) -> str:
     """Return how many trials the measure counts, as in ``58 finished trials, 12 with a crash``.
 
     Trials of equal drivers, words and course are one: ``80 identical to another one are left out``,
     with the levels that change nothing.
     """
-    counted, ended = (sum(count_of(row, name) for row in levels) for name in ("n", "ended"))
-    repeated = sum(count_of(row, "repeated") for row in levels)
-    copied = joined([level_text(row) for row in effects if is_copied(row)] or [""])
+    counted, ended = (sum(row.values[name] for row in levels) for name in ("n", "ended"))
+    repeated = sum(row.values["repeated"] for row in levels)
+    copied = joined([row.level for row in effects if is_copied(row)] or [""])
     why = f" ({copied} changes nothing)" if copied else ""
     left_out = f"; {repeated:,} identical to another one{why} are left out" if repeated else ""
-    crashed = sum(count_of(row, "crashed") for row in levels)
+    crashed = sum(row.values["crashed"] for row in levels)
     if metric != LEFT_FIRST.name:
         what = "that ended" if metric == COLLISIONS.name else "that count"
         return f"{counted:,} trials {what}{left_out}"
@@ -348,7 +328,7 @@ def _counted(levels: Sequence[Row], metric: str, effects: Sequence[Row]) -> str:
     return f"{counted:,} finished trials{''.join(parts)}{left_out}"
 
 
-def _of_one_factor(levels: Sequence[Row], drivers: Sequence[str]) -> list[Row]:
+def _of_one_factor(levels: Sequence[Measured], drivers: Sequence[str]) -> list[Measured]:
     """Return the rows of the first drawn factor's levels, of all ``drivers``: every trial once."""
     drawn = [
         row

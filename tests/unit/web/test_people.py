@@ -16,11 +16,11 @@ from merge_runner_analysis.web.people import (
     other_differences,
     verdict_rules,
 )
-from merge_runner_analysis.wording import MEASURES, MOCK, OPEN, PROGRAM, SHOWN, STRONGER, WEAKER
+from merge_runner_analysis.wording import MOCK, OPEN, PROGRAM, SHOWN, STRONGER, WEAKER
 
 
 def driver(name, **verdicts):
-    cells = {of: Cell(None, values, None, "", "", "", "") for of, values in verdicts.items()}
+    cells = {of: Cell(values, None, "", "", "", "") for of, values in verdicts.items()}
     return Driver(name, "baseline", PROGRAM, cells, "", None, "", "")
 
 
@@ -142,7 +142,7 @@ def test_crashes_that_another_rule_ended_are_given_by_peoples_rule_first():
     values = {"measure": "collisions", "state": OPEN, "n": 98, "k": 2, "undecided": 12, "row": "a",
               "ended": 110, "counted": "14 of 110",
               "counted_by": "the rule of centres"}  # fmt: skip
-    cell = Cell(MEASURES["collisions"], values, None, "", "", "", "")
+    cell = Cell(values, None, "", "", "", "")
     shown = likeness_of(replace(driver("a"), cells={"collisions": cell}))["collisions"]
     assert (shown.surely, shown.by_people.replace("\xa0", " ")) == (
         2,

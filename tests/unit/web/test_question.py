@@ -277,7 +277,7 @@ def test_a_small_price_keeps_two_digits():
         [effect(measure=COST, difference=-0.0005, **cheap), effect(p=0.2)], levels_of("hurry")
     )
     assert "Hurry changes the cost of a trial: 0.00024 USD with hurry=yes" in unspaced(made.rest)
-    assert effect_rows.test_text(effect(measure=COST, difference=-0.0005, **cheap)) == (
+    assert effect_rows.measured(effect(measure=COST, difference=-0.0005, **cheap)).test == (
         "−0.00050 USD [−0.0012, 0.00031], corrected p = 0.001"
     )
 
@@ -288,5 +288,5 @@ def test_what_a_person_sees_at_once_is_said_of_several_other_changes():
 
 
 def test_the_end_of_an_interval_reads_as_0_only_where_it_is():
-    assert effect_rows.interval_text(effect(ci=(0.001, 0.075))) == "[0.001, 0.075]"
-    assert effect_rows.interval_text(effect(ci=(-7.0, 0.0))) == "[−7.00, 0.00]"
+    assert effect_rows.measured(effect(ci=(0.001, 0.075))).interval == "[0.001, 0.075]"
+    assert effect_rows.measured(effect(ci=(-7.0, 0.0))).interval == "[−7.00, 0.00]"

@@ -14,7 +14,7 @@ from merge_runner.records import SIDES
 from merge_runner_analysis.metrics import COLLISIONS
 from merge_runner_analysis.tables.formats import printed
 from merge_runner_analysis.tables.model import Table
-from merge_runner_analysis.web.effect_rows import difference_mark, ends_of, metric_of
+from merge_runner_analysis.web.effect_rows import difference_mark, ends_of, rows_of
 from merge_runner_analysis.web.phrases import UNKNOWN, block_meaning
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.scope import carried, scope_of, unmarked
@@ -123,7 +123,7 @@ def differences(
     ends at the same distance on both sides.
     """
     # A driver that is not judged has none.
-    rows = [row for row in table.rows if row.values.get("difference") is not None]
+    rows = [row for row in rows_of(table) if row.values.get("difference") is not None]
     ends = ends_of(rows)
     drivers: dict[str, dict[str, dict[str, Any]]] = {}
     for row in rows:
@@ -132,12 +132,12 @@ def differences(
             continue
         compared = f"{prompt} against {row.values['reference']}"
         of_driver = drivers.setdefault(str(row.values["driver"]), {})
-        of_driver.setdefault(compared, {})[metric_of(row)] = {
+        of_driver.setdefault(compared, {})[row.metric] = {
             **printed(table, row),
             "row": row.id,
             "driver": driver,
             "prompt": prompt,
-            "mark": difference_mark(row, ends[metric_of(row)]),
+            "mark": difference_mark(row, ends[row.metric]),
         }
     return drivers, ends
 
