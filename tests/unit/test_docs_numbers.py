@@ -15,7 +15,7 @@ from merge_runner.scenarios.merge.world import World
 from merge_runner_analysis import wording
 from merge_runner_analysis.published import published
 from merge_runner_analysis.stats.regressions import GAP_MARGIN_M
-from merge_runner_analysis.web import export, report
+from merge_runner_analysis.web import alarms, export
 from merge_runner_analysis.web.pages import conditions
 from merge_runner_analysis.web.trial import account
 from tests.support.harness import PROJECT
@@ -41,7 +41,7 @@ models: longer replies are refused ({ENTRY.max_reply_mb:g})
 models: is refused for {endpoint_state.NOBODY_S:g} to {2 * endpoint_state.NOBODY_S:g} s
 models: warn from {models.SOON_DAYS} days before
 numbers: more than {MOST_INVALID_SHARE * 100:g} % of a model's decisions
-numbers: more than {report.MANY_FALLBACKS * 100:g} % fallbacks
+numbers: more than {alarms.MANY_FALLBACKS * 100:g} % fallbacks
 numbers: together in {PASSES[10, "I1-I4", "paper"]:.0f} % of studies by the paper's rules
 numbers: By the robust rules it is {PASSES[10, "I1-I4", "robust"]:g} %
 numbers: I4 in {PASSES[10, "I4", "robust"]:.0f} % of data sets with 110 trials

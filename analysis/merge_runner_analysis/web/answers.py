@@ -113,7 +113,6 @@ class Numbers:
         return cached(self.db, self._state, options or Selection().key(self.db), name, make)
 
     def _table(self, kind: str, *named: str) -> str:
-        """Return a table, or a comparison of two drivers, each with its prompt."""
         name, selection = _cache_key(kind, *named)
 
         def make() -> str:

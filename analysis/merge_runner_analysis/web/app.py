@@ -133,7 +133,7 @@ def explorer(site: Site) -> Starlette:
             Mount("/static", StaticFiles(directory=STATIC)),
         ],
         middleware=[
-            Middleware(Guard),
+            Middleware(guard),
             Middleware(TrustedHostMiddleware, allowed_hosts=[LOOPBACK, "localhost"]),
             Middleware(GZipMiddleware, minimum_size=2_000),
         ],
@@ -190,7 +190,7 @@ PAGES: dict[str, Callable[..., str | Response]] = {
 
 
 async def _noted(site: Site, request: Request) -> Response:
-    """Keep what a reader notes; see ``Guard`` for who may write."""
+    """Keep what a reader notes; see ``guard`` for who may write."""
     size = whole(request.headers.get("content-length", ""))
     if size is None or size > MOST_NOTED:
         return PlainTextResponse("nothing was noted: the form is too large", 413)
@@ -207,15 +207,10 @@ async def _noted(site: Site, request: Request) -> Response:
     return await run_in_threadpool(write)
 
 
-class Guard:
-    """Refuses requests of other sites' pages but links, and adds HEADERS to every reply."""
+def guard(app: ASGIApp) -> ASGIApp:
+    """Refuse requests of other sites' pages but links, and add HEADERS to every reply."""
 
-    def __init__(self, app: ASGIApp) -> None:
-        self.app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request, as Starlette's pure middleware does."""
-
+    async def guarded(scope: Scope, receive: Receive, send: Send) -> None:
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
@@ -224,8 +219,10 @@ class Guard:
             await send(message)
 
         problem = _problem(Request(scope)) if scope["type"] == "http" else ""
-        app = PlainTextResponse(f"{problem}\n", 403) if problem else self.app
-        await app(scope, receive, send_with_headers)
+        answer = PlainTextResponse(f"{problem}\n", 403) if problem else app
+        await answer(scope, receive, send_with_headers)
+
+    return guarded
 
 
 def _problem(request: Request) -> str:
@@ -244,7 +241,6 @@ def _problem(request: Request) -> str:
 
 
 def _errors(site: Site) -> dict[Any, Callable[[Request, Exception], Response]]:
-    """Return the error page of each exception."""
 
     def error_page(heading: str, code: int, request: Request, exc: Exception) -> Response:
         text = str(exc)

@@ -75,7 +75,6 @@ def answered(rows: Sequence[Row], driver: str = EGO[0], planted: str = "") -> tu
 
 
 def _too_few(primary: Sequence[Measured]) -> str:
-    """Return how many trials the levels with too few have, or nothing."""
     counts = {id(row): [row.values[name] for name in ("n", "n_reference")] for row in primary}
     few = [row for row in primary if min(counts[id(row)]) < ENOUGH]
     if not few:

@@ -100,7 +100,7 @@ def rows_of(table: Table) -> list[Measured]:
 
 
 def measured(row: Row) -> Measured:
-    """Return a row with what it says of its measure."""
+    """Return a row of a table with the texts of its measure."""
     return Measured(row.id, row.groups, row.values, row.note, untested=row.untested)
 
 

@@ -237,7 +237,6 @@ def _links(heads: tuple[str, ...]) -> Links:
 
 @lru_cache(1)
 def _still(db: Path, heads: tuple[str, ...]) -> Site:
-    """Return the site of a process that helps."""
     site = Site(db, _links(heads), policy=POLICY, is_still=True)
     site.trial_index.refresh()
     site.trial_index.ask("SET threads = 1")  # there are several of these
@@ -245,7 +244,6 @@ def _still(db: Path, heads: tuple[str, ...]) -> Site:
 
 
 def _trial_pages(db: Path, heads: tuple[str, ...], rows: Sequence[Row]) -> dict[str, str]:
-    """Return the pages of trials by their addresses."""
     return dict(zip(map(Links().trial, rows), trial_pages(_still(db, heads), rows), strict=True))
 
 

@@ -172,9 +172,9 @@ def list_trials(copy: Copy) -> Listing:
     """List all trials of a copy; raises duckdb.Error where they cannot be read."""
     connection = in_memory(SETTINGS)
     connection.execute(f"ATTACH {copy.file} AS results (READ_ONLY); {BOTH}")
-    connection.execute(JUDGED, columns_of(judged_collisions(connection), 3))
+    connection.execute(JUDGED, columns_of(judged_collisions(connection)))
     connection.execute(POSED)
-    connection.execute(SAID, columns_of(map(_labels, records(connection, DRIVERS, ())), 3))
+    connection.execute(SAID, columns_of(map(_labels, records(connection, DRIVERS, ()))))
     others = other_models(connection)
     connection.execute((LISTED + ";" + OF_TRIALS).format(others=sql_of(others)))
     (state,) = records(connection, STATE, ())
@@ -189,9 +189,9 @@ def judged_collisions(connection: duckdb.DuckDBPyConnection) -> list[tuple[str, 
     ]
 
 
-def columns_of(rows: Iterable[Sequence[object]], number: int) -> list[list[object]]:
-    """Return the columns of rows, also where there are no rows."""
-    return [list(column) for column in zip(*rows, strict=True)] or [[] for _ in range(number)]
+def columns_of(rows: Iterable[Sequence[object]]) -> list[list[object]]:
+    """Return the three columns of rows, also where there are no rows."""
+    return [list(column) for column in zip(*rows, strict=True)] or [[], [], []]
 
 
 def _labels(row: Row) -> tuple[int, str | None, str | None]:

@@ -89,7 +89,6 @@ class Queries:
 
     @contextmanager
     def _answering(self, sql: str) -> Iterator[duckdb.DuckDBPyConnection]:
-        """Run a query, to be fetched; raises UsageError."""
         if len(sql) > LONGEST:
             raise UsageError(
                 f"a query has up to {LONGEST:,} characters here, this one {len(sql):,}"

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import datetime
 from difflib import unified_diff
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -14,20 +15,18 @@ from typing import Any
 import pandas as pd
 from pandas.api.types import is_string_dtype
 
-from merge_runner.drivers.registry import MOCKS
 from merge_runner.errors import UsageError
 from merge_runner.prompts.blocks import BASELINE, title_of
-from merge_runner.records import NO_DECISION
 from merge_runner.results.database import read_database
 from merge_runner.results.provenance import program
-from merge_runner_analysis.cache import cache_finished, digest_of, finished
+from merge_runner_analysis.cache import cached, digest_of
 from merge_runner_analysis.explain import Source, sources_of, sql_command
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.figures.gallery import rendered, write_figures
 from merge_runner_analysis.frames import KEYS
 from merge_runner_analysis.grouping import levels_of
 from merge_runner_analysis.headlines import sentences
-from merge_runner_analysis.provenance import Provenance, provenance, tally
+from merge_runner_analysis.provenance import provenance
 from merge_runner_analysis.published import published
 from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.table_format import TableFormat
@@ -37,6 +36,7 @@ from merge_runner_analysis.tables.comparison import comparison
 from merge_runner_analysis.tables.formats import render, table_view
 from merge_runner_analysis.tables.model import Column, Row, Table
 from merge_runner_analysis.tables.verdicts import verdicts
+from merge_runner_analysis.web.alarms import alarms
 from merge_runner_analysis.web.comparison import Comparison, comparison_of, no_trials
 from merge_runner_analysis.web.listing import judged_collisions
 from merge_runner_analysis.web.names import names_mean, programs_of, short_names
@@ -45,7 +45,7 @@ from merge_runner_analysis.web.question import answer_of
 from merge_runner_analysis.web.rendering import STYLE, environment, inlined_texts, policy_of
 from merge_runner_analysis.web.scope import DESCRIPTIONS
 from merge_runner_analysis.web.urls import Links
-from merge_runner_analysis.wording import HUMANS, LANGUAGE_MODEL, TABLE, number
+from merge_runner_analysis.wording import HUMANS, LANGUAGE_MODEL, TABLE
 
 # The first prompt of each variant, all of the same condition as far as that was played.
 PROMPTS = """
@@ -58,28 +58,6 @@ ORDER BY min((condition, decisions.side, trial_id)) DESC
 LISTED = 300
 # Findings of an alarm that stand open, and the open tables of a study with factors.
 FEW, ANSWERING = 3, ("effects", "levels")
-# The share of a group's decisions above which an alarm is raised: a convention.
-MANY_FALLBACKS = 0.05
-# The worst first: what each alarm says of the groups that it names.
-MEANINGS = {
-    "Another model answered": "These trials are not what they claim to be.",
-    "A mock model answered": "These rows stand last, are in no conclusion, and never beside "
-    "the paper's row of that model.",
-    "Too few valid decisions": "What was driven is mostly not what the model decided: no value, "
-    "test or conclusion rests on these trials.",
-    "Trials repeat earlier ones": "Copies of programs add nothing to any n, interval or test. "
-    "Where a cache answered a language model on the way, or its temperature is 0, equal trials are "
-    "no samples, and intervals and tests claim too much.",
-    "Trials failed": "They are in no measure; the same sweep again plays them anew.",
-    "Many fallbacks": "There the older plan was driven, or none: tables --without-fallbacks shows "
-    "whether that changes the results.",
-    "Decisions are missing": "The plans of these replies were driven, but the tactical decision "
-    "that was asked for is not in them: they are in no table of what drivers say.",
-    "Attempts of unknown fate": "A run was killed before their reply was seen: they may have been "
-    "paid for.",
-    "Several settings under one name": "All but the most frequent, or the newest of these, carry a "
-    "mark. Only levels of factors pool them.",
-}
 LIBRARIES = ("statsmodels", "scipy", "numpy", "pandas", "matplotlib")
 
 
@@ -121,16 +99,14 @@ def finished_figures(
     study: StudyResults, names: Iterable[str] = FIGURES, say: Callable[[str], object] = str
 ) -> dict[str, str]:
     """Return figures by name as SVG in Base64: the stored ones, else new drawings."""
-    files = {name: f"{name}.svg" for name in names}  # a table may have the name alone
-    figures = finished(study.db, study.state, study.options, [*files.values()])
-    drawn = {}
-    for name, file in files.items():
-        if file not in figures:
-            say(f"drawing {name}")
-            drawn[file] = base64.b64encode(rendered(study, name, "svg")).decode()
-    if drawn:
-        cache_finished(study.db, study.state, study.options, drawn)
-    return {name: (figures | drawn)[file] for name, file in files.items()}
+
+    def draw(name: str) -> str:
+        say(f"drawing {name}")
+        return base64.b64encode(rendered(study, name, "svg")).decode()
+
+    kept = study.db, study.state, study.options
+    # A table may have the name alone.
+    return {name: cached(*kept, f"{name}.svg", partial(draw, name)) for name in names}
 
 
 def report_html(study: StudyResults, tables: list[Table], figures: dict[str, str]) -> str:
@@ -311,17 +287,6 @@ def _shown(value: object) -> str:
     return str(value)
 
 
-def alarms(study: StudyResults, origin: Provenance) -> dict[str, tuple[list[str], str]]:
-    """Return the reasons to doubt the results of a study by title, the worst first.
-
-    Each has its findings, one for each group or run, and their meaning.
-    """
-    findings: dict[str, list[str]] = {title: [] for title in MEANINGS}
-    for title, text in _found(study, origin):
-        findings[title].append(text)
-    return {title: (texts, MEANINGS[title]) for title, texts in findings.items() if texts}
-
-
 def crashes(study: StudyResults) -> dict[str, dict[str, int]]:
     """Return the number of crashes of each driver and prompt by cause, the most first."""
     with read_database(study.db) as connection:
@@ -334,65 +299,3 @@ def crashes(study: StudyResults) -> dict[str, dict[str, int]]:
         if of_group:
             counted[group.id] = dict(of_group.most_common())
     return counted
-
-
-def _repeats(study: StudyResults) -> Iterator[str]:
-    """Yield findings on identical trials, at one level of a driver's factors or at several."""
-    by_name: dict[str, list[pd.DataFrame]] = {}
-    for group in study.played:
-        if not group.scripted:
-            by_name.setdefault(group.name, []).append(group.trials)
-        if group.repeated:
-            yield (
-                f"{group.id}: {group.repeated} of {len(group.stored.trials)} trials of programs "
-                "are as an earlier one to the last state; they are left out"
-            )
-        if group.equal:
-            yield (
-                f"{group.id}: {group.equal} of {len(group.trials)} trials are as an earlier one to "
-                "the last state; each counts"
-            )
-    for name, parts in by_name.items():
-        every = pd.concat(parts)
-        distinct = len(every.drop_duplicates(["condition", "way"]))
-        if distinct < len(every):
-            yield (
-                f"{name}: {distinct} of {len(every)} trials of programs at different levels of "
-                "factors are distinct; each counts once where levels are pooled, and copies are "
-                "not compared"
-            )
-
-
-def _found(study: StudyResults, origin: Provenance) -> Iterator[tuple[str, str]]:
-    for pair in origin.mismatches.itertuples():
-        answers = f"{pair.answers} answer{'s' * (pair.answers != 1)}"
-        asked = f"{pair.requested} was asked for, {pair.served} answered"
-        yield "Another model answered", f"{asked}: {answers}, in {pair.sweeps}"
-    for group in (*study.unjudged, *study.unjudged_probes):
-        yield "Too few valid decisions", f"{group.id}: {group.unjudged}"
-    names: dict[str, dict[str, None]] = {}
-    for group in study.played:
-        names.setdefault(group.name, {})[group.name + group.mark] = None
-        trials, counts = len(group.trials), tally(study, group)
-        # A mock model's own name is honest.
-        if group.scripted and MOCKS.isdisjoint(group.models):
-            yield "A mock model answered", f"{group.id}: {group.posing}"
-        if failed := counts["failed"]:
-            reasons = group.trials["error"].dropna()
-            why = reasons.mode().get(0, "no reason is stored")
-            more = ", among other reasons" if reasons.nunique() > 1 else ""
-            yield "Trials failed", f"{failed} of {trials} of {group.id} ({why}{more})"
-        fallbacks, decisions = counts["fallback"], counts["decisions"]
-        if not group.unjudged and fallbacks > MANY_FALLBACKS * decisions:
-            share = number(100 * fallbacks / decisions)
-            text = f"{fallbacks} of {decisions} decisions of {group.id} ({share} %)"
-            yield "Many fallbacks", text
-        if missing := counts[NO_DECISION]:
-            yield "Decisions are missing", f"{missing} of {decisions} decisions of {group.id}"
-        if counts["unknown"]:
-            text = f"{counts['unknown']} of {counts['attempts']} of {group.id}"
-            yield "Attempts of unknown fate", text
-    yield from (("Trials repeat earlier ones", text) for text in _repeats(study))
-    for marked in names.values():
-        if len(marked) > 1:
-            yield "Several settings under one name", ", ".join(marked)

@@ -117,7 +117,7 @@ def scope_of(
         list(sweeps.items()),
         drivers,
         [(name, title_of(name)) for name in prompts],
-        [(name, f"{name}: {site.in_words(name)}") for name in conditions],
+        [(name, f"{name}: {site.trial_index.in_words(name)}") for name in conditions],
     )
 
 

@@ -112,7 +112,7 @@ class Site:
             scope_names=SCOPE,
             clock=clock,
             condition_text=condition_text,
-            in_words=self.in_words,
+            in_words=self.trial_index.in_words,
         )
 
     def begin(self) -> None:
@@ -159,10 +159,6 @@ class Site:
         if job.content is None:
             raise StoreError(job.failure or "it is still being computed: ask again in a minute")
         return job.content
-
-    def in_words(self, condition: str) -> str:
-        """Return a condition in words; empty where no human drove it and it has no trial."""
-        return self.trial_index.condition_texts().get(condition, "")
 
     @property
     def beginning(self) -> bool:

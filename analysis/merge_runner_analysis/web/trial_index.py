@@ -6,7 +6,6 @@ import io
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -126,21 +125,18 @@ def _order_of(sort: str) -> str:
     return f"{SORTS[sort.removeprefix('-')]} {direction} NULLS LAST, trial_id, spec_hash"
 
 
-@dataclass(slots=True)
 class TrialIndex:
     """All trials of a database, as it was when it was last copied."""
 
-    db: Path
-    copies: Copies = field(init=False)
-    _copy: Copy | None = None
-    _read_at: float = 0.0
-    listing: Listing = field(init=False)
-    _lock: threading.RLock = field(default_factory=threading.RLock)
-    _tags: tuple[tuple[str, str, str], ...] = ()
-    _counted: dict[str, Any] = field(default_factory=dict)
+    listing: Listing
 
-    def __post_init__(self) -> None:
-        self.copies = Copies(self.db)
+    def __init__(self, db: Path) -> None:
+        self.db, self.copies = db, Copies(db)
+        self._copy: Copy | None = None
+        self._read_at = 0.0
+        self._lock = threading.RLock()
+        self._tags: tuple[tuple[str, str, str], ...] = ()
+        self._counted: dict[str, Any] = {}
 
     def refresh(self, *, at_once: bool = False) -> bool:
         """Take in what is new in the database; returns whether anything was.
@@ -194,7 +190,7 @@ class TrialIndex:
         with self._lock:
             if tags != self._tags:
                 self.ask("DELETE FROM several WHERE facet = 'tag'")
-                self.ask(TAGGED, *columns_of(tags, 3))
+                self.ask(TAGGED, *columns_of(tags))
                 self._tags, self._counted = tags, {}
 
     def factors(self) -> list[str]:
@@ -273,8 +269,8 @@ class TrialIndex:
         )
         return next(iter(rows), None)
 
-    def condition_texts(self) -> dict[str, str]:
-        """Return the conditions in words, of humans' trials and of all others."""
+    def in_words(self, condition: str) -> str:
+        """Return a condition in words; empty where no human drove it and it has no trial."""
 
         def read() -> dict[str, str]:
             known = {
@@ -284,7 +280,7 @@ class TrialIndex:
             played = {name: of for name, *of in map(dict.values, self.ask(CONDITIONS))}
             return {name: condition_text(*of) for name, of in (known | played).items()}
 
-        return self._once("conditions", read)
+        return self._once("conditions", read).get(condition, "")
 
     def export(self, filters: TrialFilter, sort: str) -> str:
         """Return all trials of a filter as CSV, with a column for each factor but the model."""

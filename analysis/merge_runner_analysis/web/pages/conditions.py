@@ -77,7 +77,7 @@ def condition_page(site: Site, name: str, params: Mapping[str, str]) -> str:
     Raises NotThere, and NothingNew as they were ``seen``.
     """
     state = news_of(site.trial_index.state, params.get("seen", ""))
-    if not site.in_words(name):
+    if not site.trial_index.in_words(name):
         raise NotThere(f"there is no condition {name!r} here")
     bar = scope_of(site, params, any_prompt=True)
     filters = {**bar.scope.filters, "condition": name, "who": ["drivers", "mocks"]}

@@ -9,7 +9,6 @@ from merge_runner.drivers.registry import EMULATOR
 from merge_runner_analysis.headlines import headline
 from merge_runner_analysis.web.comparison import Comparison, compared
 from merge_runner_analysis.web.computing import Job
-from merge_runner_analysis.web.effect_rows import MIDDLE
 from merge_runner_analysis.web.judged import Driver, by_condition, by_kind, humans_of, judged, noted
 from merge_runner_analysis.web.names import PLAYED, names_mean, opponents_text, short_names
 from merge_runner_analysis.web.next_steps import is_found, is_rehearsal, next_steps
@@ -71,7 +70,6 @@ def _beside_people(
     human: Mapping[str, Any],
     conditions: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Return what the page says of likeness to people."""
     verdicts = {
         short[driver.name]: {name: cell.values for name, cell in driver.cells.items()}
         or {"": {"kind": driver.kind}}
@@ -159,7 +157,6 @@ def home_page(site: Site, params: Mapping[str, str]) -> str:
         found=is_found(shown, question or apart),
         prompted=any(driver.facts and driver.facts["asked"] for driver in shown),
         asking=asking,
-        middle=MIDDLE,
         linked=True,
         titles=dict(bar.prompts),
         pair=names if len(names) == 2 else (),

@@ -67,11 +67,9 @@ ORDER BY avg((told.headway_m - mine.headway_m) ** 2), told.trial_id, told.spec_h
 """
 
 
-def trial_page(
-    site: Site, trial_id: str, params: Mapping[str, str], template: str = "trial.html"
-) -> str:
-    """Return a trial with all of its decisions, as a page or by another template."""
-    (page,) = trial_pages(site, [site.trial(trial_id, params.get("spec", ""))], template)
+def trial_page(site: Site, trial_id: str, params: Mapping[str, str]) -> str:
+    """Return a trial with all of its decisions."""
+    (page,) = trial_pages(site, [site.trial(trial_id, params.get("spec", ""))])
     return page
 
 
@@ -121,7 +119,6 @@ def panels(site: Site, row: Row, trial: Trial) -> list[Markup]:
 
 
 def _panel(site: Site, row: Row, trial: Trial, decision: Row) -> Markup:
-    """Return a decision's observation, reply, plan and action."""
     named = {"side": decision["side"], "decision": decision["decision"]}
     query = REPLY.format(decision["call_key"])
     before = decision["before"]
@@ -163,13 +160,16 @@ def _older_s(decision: Row, trial: Trial) -> float | None:
 def others(site: Site, trial_id: str, params: Mapping[str, str]) -> dict[str, Any] | str | None:
     """Return other trials for a trial's page: one to compare, one on offer, or several.
 
-    ``compare=KEY`` gives that trial's drawing, ``offer=KIND`` a key or None.
+    ``compare=KEY`` gives that trial's drawing, ``offer=KIND`` a key or None. A key without a spec
+    stands for the first trial of its name.
     ``q=WORDS`` gives the first trials that have the words, in the same condition before
     others. Raises NotThere.
     """
     row = site.trial(trial_id, params.get("spec", ""))
     if "compare" in params:
-        other = named(site, params["compare"])
+        name, _, spec = (key := params["compare"]).rpartition("@")
+        find = site.trial_index.find
+        other = find(key) or (find(name, spec) if name else None)
         return None if other is None else _laid(site, other)
     if "offer" in params:
         offers = {HUMAN: _nearest_human, REPETITION: _next_repetition}
@@ -186,12 +186,6 @@ def others(site: Site, trial_id: str, params: Mapping[str, str]) -> dict[str, An
         *(row["trial_id"], row["spec_hash"], *words, row["condition"]),
     )
     return {"found": [other | {"note": visible(other["note"])} for other in rows]}
-
-
-def named(site: Site, key: str) -> Row | None:
-    """Return the trial of a key; a name with several specs stands for the first of them."""
-    name, _, spec = key.rpartition("@")
-    return site.trial_index.find(key) or (site.trial_index.find(name, spec) if name else None)
 
 
 def _laid(site: Site, row: Row) -> dict[str, Any] | None:

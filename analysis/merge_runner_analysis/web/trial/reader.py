@@ -87,7 +87,6 @@ def read_trials(connection: DuckDBPyConnection, keys: Sequence[Key]) -> list[Tri
 
 
 def _by_trial(rows: Iterable[Row]) -> dict[Key, list[Row]]:
-    """Return rows by the name and the spec of their trial."""
     by_trial = defaultdict[Key, list[Row]](list)
     for row in rows:
         by_trial[row["trial_id"], row["spec_hash"]].append(row)
