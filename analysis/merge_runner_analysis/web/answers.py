@@ -10,16 +10,14 @@ from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-import duckdb
-
 from merge_runner.errors import UsageError
 from merge_runner.results.database import read_database
-from merge_runner.text_safety import first_line
 from merge_runner_analysis.cache import cached, digest_of, finished, present_state, stamp_of
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.tables.formats import shown_value
 from merge_runner_analysis.tables.model import Column, Table, from_text, to_text
+from merge_runner_analysis.web.reading import readable
 from merge_runner_analysis.wording import MEASURES
 
 if TYPE_CHECKING:
@@ -41,10 +39,8 @@ ORDER BY started_at DESC, sweep_id DESC
 
 def answer(db: Path, request: Request) -> dict[str, Any]:
     """Return the answer of the database as it is now; raises MergeRunnerError."""
-    try:
+    with readable(db):
         return numbers(db, stamp_of(db)).answer(request)
-    except duckdb.Error as exc:  # as where the file is replaced while it is read
-        raise UsageError(f"{db} cannot be read: {first_line(exc)}") from exc
 
 
 def cached_answer(db: Path, request: Request) -> dict[str, Any] | None:

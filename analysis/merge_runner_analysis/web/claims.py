@@ -75,12 +75,11 @@ def answered(rows: Sequence[Row], driver: str = EGO[0], planted: str = "") -> tu
 
 
 def _too_few(primary: Sequence[Measured]) -> str:
-    counts = {id(row): [row.values[name] for name in ("n", "n_reference")] for row in primary}
-    few = [row for row in primary if min(counts[id(row)]) < ENOUGH]
+    few = [row for row in primary if min(row.values["n"], row.values["n_reference"]) < ENOUGH]
     if not few:
         return ""
-    every = [count for row in few for count in counts[id(row)]]
-    trials = " to ".join(dict.fromkeys(map(str, (min(every), max(every)))))
+    counts = [row.values[name] for row in few for name in ("n", "n_reference")]
+    trials = " to ".join(dict.fromkeys(map(str, (min(counts), max(counts)))))
     asked = f"whether {joined(factors_named(few))} changes {changed(primary[0])}"
     return f"too few trials to say {asked}: {trials} a level."
 
@@ -134,22 +133,18 @@ def sizes(rows: Sequence[Measured]) -> str:
 
     A factor with several levels has its largest one.
     """
-    least: dict[str, Measured] = {}
-    for row in rows:
-        factor = row.values["factor"]
-        if row.values.get("detectable") is not None:
-            known = [row, *filter(None, [least.get(factor)])]
-            least[factor] = max(known, key=lambda row: row.values["detectable"])
-    if not least:
-        return ""
+    known = [row for row in rows if row.values.get("detectable") is not None]
+    least = {
+        name: max(row.values["detectable"] for row in known if row.values["factor"] == name)
+        for name in factors_named(known)
+    }
     if len(least) > FEW:
-        factor = max(least, key=lambda name: least[name].values["detectable"])
-        least = {"any factor": least[factor]}
-    first, *others = (
-        (row.amount(row.values["detectable"]), f" ({factor})") for factor, row in least.items()
-    )
-    unit = rows[0].unit
-    return ", ".join([f"{first[0]} {unit}{first[1] * bool(others)}", *map("".join, others)])
+        least = {"any factor": max(least.values())}
+    if len(least) < 2:
+        return known[0].with_unit(*least.values()) if known else ""
+    (factor, first), *others = least.items()
+    texts = [f"{known[0].amount(size)} ({name})" for name, size in others]
+    return ", ".join([f"{known[0].with_unit(first)} ({factor})", *texts])
 
 
 def factors_named(rows: Iterable[Measured]) -> list[str]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from merge_runner.study.arms import MODEL, OPPONENT
 from merge_runner_analysis.metrics import COLLISIONS, LEFT_FIRST
@@ -214,23 +213,19 @@ def _adjusted(levels: Sequence[Measured], effects: Sequence[Measured]) -> list[M
     """
     adjusted: dict[tuple[str, str], Measured] = {}
     for row in levels:
-        name = f"{row.values['factor']}={row.values['level']}"
         for effect in effects:
-            if effect.is_interaction or effect.values.get("estimate") is None:
+            value, base = (effect.values.get(f"estimate{of}") for of in ("", "_reference"))
+            ends = effect.values.get("ci")
+            if effect.is_interaction or value is None:
                 continue
-            base = effect.values["estimate_reference"]
-            values: dict[str, Any] = {"k": None}
-            if name == effect.level:
-                ends = effect.values.get("ci")
+            if row.level == effect.level:
                 ci = ends and tuple(base + end for end in ends)
-                values |= {"value": effect.values["estimate"], "ci": ci}
-            elif name == f"{effect.values['factor']}={_reference(effect)}":
-                values |= {"value": base, "ci": None}
+            elif row.level == f"{effect.values['factor']}={_reference(effect)}":
+                value, ci = base, None
             else:
                 continue
-            adjusted[row.id, number(values["value"])] = replace(
-                row, values={**row.values, **values}
-            )
+            values = {**row.values, "k": None, "value": value, "ci": ci}
+            adjusted[row.id, number(value)] = replace(row, values=values)
     return [*adjusted.values()]
 
 
@@ -254,29 +249,21 @@ def _changes(
 def _change(
     row: Measured, sides: dict[str, Measured], end: float, primary: str, words: dict[str, str]
 ) -> Change:
-    of, base, metric = row.values["level"], row.values["reference"], row.metric
-    factor = row.values["factor"]
-    is_own = metric == primary
-    reference, level = (
-        None
-        if row.is_interaction
-        else _side(
-            Side(unbroken(estimate_text(row, name)), called(factor, side) if is_own else str(side)),
-            sides.get(f"{factor}={side}"),
-            is_own,
-            metric,
-        )
-        for name, side in (("estimate_reference", _reference(row)), ("estimate", of))
-    )
+    factor, of, base = (row.values[name] for name in ("factor", "level", "reference"))
+    is_own, reference, level = row.metric == primary, None, None
     if row.is_interaction:  # whose id has the level of the second factor, too
         first, second = row.factors
-        level_name, at = str(of).split(TIMES)
-        otherwise = str(base).split(TIMES)[1]
+        level_name, at = of.split(TIMES)
+        otherwise = base.split(TIMES)[1]
         detail = (
             f"effect of {first}={level_name} with {second}={at}, less that with "
             f"{second}={otherwise}"
         )
     else:
+        reference, level = (
+            _side(row, name, side, sides.get(f"{factor}={side}"), is_own)
+            for name, side in (("estimate_reference", _reference(row)), ("estimate", of))
+        )
         detail = called(factor, of) if is_own else f"{factor}: {called(factor, of)}"
     if of_level := words.get(row.level.removesuffix(" [scripted]")):
         detail += f": {of_level}"
@@ -295,17 +282,17 @@ def _change(
     )
 
 
-def _side(side: Side, counts: Measured | None, is_own: bool, metric: str) -> Side:
+def _side(row: Measured, name: str, level: str, counts: Measured | None, is_own: bool) -> Side:
     """Return one side of an effect, with its counts by a row of ``levels``."""
+    text = unbroken(estimate_text(row, name))
+    label = called(row.values["factor"], level) if is_own else level
+    if counts is None or not (is_own or row.metric == COLLISIONS.name):
+        return Side(text, label)
     columns = ("k", "n") if is_own else ("crashed", "ended")
-    if counts is None or not (is_own or metric == COLLISIONS.name):
-        return side
-    values: Any = counts.values
-    k, n = (values[column] for column in columns)
-    halves = ""
-    if k is None and metric == LEFT_FIRST.name and values["value"] is not None:
-        halves = f"{round(values['value'] * n / 50) / 2:g}"
-    return replace(side, k=k, n=n, halves=halves, row=counts.id, columns=columns)
+    k, n, value = (counts.values[column] for column in (*columns, "value"))
+    is_half = k is None and row.metric == LEFT_FIRST.name and value is not None
+    halves = f"{round(value * n / 50) / 2:g}" if is_half else ""
+    return Side(text, label, k, halves, n, counts.id, columns)
 
 
 def _counted(levels: Sequence[Measured], metric: str, effects: Sequence[Measured]) -> str:

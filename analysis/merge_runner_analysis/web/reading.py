@@ -34,16 +34,22 @@ Row = dict[str, Any]
 
 
 @contextmanager
-def reading(db: Path, patience_s: float = PATIENCE_S) -> Iterator[duckdb.DuckDBPyConnection]:
-    """Open the database for reading, for a moment; raises UsageError and StoreError.
+def readable(db: Path) -> Iterator[None]:
+    """Raise UsageError where DuckDB cannot read the database.
 
-    What lies there may be damaged, or have been made by another program.
+    It may be damaged, made by another program, or replaced meanwhile.
     """
     try:
-        with ALONE, read_database(db, patience_s=patience_s) as connection:
-            yield connection
+        yield
     except duckdb.Error as exc:
         raise UsageError(f"{db} cannot be read: {first_line(exc)}") from exc
+
+
+@contextmanager
+def reading(db: Path, patience_s: float = PATIENCE_S) -> Iterator[duckdb.DuckDBPyConnection]:
+    """Open the database for reading, for a moment; raises UsageError and StoreError."""
+    with readable(db), ALONE, read_database(db, patience_s=patience_s) as connection:
+        yield connection
 
 
 def records(

@@ -64,8 +64,7 @@ class Scope:
     @property
     def part(self) -> dict[str, str]:
         """The run and the condition that tables are of, as addresses of their cells have them."""
-        part = {"of_run": self.sweep, "of_condition": self.condition}
-        return {name: value for name, value in part.items() if value}
+        return {"of_run": self.sweep, "of_condition": self.condition}
 
     def trials(self, driver: str = "", prompt: str = "") -> dict[str, Any]:
         """Return the filter of its trials, of a driver and a prompt or of all."""

@@ -88,9 +88,10 @@ class Site:
     """Content security policy of a page without a server."""
     inlined: Mapping[str, str] = field(default_factory=dict)
     """The styles and scripts of a page that holds them itself, by name."""
+    beginning = False
+    """True while the trials are read for the first time."""
 
     def __post_init__(self) -> None:
-        self._first_reading: threading.Thread | None = None
         self.trial_index = TrialIndex(self.db)
         self.queries = Queries(self.trial_index.copies)
         self.computing = Computing(self.db)
@@ -109,7 +110,6 @@ class Site:
             program=self.program,
             study=str(self.db) if self.at.served else self.db.name,
             carried={},
-            scope_names=SCOPE,
             clock=clock,
             condition_text=condition_text,
             in_words=self.trial_index.in_words,
@@ -117,14 +117,17 @@ class Site:
 
     def begin(self) -> None:
         """Read the trials and make the first page's table, before anything is asked."""
+        self.beginning = True
         self.computing.ask(("table", TABLE, "", ""), stamp_of(self.db))
 
         def read() -> None:
-            with contextlib.suppress(MergeRunnerError):  # the first page says what is wrong
-                self.refresh()
+            try:
+                with contextlib.suppress(MergeRunnerError):  # the first page says what is wrong
+                    self.refresh()
+            finally:
+                self.beginning = False
 
-        self._first_reading = threading.Thread(target=copy_context().run, args=(read,), daemon=True)
-        self._first_reading.start()
+        threading.Thread(target=copy_context().run, args=(read,), daemon=True).start()
 
     def refresh(self) -> None:
         """Take in what is new: in the database, and in the notes beside it."""
@@ -159,11 +162,6 @@ class Site:
         if job.content is None:
             raise StoreError(job.failure or "it is still being computed: ask again in a minute")
         return job.content
-
-    @property
-    def beginning(self) -> bool:
-        """Return whether the trials are being read for the first time."""
-        return self._first_reading is not None and self._first_reading.is_alive()
 
     def share(self, *options: str, of_study: bool = True) -> str:
         """Return the command that exports the shown pages; ``of_study``: it takes --study."""

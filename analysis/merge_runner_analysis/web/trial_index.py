@@ -11,14 +11,13 @@ from typing import Any, TypeVar
 
 import duckdb
 
-from merge_runner.errors import UsageError
 from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
-from merge_runner.text_safety import csv_writer, first_line
+from merge_runner.text_safety import csv_writer
 from merge_runner_analysis.web.display_text import csv_cell
 from merge_runner_analysis.web.listing import BOTH, FACTOR, Listing, columns_of, list_trials
 from merge_runner_analysis.web.phrases import condition_text
-from merge_runner_analysis.web.reading import Copies, Copy, Row, records
+from merge_runner_analysis.web.reading import Copies, Copy, Row, readable, records
 
 PAGE = 100
 # While a run goes on the database changes all the time: a list of MANY trials, which takes half a
@@ -45,7 +44,7 @@ INSERT INTO several SELECT number, 'tag', tag, 1 FROM listed JOIN (
 """
 SORTS = {"trial": "condition", "outcome": "outcome", "end": "end_time_s", "gap": "gap_m",
          "rmse": "rmse_mps", "invalid": "invalid", "cost": "cost_usd"}  # fmt: skip
-SUMMED = ("decisions", "asked", "invalid", "fallbacks", "no_decision", "attempts", "faults",
+SUMMED = ("asked", "invalid", "fallbacks", "no_decision", "attempts", "faults",
           "answers", "others", "unpriced")  # fmt: skip
 # A reply that several of the trials share counts and costs once. In their last digits sums differ
 # from time to time.
@@ -64,7 +63,7 @@ count(*) FILTER (outcome = 'right first') AS right_first,
 },
 count(*) FILTER (scripted) AS scripted,
 {", ".join(f"coalesce(sum({name}), 0)::BIGINT AS {name}" for name in SUMMED)},
-round(avg(gap_m), 9) AS gap_m, round(avg(rmse_mps), 9) AS rmse_mps,
+round(avg(gap_m), 9) AS gap_m,
 string_agg(DISTINCT stand_in, '; ' ORDER BY stand_in) AS stand_in,
 flatten(list(of_several)) AS every, list_distinct(every) AS once,
 coalesce(len(once), 0) AS shared,
@@ -151,10 +150,8 @@ class TrialIndex:
             copy = self.copies.current()
             if copy is self._copy:
                 return False
-            try:
+            with readable(self.db):
                 self.listing, self._tags, self._counted = list_trials(copy), (), {}
-            except duckdb.Error as exc:
-                raise UsageError(f"{self.db} cannot be read: {first_line(exc)}") from exc
             self._copy, self._read_at = copy, time.monotonic()
             return True
 

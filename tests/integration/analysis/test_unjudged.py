@@ -10,8 +10,8 @@ from merge_runner_analysis.provenance import provenance
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables import make_tables
-from merge_runner_analysis.web.pages.prompts import differences
 from merge_runner_analysis.web.alarms import alarms
+from merge_runner_analysis.web.pages.prompts import differences
 from tests.support.studies import Said, changed, write_study, yielding
 from tests.support.tables import QUICK, made, notes_with
 

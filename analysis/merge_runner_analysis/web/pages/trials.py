@@ -17,7 +17,7 @@ from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.scope import HEADINGS, carried, facets_shown, filter_of, sort_of
 from merge_runner_analysis.web.search import FACETS, LIMITS, search, terms_of
 from merge_runner_analysis.web.site import NotThere, Site, download, news_of
-from merge_runner_analysis.web.trial_index import PAGE, SORTS, TrialFilter
+from merge_runner_analysis.web.trial_index import PAGE, TrialFilter
 from merge_runner_analysis.web.urls import CELL, whole
 
 MOST = 4  # drivers whose sums stand above a list
@@ -65,7 +65,6 @@ def trials_page(site: Site, params: Mapping[str, str]) -> str:
         cell=cell,
         computed=named,
         sort=sort,
-        sorts=SORTS,
         totals=[row | {"driver": plain(row["model"])} for row in totals if len(totals) <= MOST],
         trials=trials,
         asked=sum(part["asked"] for part in totals),

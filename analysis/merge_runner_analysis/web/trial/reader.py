@@ -62,10 +62,8 @@ class Trial:
     @property
     def by_side(self) -> dict[Side, list[Row]]:
         """The decisions of each side that has any."""
-        decisions = self.decisions
-        return {
-            side: rows for side in SIDES if (rows := [d for d in decisions if d["side"] == side])
-        }
+        by_side = {side: [d for d in self.decisions if d["side"] == side] for side in SIDES}
+        return {side: rows for side, rows in by_side.items() if rows}
 
 
 def read_trials(connection: DuckDBPyConnection, keys: Sequence[Key]) -> list[Trial]:
