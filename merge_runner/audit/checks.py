@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from operator import itemgetter
@@ -15,7 +15,7 @@ import duckdb
 
 from merge_runner.errors import StoreError
 from merge_runner.results.database import append, by_name, read_database
-from merge_runner.results.instance import SIZES, limit_memory
+from merge_runner.results.instance import limit_memory
 from merge_runner.results.rows import TrialKey
 from merge_runner.served_model import other_models
 from merge_runner.text_safety import first_line
@@ -123,7 +123,6 @@ def _queries(file: str) -> dict[str, str]:
 
 CHECKS, FACTS, REST = map(_queries, ("checks.sql", "facts.sql", "rest.sql"))
 OF_CALLS = ("served_findings", "attempt_findings", "exchanged_findings", "shared_findings")
-CALL_FINDINGS = [CHECKS[name] for name in OF_CALLS]
 
 
 @contextmanager
@@ -136,22 +135,22 @@ def audited_database(
     """
     try:
         with read_database(path) as connection:
-            limit_memory(connection)
-            prepare(connection, sweep_id)
+            prepare(connection, limit_memory(connection), sweep_id)
             yield connection
     except duckdb.Error as exc:
         raise StoreError(f"{path} cannot be audited: {first_line(exc)}") from exc
 
 
-def prepare(connection: duckdb.DuckDBPyConnection, sweep_id: str | None = None) -> None:
+def prepare(
+    connection: duckdb.DuckDBPyConnection, longest: int, sweep_id: str | None = None
+) -> None:
     """Create the tables of checks.sql, and read the reply ids of a sweep, or of all.
 
-    Replies whose id is repeated are compared.
+    Replies whose id is repeated are compared. ``longest`` is the length of the longest reply.
     """
     connection.execute(CHECKS["tables"])
     append(connection, "other_models", other_models(connection))
     connection.execute("SET VARIABLE sweep_id = ?", [sweep_id])
-    [(longest, _)] = connection.execute(SIZES).fetchall()
     [(rows,)] = connection.execute("SELECT coalesce(max(rowid), -1) + 1 FROM calls").fetchall()
     step = max(1, PARSED_BYTES // longest if longest > LONG_REPLY else rows)
     for first in range(0, rows, step):
@@ -162,7 +161,8 @@ def prepare(connection: duckdb.DuckDBPyConnection, sweep_id: str | None = None) 
     for first in range(0, len(rowids), REPLIES_AT_ONCE):  # a chunk is in memory at once
         replies = connection.execute(REPLIES, [rowids[first : first + REPLIES_AT_ONCE]]).fetchall()
         append(connection, "contents", [(rowid, _content(reply)) for rowid, reply in replies])
-    connection.execute(CHECKS["repeated_ids"])
+    if rowids:
+        connection.execute(CHECKS["repeated_ids"])
 
 
 def _content(reply: str) -> str:
@@ -183,10 +183,27 @@ def sweep_facts(connection: duckdb.DuckDBPyConnection, sweep_id: str) -> dict[st
     connection.execute(FACTS["tables"])
     facts = next(by_name(connection.execute(FACTS["decided"])))
     for name in ("outcomes", "failed", "others", "stand_ins", "same_prompts"):
-        facts[name] = connection.execute(FACTS[name]).fetchall()
+        rows = connection.execute(FACTS[name]).fetchall() if facts.get(name, True) else []
+        facts[name] = rows
     for name in ("levels", "first_looks"):
-        facts[name] = list(by_name(connection.execute(FACTS[name])))
+        facts[name] = (
+            list(by_name(connection.execute(FACTS[name]))) if facts.get(name, True) else []
+        )
     return facts
+
+
+def counted(connection: duckdb.DuckDBPyConnection) -> tuple[dict[str, int], set[str]]:
+    """Return the numbers of checked items, and the names of the blocks that may have a row."""
+    counts = dict(connection.execute(CHECKS["counts"]).fetchall())
+    possible = {block for (block,) in connection.execute(CHECKS["possible"]).fetchall()}
+    if counts["attempts"] > counts["calls"]:
+        possible.add("attempt_findings")
+    return counts, possible | {"exchanged_findings"}
+
+
+def of_calls(possible: Collection[str]) -> list[str]:
+    """Return the queries for findings about calls, of the ``possible`` blocks."""
+    return [CHECKS[name] for name in OF_CALLS if name in possible]
 
 
 def check_sweep(
@@ -205,9 +222,11 @@ def check_sweep(
     append(connection, "subject", [(sweep_id, finished, bool(planned))])
     append(connection, "planned", planned)
     connection.execute(TRIALS)
-    counts = {"trials": len(planned), **next(by_name(connection.execute(CHECKS["counts"])))}
-    findings = findings_of(connection, (CHECKS["list_findings"], *CALL_FINDINGS), sweep_id)
-    notes = [*notes_of(connection, counts)]
+    numbers, possible = counted(connection)
+    counts = {"trials": len(planned), **numbers}
+    queries = [CHECKS["list_findings"], *of_calls(possible)]
+    findings = findings_of(connection, queries, sweep_id)
+    notes = [*notes_of(connection, counts, possible)]
     missing, failed = counts["missing"], counts["failed"]
     if not finished and missing + failed:
         text = f"unfinished: {missing} of {len(planned)} trials are missing, {failed} failed"
@@ -243,9 +262,12 @@ def findings_of(
     ]
 
 
-def notes_of(connection: duckdb.DuckDBPyConnection, counts: Mapping[str, int]) -> Iterator[str]:
-    """Yield the notes of an audit with these ``counts``."""
-    yield from (text for (text,) in connection.execute(CHECKS["notes"]).fetchall())
+def notes_of(
+    connection: duckdb.DuckDBPyConnection, counts: Mapping[str, int], possible: Collection[str]
+) -> Iterator[str]:
+    """Yield the notes of an audit with these ``counts`` and ``possible`` blocks."""
+    if "notes" in possible:
+        yield from (text for (text,) in connection.execute(CHECKS["notes"]).fetchall())
     if not counts[OF_MOCKS]:  # the emulator has only a few phrases
         [(answers,)] = connection.execute(CHECKS["alike"]).fetchall()
         if answers:
@@ -253,7 +275,8 @@ def notes_of(connection: duckdb.DuckDBPyConnection, counts: Mapping[str, int]) -
                 f"all {answers} replies to prompts that were asked before are word for word as "
                 "before: are they samples?"
             )
-    for group, model, invalid, asked in connection.execute(DECIDED).fetchall():
+    decided = connection.execute(DECIDED).fetchall() if counts["invalid"] else []
+    for group, model, invalid, asked in decided:
         if reason := not_judged(model, invalid, asked):
             yield f"{group}: {reason}"
 

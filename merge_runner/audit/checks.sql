@@ -155,18 +155,28 @@ FROM (
     ) GROUP BY model_left, model_right, side, prompt_hash
 );
 
--- counts: numbers of what is checked.
-FROM (SELECT count(*) AS stored FROM linked SEMI JOIN trials USING (trial_id, spec_hash)),
-    (SELECT count(*) FILTER (NOT elsewhere) AS missing FROM unplayed),
-    (SELECT count(*) AS failed FROM linked
-        SEMI JOIN (FROM trials WHERE status = 'failed') USING (trial_id, spec_hash)),
-    (SELECT count(*) AS decisions, count(*) FILTER (NOT valid) AS invalid
-    FROM decisions SEMI JOIN audited USING (trial_id, spec_hash)),
-    (SELECT count(DISTINCT call_key) AS calls, count(*) AS attempts,
-        count(*) FILTER (scripted) AS "attempts answered by a mock model"
-    FROM calls SEMI JOIN audited USING (trial_id, spec_hash)),
-    (SELECT count(DISTINCT reply_id) AS "reply ids"
-    FROM reply_ids SEMI JOIN audited USING (trial_id, spec_hash));
+-- counts: numbers of what is checked, by name.
+SELECT 'stored' AS name, count(*) AS number
+FROM linked SEMI JOIN trials USING (trial_id, spec_hash)
+UNION ALL SELECT 'missing', count(*) FROM unplayed WHERE NOT elsewhere
+UNION ALL SELECT 'failed', count(*)
+FROM linked SEMI JOIN (FROM trials WHERE status = 'failed') USING (trial_id, spec_hash)
+UNION ALL SELECT unnest(['decisions', 'invalid']), unnest([count(*), count(*) FILTER (NOT valid)])
+FROM decisions SEMI JOIN audited USING (trial_id, spec_hash)
+UNION ALL SELECT unnest(['calls', 'attempts', 'attempts answered by a mock model']),
+    unnest([count(DISTINCT call_key), count(*), count(*) FILTER (scripted)])
+FROM calls SEMI JOIN audited USING (trial_id, spec_hash)
+UNION ALL SELECT 'reply ids', count(DISTINCT reply_id)
+FROM reply_ids SEMI JOIN audited USING (trial_id, spec_hash);
+
+-- possible: the blocks that may have a row, attempt_findings also if there are more attempts than
+-- calls. To plan the others would take longer than to look here.
+SELECT 'attempt_findings' AS block FROM calls HAVING min(attempt) <> 1 OR max(attempt) <> 1
+UNION ALL SELECT 'shared_findings' FROM decisions HAVING count(call_key) > count(DISTINCT call_key)
+UNION ALL SELECT unnest(['shared_findings', 'notes']) FROM repeated_ids
+UNION ALL SELECT 'notes' FROM unplayed WHERE elsewhere
+UNION ALL SELECT 'notes' FROM sweeps HAVING count(*) > 1
+UNION ALL SELECT 'served_findings' FROM other_models;
 
 -- notes: no findings. Earlier runs that played trials of this one are runs of the same name and
 -- drivers, which it resumes, or other sweeps.

@@ -54,11 +54,17 @@ WITH driven AS (
 SELECT list(variant ORDER BY variant) AS variants
 FROM prompts GROUP BY trials HAVING count(*) > 1 ORDER BY ALL;
 
--- decided: numbers of decisions.
-SELECT count(*) AS decisions, count(*) FILTER (NOT valid) AS invalid,
-    count(*) FILTER (fallback) AS fallbacks,
-    count(*) FILTER (failure = 'no_decision') AS no_decision
-FROM decisions SEMI JOIN played USING (trial_id, spec_hash);
+-- decided: numbers of decisions; and by the names of other blocks, whether these may have a row: to
+-- plan them takes longer.
+FROM (SELECT count(*) AS decisions, count(*) FILTER (NOT valid) AS invalid,
+        count(*) FILTER (fallback) AS fallbacks,
+        count(*) FILTER (failure = 'no_decision') AS no_decision
+    FROM decisions SEMI JOIN played USING (trial_id, spec_hash)),
+    (SELECT coalesce(bool_or(status = 'failed'), false) AS failed,
+        coalesce(bool_or(source = 'first_decision'), false) AS first_looks,
+        coalesce(bool_or(scripted) AND min(variant) < max(variant), false) AS same_prompts
+    FROM played),
+    (SELECT count(*) > 0 AS others FROM other_models);
 
 -- first_looks: first decisions without the closed loop. The velocity is the driver's minus the other's.
 -- The action is the net acceleration over the first step, for an invalid reply the fallback's. The

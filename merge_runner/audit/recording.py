@@ -10,19 +10,19 @@ from pathlib import Path
 import duckdb
 
 from merge_runner.audit.checks import (
-    CALL_FINDINGS,
-    CHECKS,
     Audit,
     Finding,
+    counted,
     findings_of,
     notes_of,
+    of_calls,
     prepare,
 )
 from merge_runner.errors import RecordingError
 from merge_runner.llm.store import CachedCall
 from merge_runner.records import SIDES, canonical_json
-from merge_runner.results.database import append, by_name, schema_sql
-from merge_runner.results.instance import SETTINGS, in_memory
+from merge_runner.results.database import append, schema_sql
+from merge_runner.results.instance import SETTINGS, SIZES, in_memory
 from merge_runner.results.recorded_sweeps import described_sweeps
 from merge_runner.results.recording import read_provenance, read_recording
 from merge_runner.results.rows import Row, TrialKey, call_row
@@ -46,12 +46,13 @@ def audit_recording(file: Path) -> Audit:
         configs = (canonical_json({"models": sweep.models}) for sweep in sweeps)
         rows = ((n, "", NEVER, None, None, c, None, None, "{}") for n, c in enumerate(configs))
         append(connection, "sweeps", rows)  # for the aliases of models
-        prepare(connection)
+        [(longest, _)] = connection.execute(SIZES).fetchall()
+        prepare(connection, longest)
         connection.execute("INSERT INTO audited SELECT trial_id, spec_hash FROM trials")
-        counts = next(by_name(connection.execute(CHECKS["counts"])))
+        counts, possible = counted(connection)
         shown = {name: counts[name] for name in ("calls", "attempts", "reply ids")}
-        findings = findings_of(connection, CALL_FINDINGS)
-        return Audit(str(file), shown, findings, notes=[*notes_of(connection, counts)])
+        findings = findings_of(connection, of_calls(possible))
+        return Audit(str(file), shown, findings, notes=[*notes_of(connection, counts, possible)])
 
 
 def _fill(connection: duckdb.DuckDBPyConnection, entries: Iterator[CachedCall]) -> None:

@@ -87,7 +87,7 @@ def complete_app() -> typer.Typer:
 def app_with_one_command(command: str | None) -> typer.Typer:
     """Return the program with the options of one command, in half the time that all would take.
 
-    The other commands have only a name and a help text.
+    The other commands have only a name and a help text, and the other groups no commands.
     """
     light = copy(app)
     light.registered_commands = [copy(info) for info in app.registered_commands]
@@ -96,6 +96,12 @@ def app_with_one_command(command: str | None) -> typer.Typer:
         name = info.name or info.callback.__name__
         if name != command:
             info.name, info.help, info.callback = name, info.callback.__doc__, lambda: None
+    light.registered_groups = [copy(info) for info in app.registered_groups]
+    for group in light.registered_groups:
+        assert group.typer_instance is not None
+        if group.name != command:
+            group.typer_instance = copy(group.typer_instance)
+            group.typer_instance.registered_commands = []
     return light
 
 

@@ -1,7 +1,6 @@
 """The commands that play a study."""
 
-from __future__ import annotations
-
+# Annotations are no texts here: Typer would evaluate each of them four times.
 import gc
 import inspect
 import json
@@ -171,9 +170,9 @@ def sweep(
 
 def _play_all(
     studies: Sequence[str],
-    plans: Callable[[str], list[Plan]],
-    play: Callable[[Plan, Options], int],
-    options: Options,
+    plans: Callable[[str], "list[Plan]"],
+    play: Callable[["Plan", "Options"], int],
+    options: "Options",
 ) -> int:
     """Play studies one after the other; return the first exit code that is not 0."""
     from merge_runner.llm.models import shutdown_notes
@@ -200,7 +199,9 @@ def _play_all(
     return next(filter(None, codes), 0)
 
 
-def _plans(name: str, *, selection: dict[str, Any], options: Options, trust: bool) -> list[Plan]:
+def _plans(
+    name: str, *, selection: dict[str, Any], options: "Options", trust: bool
+) -> "list[Plan]":
     """Return the plan of a study, or those in a recording, which is played whole."""
     from merge_runner.run.plan import make_plan
 
@@ -238,11 +239,11 @@ def replay(**options: Any) -> None:  # noqa: ANN401 # the options of sweep
     sweep(**{**options, "replay": True})
 
 
-_parameters = inspect.signature(sweep, eval_str=True).parameters.values()
+_parameters = inspect.signature(sweep).parameters.values()
 replay.__signature__ = inspect.Signature([*map(_as_in_replay, _parameters)])  # type: ignore[attr-defined] # read by typer
 
 
-def _estimate(plan: Plan, options: Options, *, show_prompts: bool, as_json: bool) -> int:
+def _estimate(plan: "Plan", options: "Options", *, show_prompts: bool, as_json: bool) -> int:
     import asyncio
 
     from merge_runner.run import estimate_lines as lines
@@ -259,7 +260,7 @@ def _estimate(plan: Plan, options: Options, *, show_prompts: bool, as_json: bool
     return 0
 
 
-def _play_plan(plan: Plan, options: Options, *, whole: bool, yes: bool, as_json: bool) -> int:
+def _play_plan(plan: "Plan", options: "Options", *, whole: bool, yes: bool, as_json: bool) -> int:
     import asyncio
 
     from merge_runner.run.estimate_lines import estimate_lines
@@ -267,7 +268,7 @@ def _play_plan(plan: Plan, options: Options, *, whole: bool, yes: bool, as_json:
     from merge_runner.run.summary import as_lines
     from merge_runner.run.sweep import play
 
-    def ask(expected: Estimate) -> None:
+    def ask(expected: "Estimate") -> None:
         lines = "\n".join(estimate_lines(expected))
         agree(lines, "Go ahead?", otherwise="nothing was sent", yes=yes)
 

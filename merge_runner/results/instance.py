@@ -91,8 +91,10 @@ class Instance:
         self._connection = None
 
 
-def limit_memory(connection: duckdb.DuckDBPyConnection, longest: int = 0) -> None:
+def limit_memory(connection: duckdb.DuckDBPyConnection, longest: int = 0) -> int:
     """Limit DuckDB to little memory and one thread for short texts and few calls.
+
+    Returns the length of the longest stored text.
 
     The limit holds until the instance closes the database. ``longest`` is the length of the
     longest text to store. A row group of such calls takes 32 MB, an audit of 200,000 calls 110 MB;
@@ -102,6 +104,7 @@ def limit_memory(connection: duckdb.DuckDBPyConnection, longest: int = 0) -> Non
     is_little = bool(max(stored, longest) < 8_192 and calls < 210_000)
     limit = f"{110 + calls // 7_000}MB" if is_little else SETTINGS["memory_limit"]
     connection.execute(f"SET memory_limit = '{limit}'; SET threads = {2 - is_little}")
+    return int(stored)
 
 
 def merge_small_groups(connection: duckdb.DuckDBPyConnection, added: int) -> None:
