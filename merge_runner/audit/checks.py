@@ -20,20 +20,6 @@ from merge_runner.results.rows import TrialKey
 from merge_runner.served_model import other_models
 from merge_runner.text_safety import first_line
 
-TRIALS = """
-CREATE OR REPLACE TEMP TABLE linked AS
-SELECT trial_id, spec_hash, count(*) AS links FROM sweep_trials SEMI JOIN subject USING (sweep_id)
-GROUP BY ALL;
-CREATE OR REPLACE TEMP TABLE unplayed AS
-SELECT trial_id, trials.status IS NOT NULL AS elsewhere
-FROM planned ANTI JOIN linked USING (trial_id)
-LEFT JOIN (
-    FROM trials SEMI JOIN sweep_trials USING (trial_id, spec_hash) WHERE status <> 'failed'
-) AS trials USING (trial_id, spec_hash);
-CREATE OR REPLACE TEMP TABLE audited AS
-SELECT trial_id, spec_hash FROM linked SEMI JOIN trials USING (trial_id, spec_hash)
-ANTI JOIN done USING (trial_id, spec_hash)
-"""
 # Members of a reply that hold the model's answer, over all wire formats.
 ANSWER_MEMBERS = ("choices", "output", "candidates", "content")
 MOST_INVALID_SHARE = 0.2
@@ -177,17 +163,23 @@ def _content(reply: str) -> str:
     return hashlib.blake2b(answer, digest_size=16).hexdigest()
 
 
+def result(connection: duckdb.DuckDBPyConnection, query: str) -> duckdb.DuckDBPyConnection:
+    """Run a query, for which the table ``drivers`` is made if it reads that."""
+    if "JOIN drivers " in query:
+        connection.execute(CHECKS["drivers"])
+    return connection.execute(query)
+
+
 def sweep_facts(connection: duckdb.DuckDBPyConnection, sweep_id: str) -> dict[str, Any]:
     """Count a sweep's trials, decisions and replies in an audited database."""
     connection.execute("SET VARIABLE sweep_id = ?", [sweep_id])
     connection.execute(FACTS["tables"])
     facts = next(by_name(connection.execute(FACTS["decided"])))
     for name in ("outcomes", "failed", "others", "stand_ins", "same_prompts"):
-        rows = connection.execute(FACTS[name]).fetchall() if facts.get(name, True) else []
-        facts[name] = rows
+        facts[name] = result(connection, FACTS[name]).fetchall() if facts.get(name, True) else []
     for name in ("levels", "first_looks"):
         facts[name] = (
-            list(by_name(connection.execute(FACTS[name]))) if facts.get(name, True) else []
+            list(by_name(result(connection, FACTS[name]))) if facts.get(name, True) else []
         )
     return facts
 
@@ -221,7 +213,7 @@ def check_sweep(
     connection.execute("DELETE FROM subject; DELETE FROM planned")
     append(connection, "subject", [(sweep_id, finished, bool(planned))])
     append(connection, "planned", planned)
-    connection.execute(TRIALS)
+    connection.execute(CHECKS["trials"])
     numbers, possible = counted(connection)
     counts = {"trials": len(planned), **numbers}
     queries = [CHECKS["list_findings"], *of_calls(possible)]
@@ -245,7 +237,7 @@ def check_rest(connection: duckdb.DuckDBPyConnection, path: Path) -> Audit:
             count(*) FILTER (source = 'human') AS "human trials" FROM trials)
     """
     counts = next(by_name(connection.execute(sql)))
-    shared = connection.execute(REST["calls_in_common"]).fetchall()
+    shared = result(connection, REST["calls_in_common"]).fetchall()
     notes = [f"{first} and {second} share {calls} calls" for first, second, calls in shared]
     return Audit(str(path), counts, findings_of(connection, [REST["orphans"]]), notes)
 
@@ -255,7 +247,7 @@ def findings_of(
 ) -> list[Finding]:
     """Return the rows of the queries, one by one: a joint query would need their joint memory."""
     selects = (f"SELECT DISTINCT * FROM ({query}) ORDER BY ALL" for query in queries)  # noqa: S608 # constants
-    rows = [row for select in selects for row in by_name(connection.execute(select))]
+    rows = [row for select in selects for row in by_name(result(connection, select))]
     return [
         Finding(r["kind"], r["text"], sweep_id, r["trial_id"], r.get("side"), r.get("decision"))
         for r in sorted(rows, key=itemgetter("kind"))
@@ -275,7 +267,7 @@ def notes_of(
                 f"all {answers} replies to prompts that were asked before are word for word as "
                 "before: are they samples?"
             )
-    decided = connection.execute(DECIDED).fetchall() if counts["invalid"] else []
+    decided = result(connection, DECIDED).fetchall() if counts["invalid"] else []
     for group, model, invalid, asked in decided:
         if reason := not_judged(model, invalid, asked):
             yield f"{group}: {reason}"

@@ -1,16 +1,11 @@
 -- Checks that a replay cannot make. Each block is a query by name: DuckDB would plan a view twice.
 
--- tables: the audited sweep, its planned trials (if subject.known), its list of trials, the planned
--- ones that it does not list (elsewhere: another sweep played it after this one stopped), its stored
--- trials, the trials that were audited before, and pairs of models that do not match; then the ids of
--- replies, and the requests that they name; hashes of the answers whose id another call has too.
+-- tables: the audited sweep, its planned trials (if subject.known), the trials that were audited
+-- before, and pairs of models that do not match; then the ids of replies, and the requests that they
+-- name; hashes of the answers whose id another call has too.
 CREATE OR REPLACE TEMP TABLE subject (sweep_id VARCHAR, finished BOOLEAN, known BOOLEAN);
 CREATE OR REPLACE TEMP TABLE planned (trial_id VARCHAR, spec_hash VARCHAR);
-CREATE OR REPLACE TEMP TABLE linked (trial_id VARCHAR, spec_hash VARCHAR, links BIGINT);
-CREATE OR REPLACE TEMP TABLE unplayed (trial_id VARCHAR, elsewhere BOOLEAN);
-CREATE OR REPLACE TEMP TABLE audited AS SELECT trial_id, spec_hash FROM trials LIMIT 0;
-CREATE OR REPLACE TEMP TABLE done AS FROM audited;
-CREATE OR REPLACE TEMP TABLE drivers AS SELECT trial_id, spec_hash, driver FROM trial_drivers;
+CREATE OR REPLACE TEMP TABLE done (trial_id VARCHAR, spec_hash VARCHAR);
 CREATE OR REPLACE TEMP TABLE other_models (model_requested VARCHAR, model_served VARCHAR);
 CREATE OR REPLACE TEMP TABLE ids (call_rowid BIGINT, reply_id VARCHAR, answered JSON);
 CREATE OR REPLACE TEMP TABLE reply_ids (
@@ -20,6 +15,24 @@ CREATE OR REPLACE TEMP TABLE contents (call_rowid BIGINT, content VARCHAR);
 CREATE OR REPLACE TEMP TABLE repeated_ids (
     endpoint VARCHAR, model_requested VARCHAR, reply_id VARCHAR, telling BOOLEAN);
 CREATE OR REPLACE TEMP MACRO text_of(json) AS if(json_type(json) = 'VARCHAR', json->>'$', NULL);
+
+-- trials: the sweep's list of trials, the planned ones that it does not list (elsewhere: another sweep
+-- played it after this one stopped), and its stored trials that were not audited before.
+CREATE OR REPLACE TEMP TABLE linked AS
+SELECT trial_id, spec_hash, count(*) AS links FROM sweep_trials SEMI JOIN subject USING (sweep_id)
+GROUP BY ALL;
+CREATE OR REPLACE TEMP TABLE unplayed AS
+SELECT trial_id, trials.status IS NOT NULL AS elsewhere
+FROM planned ANTI JOIN linked USING (trial_id)
+LEFT JOIN (
+    FROM trials SEMI JOIN sweep_trials USING (trial_id, spec_hash) WHERE status <> 'failed'
+) AS trials USING (trial_id, spec_hash);
+CREATE OR REPLACE TEMP TABLE audited AS
+SELECT trial_id, spec_hash FROM linked SEMI JOIN trials USING (trial_id, spec_hash)
+ANTI JOIN done USING (trial_id, spec_hash);
+
+-- drivers: made for the first query that reads them, since few do; each would plan the view anew.
+CREATE TEMP TABLE IF NOT EXISTS drivers AS SELECT trial_id, spec_hash, driver FROM trial_drivers;
 
 -- list_findings: faults of the sweep's list of trials.
 SELECT 'missing' AS kind, trial_id, 'it was not played' AS text

@@ -10,6 +10,7 @@ from pathlib import Path
 import duckdb
 
 from merge_runner.audit.checks import (
+    CHECKS,
     Audit,
     Finding,
     counted,
@@ -48,6 +49,7 @@ def audit_recording(file: Path) -> Audit:
         append(connection, "sweeps", rows)  # for the aliases of models
         [(longest, _)] = connection.execute(SIZES).fetchall()
         prepare(connection, longest)
+        connection.execute(CHECKS["trials"])
         connection.execute("INSERT INTO audited SELECT trial_id, spec_hash FROM trials")
         counts, possible = counted(connection)
         shown = {name: counts[name] for name in ("calls", "attempts", "reply ids")}

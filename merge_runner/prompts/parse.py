@@ -52,19 +52,18 @@ _CHOICE = (
     rf"|(?:(?P<merge>{_MERGE})|yield(?: to the other (?:car|driver|vehicle))?)"
     r"(?![^\W_])(?:[\W_]++(?P<same>[MY])(?![^\W_]))?+)"
 )
+# Texts, which re compiles at the first use and keeps: few replies need them.
 # Some replies number their parts like the output format; a brace begins a JSON object.
 _HEAD = r"(?:[^\w{]|_)*+(?:1[\W_]++)?"
-_CHOICE_LINE = re.compile(rf"{_HEAD}(?P<label>{_LABEL}*+){_CHOICE}[\W_]*+", re.IGNORECASE)
-_CHOICE_WITH_REASON = re.compile(
-    rf"{_HEAD}{_LABEL}++{_CHOICE}[*_`\"')\]]*+ ?"
-    r"(?P<reason>[.,:;(\u2013\u2014-]|(?=because|since)) ?",
-    re.IGNORECASE,
+_CHOICE_LINE = rf"(?i){_HEAD}(?P<label>{_LABEL}*+){_CHOICE}[\W_]*+"
+_CHOICE_WITH_REASON = (
+    rf"(?i){_HEAD}{_LABEL}++{_CHOICE}[*_`\"')\]]*+ ?"
+    r"(?P<reason>[.,:;(\u2013\u2014-]|(?=because|since)) ?"
 )
-_HEADING = re.compile(rf"{_HEAD}{_LABEL}++", re.IGNORECASE)
-_MEMBER = re.compile(
-    r"""[{,]\s*+["'](?:tactical|decision|tactical[ _]decision|choice)["']\s*+:\s*+"""
-    rf"""["']{_CHOICE}["']""",
-    re.IGNORECASE,
+_HEADING = rf"(?i){_HEAD}{_LABEL}++"
+_MEMBER = (
+    r"""(?i)[{,]\s*+["'](?:tactical|decision|tactical[ _]decision|choice)["']\s*+:\s*+"""
+    rf"""["']{_CHOICE}["']"""
 )
 # Text after a choice that revokes it: another choice, as in "M, Y" and "yield; no, merge first".
 _CONTRARY = {
@@ -179,17 +178,17 @@ def _in_words(prose: str, text: str) -> tuple[Tactical | None, str]:
     short = [line for line in lines if len(line) <= _LONGEST_LINE]
     heads = [line for line in lines[:2] if len(line) <= _LONGEST_LINE]
     # A label may be a heading, above the choice.
-    count = 2 if len(heads) == 2 and _HEADING.fullmatch(f"{heads[0]} ") else 1
-    whole = _CHOICE_LINE.fullmatch(" ".join(heads[:count]))
+    count = 2 if len(heads) == 2 and re.fullmatch(_HEADING, f"{heads[0]} ") else 1
+    whole = re.fullmatch(_CHOICE_LINE, " ".join(heads[:count]))
     if whole and (choice := _choice(whole)):
         return choice, "\n".join(lines[count:]).strip()
-    begin = _CHOICE_WITH_REASON.match(prose[: 2 * _LONGEST_LINE])
+    begin = re.match(_CHOICE_WITH_REASON, prose[: 2 * _LONGEST_LINE])
     if begin and (choice := _choice(begin)):
         is_taken_back = _CONTRARY[choice].match(prose, begin.start("reason"))
         return (None, prose) if is_taken_back else (choice, prose[begin.end() :].strip())
-    matches = [match for line in short if (match := _CHOICE_LINE.fullmatch(line))]
+    matches = [match for line in short if (match := re.fullmatch(_CHOICE_LINE, line))]
     choices = {*map(_choice, [match for match in matches if match["label"]])}
-    choices = choices or {*map(_choice, _MEMBER.finditer(text))}
+    choices = choices or {*map(_choice, re.finditer(_MEMBER, text))}
     return (choices.pop() if len(choices) == 1 else None), prose
 
 

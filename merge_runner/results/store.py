@@ -87,7 +87,8 @@ class Store:
                 if not has_these_measures(connection):
                     connection.execute(measures_sql())
             else:
-                connection.execute(schema_sql())
+                # Definitions have nothing to optimize; the setting ends with the connection.
+                connection.execute(f"PRAGMA disable_optimizer; {schema_sql()}")
                 connection.execute("INSERT INTO meta VALUES (?)", [SCHEMA_VERSION])
             tables = (*RESULTS, "sweep_trials")
             self._columns = {table: columns_of(connection, table) for table in tables}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import platform
 from collections.abc import Iterator
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -17,7 +16,11 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, NonNegativeInt
 STALE_S = 10.0
 MOST_BYTES = 1_000_000
 # Identifies the machine among those that share a folder: process ids mean nothing on another one.
-MACHINE = hashlib.sha256(platform.node().encode()).hexdigest()[:8]
+MACHINE = hashlib.sha256(os.uname().nodename.encode()).hexdigest()[:8]
+
+
+def _own_pid() -> int:
+    return os.getpid()  # of the builtin itself, pydantic would parse the signature at import
 
 
 class ProgressSnapshot(BaseModel):
@@ -31,7 +34,7 @@ class ProgressSnapshot(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     sweep_id: str
-    pid: int = Field(default_factory=os.getpid, ge=1, lt=2**31)
+    pid: int = Field(default_factory=_own_pid, ge=1, lt=2**31)
     machine: str = MACHINE
     updated_at: AwareDatetime
     doing: Literal["playing", "checking"]
