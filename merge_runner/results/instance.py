@@ -18,8 +18,8 @@ file's size up to which its row groups are merged."""
 MANY_CALLS = 256
 """Calls that are added at once and need not be merged: their blocks are nearly full."""
 SIZES = """
-SELECT greatest(max(stats(request).max_string_length), max(stats(reply).max_string_length), 0),
-    (SELECT count(*) FROM calls)
+SELECT greatest(max(stats(request).max_string_length::BIGINT),
+    max(stats(reply).max_string_length::BIGINT), 0), (SELECT count(*) FROM calls)
 FROM (SELECT request, reply FROM calls WHERE rowid < 0 UNION ALL SELECT NULL, NULL)
 """
 """Length of the longest text, from DuckDB's statistics alone, and the number of calls."""
