@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 import subprocess
-from importlib.metadata import distribution, version
+from importlib.metadata import version
 
 from merge_runner.paths import PROJECT
 
@@ -13,13 +13,7 @@ PACKAGES = ("merge-runner", "diskcache", "duckdb", "httpx", "httpx-aiohttp", "py
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and the packages."""
-    return {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}}
-
-
-def _version(package: str) -> str:
-    """Return the version of a package, without a parse of its metadata, which has its README."""
-    lines = (distribution(package).read_text("METADATA") or "").splitlines()
-    return next(line for line in lines if line.startswith("Version: ")).removeprefix("Version: ")
+    return {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
 
 
 def git_state() -> tuple[str, bool | None]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import socket
 from collections.abc import Iterator
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -16,7 +17,7 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, NonNegativeInt
 STALE_S = 10.0
 MOST_BYTES = 1_000_000
 # Identifies the machine among those that share a folder: process ids mean nothing on another one.
-MACHINE = hashlib.sha256(os.uname().nodename.encode()).hexdigest()[:8]
+MACHINE = hashlib.sha256(socket.gethostname().encode()).hexdigest()[:8]
 
 
 def _own_pid() -> int:
