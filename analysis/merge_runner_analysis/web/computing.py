@@ -16,7 +16,6 @@ from concurrent.futures import Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +42,7 @@ class Job:
     database has changed since where it is ``older``.
     """
 
+    request: Request
     answer: Future[dict[str, Any]]
     state: tuple[int, ...]
     begun: float
@@ -50,9 +50,17 @@ class Job:
     older: bool = False
 
     @property
-    def at(self) -> str:
-        """Start time, in local time with its zone."""
-        return f"{datetime.fromtimestamp(self.begun).astimezone():%Y-%m-%d %H:%M:%S %Z}"
+    def what(self) -> str:
+        """What is computed, in words."""
+        match self.request:
+            case ["comparison", one, other, *_]:
+                return f"the comparison of {one} and {other}"
+            case ["cell", table, *_]:
+                return f"the trials behind a number of the table {table}"
+            case [kind, name, *_]:
+                return f"the {kind} {name}"
+            case _:
+                return f"the {' '.join(self.request)} of the results"
 
     @property
     def elapsed_s(self) -> float:
@@ -105,7 +113,7 @@ class Computing:
                 and (is_absent or job.elapsed_s > STANDS_S)
             ):
                 before = None if job is None or is_absent else replace(job, before=None)
-                job = Job(self._submit(request), state, time.time(), before)
+                job = Job(request, self._submit(request), state, time.time(), before)
             self._jobs[request] = job
             if len(self._jobs) > REMEMBERED:
                 del self._jobs[next(iter(self._jobs))]

@@ -21,6 +21,7 @@ from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.served_model import Pair, other_models, sql_of
 from merge_runner_analysis.calls import COUNTED
 from merge_runner_analysis.drivers import language_models, stand_in, unresponsive
+from merge_runner_analysis.web.asked import list_sent
 from merge_runner_analysis.web.reading import Copy, Row, records
 from merge_runner_analysis.web.trial.account import ALONE, OTHER_ACCOUNTS, Course, collision_class
 from merge_runner_analysis.web.trial.reader import scenario_of
@@ -157,7 +158,7 @@ STATE = "SELECT count(*) AS trials, bit_xor(hash(listed)) AS prints FROM listed"
 
 
 class Listing(NamedTuple):
-    """The tables ``listed`` and ``several`` of one state of a database.
+    """The tables ``listed``, ``several``, ``sent`` and ``unasked`` of one state of a database.
 
     ``others`` are pairs of models, requested and served, that differ; ``state`` changes with the
     listed ``trials`` or their values.
@@ -177,6 +178,7 @@ def list_trials(copy: Copy) -> Listing:
     connection.execute(SAID, columns_of(map(_labels, records(connection, DRIVERS, ()))))
     others = other_models(connection)
     connection.execute((LISTED + ";" + OF_TRIALS).format(others=sql_of(others)))
+    list_sent(connection)
     (state,) = records(connection, STATE, ())
     return Listing(connection, others, state)
 

@@ -155,7 +155,7 @@ def report_html(study: StudyResults, tables: list[Table], figures: dict[str, str
         cited=published("sources"),
         program=program(),
         version=version("merge-runner"),
-        made_at="",  # equal results give equal reports
+        played_at="",  # equal results give equal reports
         trials=len(study.frames.trials),
         digest=digest_of(study.db, study.state),
     )

@@ -16,6 +16,7 @@ LONGEST = 65_536  # characters of a text that are searched
 MOST_TERMS, LONGEST_QUERY = 12, 300
 TERM = re.compile(r'"([^"]*)"?|([^\s"]+)')
 SHOWN, BEFORE = 600, 200  # characters that are shown of a text, and of these before a match
+NOT_ASKED = "not asked"  # whose prompt asked for no M or Y, whatever the reply says
 FACETS = ("tactical", "planned", "driven", "switch", "failure", "sweep", "model", "variant",
           "condition", "outcome", "account", "tag")  # fmt: skip
 # In figures: the least or the most of a mean, as a part of the greatest acceleration.
@@ -30,20 +31,27 @@ ACTION = (
 )
 # A line break is a space to whoever looks for a phrase.
 FOLDED = f"lower(translate(left(rationale, {LONGEST}), chr(10) || chr(13) || chr(9), '   '))"
-# A change of mind is between what a driver said and what it had said before. ``place`` is the row
-# of the text: a search reads all texts, a page reads only the texts that it shows.
+# A change of mind is between what a driver, asked for it, said and what it had said before.
+# ``place`` is the row of the text: a search reads all texts, a page only those that it shows.
 HITS = f"""
 CREATE TEMP TABLE hits AS
 WITH decided AS (
-    SELECT trial_id, spec_hash, side, decision, time_s, coalesce(tactical, 'none') AS tactical,
-        CASE WHEN tactical <> lag(tactical IGNORE NULLS) OVER said
-            THEN lag(tactical IGNORE NULLS) OVER said || ' to ' || tactical END AS switch,
-        failure, {ACTION.format("plan")} AS planned, {ACTION.format("applied")} AS driven,
-        list_avg(plan) AS plan_mean, list_avg(applied) AS drive_mean, rowid AS place
-    FROM decisions WHERE call_key IS NOT NULL
+    SELECT trial_id, spec_hash, side, decision, time_s,
+        if(is_asked, coalesce(word, 'none'), '{NOT_ASKED}') AS tactical,
+        CASE WHEN word <> lag(word IGNORE NULLS) OVER said
+            THEN lag(word IGNORE NULLS) OVER said || ' to ' || word END AS switch,
+        coalesce(trim(rationale), '') <> '' AS has_words, failure,
+        {ACTION.format("plan")} AS planned, {ACTION.format("applied")} AS driven,
+        list_avg(plan) AS plan_mean, list_avg(applied) AS drive_mean, place
+    FROM (
+        SELECT * EXCLUDE (tactical), if(is_asked, tactical, NULL) AS word
+        FROM (SELECT *, rowid AS place, rowid NOT IN (FROM unasked) AS is_asked FROM decisions)
+        WHERE call_key IS NOT NULL
+    )
     WINDOW said AS (PARTITION BY trial_id, spec_hash, side ORDER BY decision)
 )
-SELECT number, side, decision, time_s, tactical, switch, failure, planned, driven, plan_mean, place
+SELECT number, side, decision, time_s, tactical, switch, has_words, failure, planned, driven,
+    plan_mean, place
 FROM decided JOIN listed USING (trial_id, spec_hash) WHERE {{}}
 """  # noqa: S608 # constants
 FOUND = "hits JOIN listed USING (number)"
@@ -76,6 +84,8 @@ def search(
         (totals,) = records(
             connection,
             "SELECT count(*) AS decisions, count(DISTINCT number) AS trials, "
+            "count(*) FILTER (NOT has_words) AS silent, "
+            f"count(*) FILTER (tactical = '{NOT_ASKED}') AS unasked, "
             "histogram(planned) FILTER (tactical = 'M') AS \"M\", "
             f"histogram(planned) FILTER (tactical = 'Y') AS \"Y\" {matches}",
             values,
@@ -100,7 +110,7 @@ def search(
     crossed = {letter: counts for letter in "MY" if (counts := totals.pop(letter))}
     for row in rows:
         text = texts.get(row["place"])
-        row["pieces"] = None if text is None else pieces_of(text, terms)
+        row["pieces"] = None if not (text or "").strip() else pieces_of(text, terms)
     return {**totals, "hits": rows, "page": page, "last_page": last_page, "facets": facets,
             "crossed": crossed}  # fmt: skip
 

@@ -35,6 +35,10 @@ _PARTS = "moment track charts ribbons panel clock comparison start"
 REPLAY = [f"replay/{part}.js" for part in _PARTS.split()]
 PAGES = {"Study": HOME, "Drivers": "drivers", "Trials": "trials", "Words": "words",
          "Prompts": "prompts", "Runs": "sweeps", "SQL": "sql"}  # fmt: skip
+PLAYED = """
+SELECT count(*) AS runs, min(started_at) AS first, max(coalesce(ended_at, started_at)) AS last,
+    count(ended_at) AS ended FROM results.sweeps
+"""
 # The parts of a scope in an address; the list of trials filters by the same names.
 SCOPE = ("sweep", "model", "variant", "condition")
 # Pages with one list of all their entries.
@@ -107,6 +111,7 @@ class Site:
             pages=PAGES,
             lists=LISTS,
             share=self.share,
+            played=self.played,
             program=self.program,
             study=str(self.db) if self.at.served else self.db.name,
             carried={},
@@ -162,6 +167,16 @@ class Site:
         if job.content is None:
             raise StoreError(job.failure or "it is still being computed: ask again in a minute")
         return job.content
+
+    def played(self) -> str:
+        """Return when the database's runs were played; empty without one."""
+        ((runs, first, last, ended),) = map(dict.values, self.trial_index.ask(PLAYED))
+        if not runs:
+            return ""
+        times = [f"{time:%Y-%m-%d %H:%M}" for time in (first, last)]
+        end = f" to {times[1]}" if times[1] != times[0] else ""
+        going = "" if ended == runs else ", not all ended"
+        return f"{f'in {runs} runs ' if runs > 1 else ''}{times[0]}{end} UTC{going}"
 
     def share(self, *options: str, of_study: bool = True) -> str:
         """Return the command that exports the shown pages; ``of_study``: it takes --study."""

@@ -1,6 +1,7 @@
 """Prompts of a study whose words are given to one driver, side by side and pair by pair."""
 
 import re
+import shutil
 
 import pytest
 
@@ -9,6 +10,7 @@ from merge_runner_analysis.web.pages import home
 from merge_runner_analysis.web.site import Site
 from tests.support.harness import FAST
 from tests.support.serving import Page, client_of
+from tests.support.studies import damage
 
 STUDY = """
 models = ["emulator"]
@@ -106,3 +108,52 @@ def test_pairs_are_found_although_an_effect_is_planted_with_the_prompt(db):
     assert "emulator: persona=taxi, " not in page.text  # these ended as with the baseline
     assert "No driver was run with another prompt" not in page.text
     assert f"{differing} of {pairs} ended differently" in text
+
+
+def test_every_text_that_was_sent_is_shown_with_its_share_of_the_decisions(db):
+    sql = (
+        "SELECT variant, count(*) FILTER (prompt LIKE '%Road type: straight%'), count(*) "
+        "FROM decisions JOIN trials USING (trial_id, spec_hash) GROUP BY ALL"
+    )
+    with client_of(db) as client:
+        cards = client.get("/prompts").text.split('<section class="card"')[1:]
+    said = {card.partition('"')[2].partition('"')[0]: Page(card).text for card in cards}
+    share = re.compile(r"(Before|After) the merge point (\d+) of (\d+) decisions \(([\d.]+) %")
+    for variant, after, sent in query(db, sql)[1]:
+        texts = share.findall(said[variant])
+        assert sum(int(k) for _, k, *_ in texts) == sent
+        assert sum(int(k) for road, k, *_ in texts if road == "After") == after > 0
+        assert all((int(n), f"{100 * int(k) / sent:.2f}") == (sent, of) for _, k, n, of in texts)
+    before, _, later = said["baseline"].partition("After the merge point")
+    assert ("Road type: straight" in before, "Road type: straight" in later) == (False, True)
+    assert "%), without C4: tactical decision" in later
+
+
+def test_a_letter_that_no_prompt_asked_for_is_no_decision_and_silence_is_no_words(db, tmp_path):
+    copy = shutil.copy(db, tmp_path / "t.duckdb")
+    after = "prompt LIKE '%Road type: straight%'"
+    damage(copy, f"UPDATE decisions SET tactical = 'Y', rationale = ' ' WHERE {after}")
+    _, [(yielding, silent, every)] = query(
+        copy,
+        f"SELECT count(*) FILTER (tactical = 'Y' AND NOT {after}), count(*) FILTER ({after}), "
+        "count(*) FROM decisions",
+    )
+    assert yielding > 0
+    with client_of(copy) as client:
+        page = Page(client.get("/words").text)
+        for word, number in (("Y", yielding), ("not asked", silent)):
+            text = client.get("/words", params={"tactical": word}).text
+            assert f"<strong>{number:,}</strong> decisions" in text
+    words = f"{every - silent:,} with words, {silent:,} without"
+    assert f"{every:,} decisions in 20 trials: {words}" in page.text
+    assert f"Left out: {silent:,} whose prompt did not ask who goes first." in page.text
+
+
+def test_the_share_of_a_text_is_of_the_chosen_trials(db, tmp_path):
+    copy = shutil.copy(db, tmp_path / "t.duckdb")
+    damage(copy, "UPDATE trials SET condition = 'L_4_0' WHERE rep = 1")
+    sql = "SELECT count(*) FROM decisions JOIN trials USING (trial_id, spec_hash) WHERE "
+    with client_of(copy) as client:
+        for rule, of in (("rep > 0", {}), ("rep = 1", {"condition": "L_4_0"})):
+            _, [(sent,)] = query(copy, f"{sql}{rule} AND variant = 'baseline'")
+            assert f" of {sent} decisions" in Page(client.get("/prompts", params=of).text).text

@@ -2,12 +2,14 @@
 
 import os
 import re
+import shutil
 import signal
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from contextvars import copy_context
 from dataclasses import replace
+from datetime import UTC, datetime
 from functools import partial
 from html import unescape
 from urllib.parse import parse_qs, unquote, urlsplit
@@ -32,7 +34,7 @@ from merge_runner_analysis.web.computing import Computing
 from tests.support.cases import cases
 from tests.support.gate import HANGS_S
 from tests.support.serving import Page, client_of, in_process, listed, never
-from tests.support.studies import Said, write_study, yielding
+from tests.support.studies import Said, damage, write_study, yielding
 
 HOSTILE = '<img src=x onerror="alert(1)">'
 
@@ -211,14 +213,36 @@ def test_a_page_is_served_while_a_computation_runs_and_a_failure_is_said(db):
         raise UsageError("it broke <off>")
 
     client = client_of(db, in_process(db, slow))
-    assert "Computing, " in client.get("/tables/attempts").text
+    waiting = client.get("/tables/attempts").text
+    assert "Computing the table attempts, 0" in Page(waiting).text
+    assert re.search('<noscript><meta http-equiv="refresh" content="[1-9]"></noscript>', waiting)
     assert asked.wait(HANGS_S)
     assert listed(client.get("/trials").text) == 66
-    assert "Computing, " in client.get("/prompts").text
+    assert "Computing the table " in client.get("/prompts").text
     going.set()
-    while "Computing, " in (later := client.get("/tables/attempts").text):
+    while "Computing the table " in (later := client.get("/tables/attempts").text):
         pass
     assert "This could not be computed:</strong> it broke &lt;off&gt;" in later
+    assert "http-equiv" not in later
+
+
+def test_a_page_says_when_the_trials_were_played_and_no_time_at_which_it_was_made(db, tmp_path):
+    copy = shutil.copy(db, tmp_path / "t.duckdb")
+    begun, ended = "2026-11-21 10:00", "2026-11-22 03:04"
+    for end, said in (("NULL", " UTC, not all ended"), (f"'{ended}:05'", f" to {ended} UTC")):
+        damage(copy, f"UPDATE sweeps SET started_at = '{begun}:00', ended_at = {end}")
+        with client_of(copy) as client:
+            for page in ("/tables/attempts", "/cite", "/prompts"):
+                text = client.get(page).text
+                assert f" trials, played {begun}{said}" in Page(text).text
+                assert f"{datetime.now(UTC):%Y-%m-%d}" not in text
+    damage(
+        copy,
+        "INSERT INTO sweeps BY NAME SELECT * REPLACE ('newer' AS sweep_id, NULL AS ended_at, "
+        "TIMESTAMP '2026-11-23 00:00:00' AS started_at) FROM sweeps",
+    )
+    text = Page(client_of(copy).get("/cite").text).text
+    assert f"played in 2 runs {begun} to 2026-11-23 00:00 UTC, not all ended;" in text
 
 
 def test_an_older_answer_stands_for_a_while_and_until_there_is_a_newer_one(db, monkeypatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from collections.abc import Collection, Mapping
 from functools import partial
@@ -10,7 +11,7 @@ from typing import Any
 
 from merge_runner.planted_effect import PARAMETERS as PLANTED
 from merge_runner.prompts.blocks import BASELINE, blocks_of
-from merge_runner.records import SIDES
+from merge_runner.records import ROADS, SIDES
 from merge_runner_analysis.metrics import COLLISIONS
 from merge_runner_analysis.tables.formats import printed
 from merge_runner_analysis.tables.model import Table
@@ -19,7 +20,8 @@ from merge_runner_analysis.web.phrases import UNKNOWN, block_meaning
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.scope import carried, scope_of, unmarked
 from merge_runner_analysis.web.site import NotThere, Site
-from merge_runner_analysis.web.trial.prompt_parts import Part, digests_of, level_of, parts_of
+from merge_runner_analysis.web.trial.prompt_parts import digests_of, level_of, parts_of
+from merge_runner_analysis.web.trial_index import TrialFilter, where_of
 
 # The blocks of a prompt, as its specs name them; a program has none.
 STORED = """
@@ -27,28 +29,27 @@ SELECT any_value(names) AS names FROM listed JOIN (
     SELECT spec_hash, json_keys(spec, '$.prompt_blocks') AS names FROM specs
 ) USING (spec_hash) WHERE variant = ? AND len(names) > 0
 """
-# The first prompt of each variant with the baseline's on the same side: all of the same condition,
-# as far as that was played. The ego's and the other driver's apart, where their words may differ.
+# The first prompt of each variant on each road, how many were ``sent``, and the baseline's on the
+# same side: all of the same condition, as far as that was played. The ego's and the other driver's
+# apart, where their words may differ.
 FIRST = """
-WITH asked AS (
-    SELECT *, CASE WHEN focal IS NULL THEN 'both' WHEN side = focal THEN 'ego' ELSE 'other' END
-        AS reader
-    FROM decisions JOIN trials USING (trial_id, spec_hash)
-    WHERE decision = 0 AND prompt IS NOT NULL
-), firsts AS (
-    SELECT variant, reader, arg_min(side, (condition, side, trial_id)) AS side,
-        arg_min(prompt, (condition, side, trial_id)) AS prompt,
-        arg_min(spec_hash, (condition, side, trial_id)) AS spec_hash
-    FROM asked GROUP BY ALL
+WITH firsts AS (
+    SELECT variant, reader, road, count(*) AS sent,
+        arg_min(place, (decision, condition, side, trial_id)) AS place
+    FROM {sent} GROUP BY ALL
 ), baselines AS (
-    SELECT side, arg_min(prompt, (condition, trial_id)) AS baseline
-    FROM asked WHERE variant = $1 GROUP BY ALL
-)
-SELECT * REPLACE (coalesce(blocks, '{}') AS blocks)
-FROM firsts LEFT JOIN baselines USING (side) LEFT JOIN (
-    SELECT spec_hash, spec->>'$.prompt_blocks' AS blocks FROM specs
-) USING (spec_hash) ORDER BY variant <> $1, variant, reader
+    SELECT side, road, arg_min(place, (decision, condition, trial_id)) AS base
+    FROM sent WHERE variant = ? GROUP BY ALL
+), texts AS (SELECT rowid AS place, prompt FROM decisions)
+SELECT firsts.*, sent.side, sent.blocks, texts.prompt, bases.prompt AS baseline
+FROM firsts JOIN sent USING (place) JOIN texts USING (place) LEFT JOIN baselines
+    ON baselines.side = sent.side AND baselines.road = firsts.road
+LEFT JOIN texts AS bases ON bases.place = baselines.base
+ORDER BY firsts.variant <> ?, firsts.variant, firsts.road, firsts.reader
 """
+IN_SCOPE = "(FROM sent SEMI JOIN (FROM listed WHERE {}) USING (trial_id, spec_hash))"
+ON_ROADS = {"merge": "Before the merge point", "straight": "After the merge point"}
+VALUES = re.compile(r"[-\d.,\[\] ]+")
 # Trials of a variant and of its driver's baseline in equal conditions and repetitions, whose specs
 # differ in nothing but the prompt, and what it plants in the emulator.
 PAIRS = """
@@ -89,7 +90,8 @@ def prompts_page(site: Site, params: Mapping[str, str]) -> str:
         carried=carried(params),
         job=job,
         contrasts=contrasts,
-        prompts=_first_prompts(site),
+        prompts=_prompts(site, {**bar.scope.trials(), "model": bar.scope.drivers}),
+        on_roads=ON_ROADS,
         left_out=partial(left_out, site),
         drivers=drivers,
         ends=ends,
@@ -100,17 +102,36 @@ def prompts_page(site: Site, params: Mapping[str, str]) -> str:
     )
 
 
-def _first_prompts(site: Site) -> dict[str, dict[str, list[Part]]]:
-    """Return the first prompt's parts, by variant and reader: two readers where theirs differ."""
-    by_variant: dict[str, dict[str, list[Part]]] = {}
-    seen: dict[str, list[list[Part]]] = {}
-    for row in site.trial_index.ask(FIRST, BASELINE):
-        variant, digests = row["variant"], digests_of(json.loads(row["blocks"]), row["side"])
-        parts = parts_of(row["prompt"], row["baseline"], digests)
+def _prompts(site: Site, filters: TrialFilter) -> dict[str, list[dict[str, Any]]]:
+    """Return each variant's texts, by road and reader: two readers where theirs differ.
+
+    Each has its ``parts`` and ``changes``, and the number of decisions for which it was ``sent``.
+    After the merge point the values of two prompts differ, so that these have no ``changes``, but
+    the names of the blocks ``without`` which they are.
+    """
+    where, values = where_of(filters)
+    source = IN_SCOPE.format(where) if values else "sent"
+    rows = site.trial_index.ask(FIRST.format(sent=source), *values, BASELINE, BASELINE)
+    by_variant: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        texts = by_variant.setdefault(row["variant"], [])
+        is_before = row["road"] == ROADS[0]
+        baseline = row["baseline"] if is_before else None
+        digests = digests_of(json.loads(row["blocks"]), row["side"])
+        parts = parts_of(row["prompt"], baseline, digests)
         changes = [part for part in parts if part.changed or row["baseline"] is None]
-        if changes not in seen.setdefault(variant, []):
-            seen[variant].append(changes)
-            by_variant.setdefault(variant, {})[row["reader"]] = parts
+        words = [(part.name, VALUES.sub(" ", "".join(t for _, t in part.pieces))) for part in parts]
+        gist = changes if is_before else words
+        same = [text for text in texts if (text["road"], text["gist"]) == (row["road"], gist)]
+        if same:
+            same[0]["sent"] += row["sent"]
+            continue
+        earlier = [text for text in texts if text["reader"] == row["reader"]]
+        names = {part.name for text in earlier for part in text["parts"]}
+        without = [_named(name) for name in sorted(names - {part.name for part in parts} - {""})]
+        changed = [part for part in parts if part.changed]
+        made = {"parts": parts, "changes": changed, "gist": gist, "without": without}
+        texts.append(row | made)
     return by_variant
 
 
