@@ -14,8 +14,15 @@ from merge_runner.text_safety import quoted
 from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.frames import KEYS
 from merge_runner_analysis.grouping import Group
+from merge_runner_analysis.metrics import METRICS
 from merge_runner_analysis.provenance import call_counts
 from merge_runner_analysis.published import HUMAN, citation
+from merge_runner_analysis.stats.first_action import (
+    KINDS,
+    GroupDriver,
+    drivers_of,
+    first_actions,
+)
 from merge_runner_analysis.stats.levels import distinct
 from merge_runner_analysis.stats.verdicts import hits
 from merge_runner_analysis.study import StudyResults
@@ -29,15 +36,22 @@ QUERY = (
     "WHERE trials.spec_hash IN ({specs}) AND trials.trial_id IN ({trials}) ORDER BY ALL"
 )
 
+# Columns with the value of a row's measure, a share if the measure is a rate.
+SHARES = ("value", "estimate", "estimate_reference", "value_reference")
+
 
 class Source(NamedTuple):
-    """Trials of a group behind a row, with a query; a share counts those in ``numerator``."""
+    """Trials of a group behind a row; a value that ``counts`` some has them in ``numerator``.
+
+    The query gives the trials that it counts, otherwise all.
+    """
 
     group: str
     text: str
     query: str = ""
     trials: tuple[str, ...] = ()
     numerator: tuple[str, ...] = ()
+    counts: bool = False
 
 
 class Explanation(NamedTuple):
@@ -68,8 +82,11 @@ class Explanation(NamedTuple):
         return lines
 
 
-def explain(study: StudyResults, table: Table, cell: str) -> Explanation:
-    """Explain a ROW of a table, or ``ROW:COLUMN``; raises UsageError."""
+def explain(study: StudyResults, table: Table, cell: str, *, of_all: bool = False) -> Explanation:
+    """Explain a ROW of a table, or ``ROW:COLUMN``; raises UsageError.
+
+    ``of_all``: the trials of which a value counts some are meant, its denominator.
+    """
     rows = {row.id: row for row in table.rows}
     row_id, _, name = (cell, "", "") if cell in rows else cell.rpartition(":")
     hint = f"`merge-runner tables {table.name} --format csv` shows all rows and columns"
@@ -82,7 +99,7 @@ def explain(study: StudyResults, table: Table, cell: str) -> Explanation:
         value=texts[name] if name else ", ".join(f"{name} {text}" for name, text in texts.items()),
         meaning=table.heading + (f": {column.meaning or column.heading}" if column else ""),
         note=row.note,
-        sources=sources_of(study, table, row, column),
+        sources=sources_of(study, table, row, column, of_all=of_all),
         command=sql_command(study),
     )
 
@@ -93,7 +110,12 @@ def sql_command(study: StudyResults) -> str:
 
 
 def sources_of(
-    study: StudyResults, table: Table, row: Row, column: Column | None = None
+    study: StudyResults,
+    table: Table,
+    row: Row,
+    column: Column | None = None,
+    *,
+    of_all: bool = False,
 ) -> tuple[Source, ...]:
     """Return the trials of each group behind a row, and those that a share counts."""
     if column is not None and column.name.startswith("ceiling"):
@@ -103,9 +125,16 @@ def sources_of(
     groups = [group for group in known if group.id in row.groups]
     if column is not None and column.counts == COUNTED and row.values.get(column.name):
         once = (distinct(study, group) for group in groups)
-        return tuple(_counted(group, str(row.values["measure"])) for group in once)
+        return tuple(_counted(group, str(row.values["measure"]), of_all=of_all) for group in once)
     rests_on = (column.rests_on if column else "") or row.rests_on
     counts = column.counts if column else ""
+    if column and column.name in SHARES and rests_on in _rates():
+        counts = rests_on
+    counts *= not of_all
+    if counts in KINDS and rests_on:
+        drivers = [driver for group in groups for driver in drivers_of(group)]
+        named = [of for of in drivers if row.id == "/".join(filter(None, (of.group.id, of.side)))]
+        return tuple(_first_actions(study, driver, counts) for driver in named)
     sources = []
     for group in groups:
         if rests_on and group.measured:
@@ -117,12 +146,32 @@ def sources_of(
     return tuple(sources)
 
 
-def _counted(group: Group, measure: str) -> Source:
+def _rates() -> set[str]:
+    """Return the columns of trials whose mean is a share."""
+    return {metric.column for metric in METRICS.values() if metric.rate}
+
+
+def _counted(group: Group, measure: str, *, of_all: bool) -> Source:
     went = hits(group, measure)
     names = group.trials.loc[went.index, "trial_id"]
     trials, numerator = tuple(names), tuple(names[went])
     text = f"{len(trials)} of {len(group.trials)} trials; the value counts {len(numerator)} of them"
-    return Source(group.id, text, _query(group, trials), trials, numerator)
+    if of_all:
+        return Source(group.id, text, _query(group, trials), trials)
+    return Source(group.id, text, _query(group, trials, numerator), trials, numerator, counts=True)
+
+
+def _first_actions(study: StudyResults, driver: GroupDriver, kind: str) -> Source:
+    """Return the trials of a driver with a first action of a kind, of those with any."""
+    rows = first_actions(study, driver)
+    of_kind = rows[KINDS[kind](rows["first_mps2"])]
+    trials, counted = (tuple(dict.fromkeys(of["trial_id"])) for of in (rows, of_kind))
+    text = (
+        f"{len(rows)} first actions in {len(trials)} trials; the value counts {len(of_kind)} of "
+        f"them, in {len(counted)} trials"
+    )
+    query = _query(driver.group, trials, counted)
+    return Source(driver.group.id, text, query, trials, counted, counts=True)
 
 
 @remembered
@@ -160,7 +209,8 @@ def _source(
         f"the value counts {len(numerator)} of them" if counts else "",
     )
     text = "; ".join(filter(None, parts))
-    return Source(group.id, text, _query(group, trials), trials, numerator)
+    query = _query(group, trials, numerator if counts else None)
+    return Source(group.id, text, query, trials, numerator, bool(counts))
 
 
 @remembered
@@ -172,7 +222,10 @@ def _rows(group: Group, rests_on: str) -> list[tuple[Any, str, str, str]]:
     return [*compress(_rows(group, STORED), group.trials[rests_on].notna())]
 
 
-def _query(group: Group, trials: Sequence[str]) -> str:
+def _query(group: Group, trials: Sequence[str], counted: Sequence[str] | None = None) -> str:
+    """Return a query of trials, or of those of them that are ``counted``; empty for none."""
     specs = sorted(group.trials["spec_hash"].unique())
-    named = QUERY.format(specs=", ".join(map(quoted, specs)), trials=", ".join(map(quoted, trials)))
-    return named if trials else ""
+    names = trials if counted is None else counted
+    named = QUERY.format(specs=", ".join(map(quoted, specs)), trials=", ".join(map(quoted, names)))
+    share = "" if counted is None else f"/* {len(counted)} of {len(trials)} trials */ "
+    return f"{share}{named}" if names else ""

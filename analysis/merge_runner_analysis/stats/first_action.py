@@ -6,6 +6,7 @@ by trial or human pair.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 from math import sqrt
 from typing import NamedTuple
@@ -46,6 +47,11 @@ ORDER BY ALL
 """
 # A human pedal seldom holds a speed exactly: within this a driver holds, beyond it goes or brakes.
 HOLD_MPS2 = 0.2
+KINDS: dict[str, Callable[[pd.Series], pd.Series]] = {
+    "brake": lambda mps2: mps2 < -HOLD_MPS2,
+    "hold": lambda mps2: mps2.abs() <= HOLD_MPS2,
+    "go": lambda mps2: mps2 > HOLD_MPS2,
+}
 # First actions are equal but for the last digits, as of a vehicle that drove on the other side.
 SAME_MPS2 = 1e-9
 

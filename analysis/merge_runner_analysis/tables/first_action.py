@@ -11,7 +11,7 @@ from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.published import citation, published
 from merge_runner_analysis.stats import first_action as first
 from merge_runner_analysis.stats.estimate import Estimate
-from merge_runner_analysis.stats.first_action import HOLD_MPS2, human_exchange_rate
+from merge_runner_analysis.stats.first_action import HOLD_MPS2, KINDS, human_exchange_rate
 from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables.model import (
     ENDED,
@@ -37,9 +37,13 @@ FIRST_ACTIONS = (
         Optional(f"mean_{x}", x, "number", f"mean (m/s²) where the own velocity is {x}", digits=3)
         for x in VELOCITIES.values()
     ),
-    Optional("brake_percent", "brake (%)", "percent", f"below -{HOLD_MPS2} m/s²", digits=1),
-    Optional("hold_percent", "hold (%)", "percent", f"within {HOLD_MPS2} m/s² of 0", digits=1),
-    Optional("go_percent", "go (%)", "percent", f"above {HOLD_MPS2} m/s²", digits=1),
+    Optional(
+        "brake_percent", "brake (%)", "percent", f"below -{HOLD_MPS2} m/s²", "brake", digits=1
+    ),
+    Optional(
+        "hold_percent", "hold (%)", "percent", f"within {HOLD_MPS2} m/s² of 0", "hold", digits=1
+    ),
+    Optional("go_percent", "go (%)", "percent", f"above {HOLD_MPS2} m/s²", "go", digits=1),
     Optional("slope", "slope", "number", "on own relative velocity, m/s² per m/s", digits=3),
     Optional("slope_se", "SE", "number", "of the slope, clustered by trial", digits=3),
     interval("slope_ci", "of the slope", digits=3),
@@ -88,9 +92,7 @@ def _first_rows(study: StudyResults, group: Group) -> Iterator[Row]:
             means, fitted = action.groupby(sign).mean(), first.slope(rows)
             values |= {f"mean_{VELOCITIES[at]}": float(mean) for at, mean in means.items()}
             values |= {
-                "brake_percent": float(100 * (action < -HOLD_MPS2).mean()),
-                "hold_percent": float(100 * (action.abs() <= HOLD_MPS2).mean()),
-                "go_percent": float(100 * (action > HOLD_MPS2).mean()),
+                **{f"{name}_percent": float(100 * of(action).mean()) for name, of in KINDS.items()},
                 "slope_se": fitted.se if fitted else None,
                 **_estimate("slope", fitted),
                 **_estimate("exchange_rate", rate),

@@ -159,10 +159,9 @@ class Numbers:
         study = self._part(_cache_key("table", name, *part)[1])
         column, of, _ = column.partition(OF)
         try:
-            explained = explain(study, table, f"{row}:{column}")
+            explained = explain(study, table, f"{row}:{column}", of_all=bool(of))
         except UsageError as exc:
             return {"absent": str(exc)}
-        counts = not of and any(shown.counts for shown in table.columns if shown.name == column)
         specs = {
             group.id: dict(zip(trials["trial_id"], trials["spec_hash"], strict=True))
             for group in (*study.measured, *study.probes, *study.unjudged, *study.unjudged_probes)
@@ -171,7 +170,7 @@ class Numbers:
         trials = [
             (trial, specs[source.group][trial])
             for source in explained.sources
-            for trial in (source.numerator if counts else source.trials)
+            for trial in (source.numerator if source.counts else source.trials)
         ]
         title = _title(table, row, next(of for of in table.columns if of.name == column))
         return {"explained": explained, "trials": trials, "title": title}

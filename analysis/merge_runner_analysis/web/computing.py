@@ -51,7 +51,7 @@ class Job:
 
     @property
     def what(self) -> str:
-        """What is computed, in words."""
+        """The computation in words."""
         match self.request:
             case ["comparison", one, other, *_]:
                 return f"the comparison of {one} and {other}"

@@ -12,7 +12,7 @@ from merge_runner_analysis.headlines import crash_text, sentence
 from merge_runner_analysis.published import HUMAN, human_counts
 from merge_runner_analysis.tables.model import Table
 from merge_runner_analysis.web.marks import Cell, band, cells, measures_of
-from merge_runner_analysis.web.phrases import ordered
+from merge_runner_analysis.web.phrases import local_server, ordered
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.scope import Bar, Scope, carried, unmarked
 from merge_runner_analysis.web.site import Site
@@ -64,6 +64,11 @@ class Driver:
     facts: Row | None
     endpoint: str
     parameters: str
+
+    @property
+    def local(self) -> str:
+        """Label of a server on this machine; empty for any other."""
+        return local_server(self.endpoint)
 
 
 def judged(site: Site, bar: Bar, params: Mapping[str, str]) -> tuple[list[Driver], dict[str, Any]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -32,8 +33,9 @@ REPEATED = (
 FEW = f"{{}}: fewer than {ENOUGH} counted trials. Add repetitions"
 UNDECIDED = (
     "By people's rule it is not known how many trials crashed, since another rule ended some. To "
-    'know it, play the study with scenario.collision_rule = "rectangle"'
+    "know it, set this {}, and play the study again"
 )
+BY_OUTLINES = 'collision_rule = "rectangle"'
 UNASKED = ("--yes", "--quiet")  # of a rehearsal, not of a run that costs money
 UNSHOWN = "No effect is shown. Estimate how many trials one would need"
 
@@ -41,12 +43,13 @@ UNSHOWN = "No effect is shown. Estimate how many trials one would need"
 def next_steps(
     program: str,
     played: Sequence[str],
+    study: str,
     drivers: Sequence[Driver],
     short: Mapping[str, str],
     conditions: Mapping[str, Any],
     answers: Answer | Comparison | None,
 ) -> list[tuple[str, str]]:
-    """Return sentences with commands; ``played`` are the words that played the study."""
+    """Return sentences with commands; ``played`` are the words that played a ``study``, a text."""
     sweep = ["sweep", *without("--recording", played)[1:]]  # a replay plays no further trial
 
     def again(*options: str) -> str:
@@ -67,7 +70,10 @@ def next_steps(
     if others and not is_rehearsal(drivers):
         steps.append((FEW.format(joined(others)), again("--reps", "N")))
     if any(driver.cells["collisions"].values.get("undecided") for driver in judged):
-        steps.append((UNDECIDED, ""))
+        file = study_in(sweep) or f"a copy of {sweep[1]}.toml"
+        has_table = re.search(r"^\s*\[scenario\]", study, re.MULTILINE)
+        place = f"in [scenario] of {file}" if has_table else f"at the top of {file}"
+        steps.append((UNDECIDED.format(place), "scenario." * (not has_table) + BY_OUTLINES))
     if isinstance(answers, Answer) and not any(row.is_shown for row in answers.changes):
         steps.append((UNSHOWN, shlex.join([program, "power", study_in(sweep) or sweep[1]])))
     return steps

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from typing import Any
+from urllib.parse import urlsplit
 
 from merge_runner.prompts.blocks import BLOCKS
+from merge_runner.providers import LOOPBACK
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 UNKNOWN = "no meaning is known here"
@@ -90,6 +92,15 @@ def causes_text(causes: Iterable[tuple[str, int]]) -> str:
         replies = "reply" if count == 1 else "replies"
         texts.insert(0, f"{count} {replies} without a valid plan: {', '.join(plans)}")
     return "; ".join(texts)
+
+
+def local_server(url: str | None) -> str:
+    """Return the label of replies that came from this machine; empty for any other server.
+
+    >>> local_server("http://127.0.0.1:8977/v1")
+    'local server, http://127.0.0.1:8977/v1'
+    """
+    return f"local server, {url}" if urlsplit(url or "").hostname in LOOPBACK else ""
 
 
 def clock(time_s: float) -> str:

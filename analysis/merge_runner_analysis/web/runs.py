@@ -15,11 +15,15 @@ from merge_runner.audit.checks import not_judged
 from merge_runner.driver_names import both_sides, pair_name
 from merge_runner.paths import DEFAULT_DB, command_at, db_words
 from merge_runner.run.progress_file import ProgressSnapshot, read_snapshot
-from merge_runner_analysis.web.phrases import called, duration
+from merge_runner_analysis.task import leaves
+from merge_runner_analysis.web.phrases import called, duration, local_server
 from merge_runner_analysis.web.reading import Row
 from merge_runner_analysis.web.trial_index import TrialFilter, TrialIndex
 
 REFUSED = 2
+# Options of a sweep that a replay refuses or has no use for: without a value, and with one.
+UNREPLAYED = ("--batch", "--strict-model", "--keep-going", "--replay")
+UNREPLAYED_VALUES = ("--dask", "--max-cost", "--in-flight", "--rpm", "--tpm")
 # Reasons for an early end of a run, by exit code: in a sentence, and in a list.
 REASONS = {
     REFUSED: (
@@ -109,6 +113,7 @@ def run_of(row: Row, config: Row, snapshot: ProgressSnapshot | None, later: str 
         "config": config,
         "sweep_id": row["sweep_id"],
         "driver": ", ".join(pair_name(both_sides(name).values(), endpoints) for name in drivers),
+        "local": "; ".join(sorted(set(filter(None, map(local_server, endpoints.values()))))),
         "stand_in": row["scripted"]
         and f"{row['stand_in']}{part if row['scripted'] < row['trials'] else ''}",
         "state": state,
@@ -128,6 +133,60 @@ def run_of(row: Row, config: Row, snapshot: ProgressSnapshot | None, later: str 
     typed = config.get("typed") if goes_on and not later else None  # a notebook types none
     command = shlex.join(["merge-runner", *words_here(typed, row["db"])]) if typed else ""
     return {**run, "kind": kind, "text": text, "command": command, "ended_as": ended_as(run)}
+
+
+def repeats(run: Row) -> list[tuple[str, str, str]]:
+    """Return commands that audit, replay and repeat a run: a name, the command, what it does."""
+    row, typed = run["row"], run["config"].get("typed")
+    db = row["db"]
+    given = [("audit", audit_command(run["sweep_id"], db), "replays each trial from its replies")]
+    if not typed:  # a notebook types none
+        return given
+    played = [word for word in without("--db", words_here(typed, db)) if word != "--yes"]
+    again = [word for word in played if word not in UNREPLAYED]
+    for option in UNREPLAYED_VALUES:
+        again = without(option, again)
+    other = db.with_name(f"{db.stem}-replayed{db.suffix}")
+    before, after = (
+        command_at("merge-runner digest", "--db", place, DEFAULT_DB) for place in (db, other)
+    )
+    words = ["merge-runner", "replay", *again[1:], "--db", str(other)]
+    given += [
+        ("replay", shlex.join(words), "plays it anew from the replies in the cache: no network"),
+        ("digests", before, "of this run's database, and"),
+        ("", after, "of the replay's are equal if both hold the same trials"),
+    ]
+    if typed[0] == "sweep" and "--replay" not in typed:
+        number = str(run["config"].get("sample_set", 0) + 1)
+        words = [*without("--sample-set", played), "--sample-set", number]
+        command = shlex.join(["merge-runner", *words, *db_words(db, study_in(words))])
+        given.append(("new replies", command, "asks the models anew, in another sample set"))
+    return given
+
+
+def audit_command(sweep_id: str, db: Path) -> str:
+    """Return the command that audits a run."""
+    audit = shlex.join(["merge-runner", "audit", "--sweep", sweep_id])
+    return command_at(audit, "--db", db, DEFAULT_DB)
+
+
+def origin_of(run: Row) -> list[tuple[str, str]]:
+    """Return the program, the versions of packages and the models of a run."""
+    row, config = run["row"], run["config"]
+    changes = "with uncommitted changes" if row["git_dirty"] else "no uncommitted changes"
+    commit = row["git_commit"] or "unknown"
+    installed = commit if row["git_dirty"] is None else f"commit {commit}, {changes}"
+    versions = json.loads(row["versions"]).items()
+    models = []
+    for name, entry in config.get("models", {}).items():
+        url = config.get("endpoints", {}).get(name) or entry.get("base_url")
+        sent = dict(entry.get("parameters") or {}) | {
+            key: entry[key] for key in ("max_output_tokens",) if key in entry
+        }
+        place = local_server(url) or url or str(entry["provider"])
+        models.append((name, ", ".join((str(entry["id"]), place, *leaves(sent)))))
+    packages = ", ".join(f"{name} {version}" for name, version in versions)
+    return [("program", installed), *[("packages", packages)] * bool(packages), *models]
 
 
 def words_here(typed: Sequence[str], db: Path) -> list[str]:
@@ -199,9 +258,7 @@ def assessment_of(run: Row) -> tuple[str, str]:
         return "stopped", f"Stopped: {reason[0]}. {counted} have an outcome{failures}."
     if ended == planned:
         text = f"Ended with faults: {counted} have an outcome, but what is stored does not hold "
-        audit = f"merge-runner audit --sweep {run['sweep_id']}"
-        at = command_at(audit, "--db", row["db"], DEFAULT_DB)
-        return "stopped", f"{text}together. See: {at}"
+        return "stopped", f"{text}together. See: {audit_command(run['sweep_id'], row['db'])}"
     if run["failed"]:
         return "stopped", f"Ended: {counted} have an outcome{failures}."
     return "stopped", f"Stopped by an error that it printed: {counted} have an outcome."

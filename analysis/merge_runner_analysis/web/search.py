@@ -109,8 +109,8 @@ def search(
         facets = facets_of(connection, FOUND, FACETS, filters)
     crossed = {letter: counts for letter in "MY" if (counts := totals.pop(letter))}
     for row in rows:
-        text = texts.get(row["place"])
-        row["pieces"] = None if not (text or "").strip() else pieces_of(text, terms)
+        text = texts.get(row["place"]) or ""
+        row["pieces"] = pieces_of(text, terms) if row["has_words"] else None
     return {**totals, "hits": rows, "page": page, "last_page": last_page, "facets": facets,
             "crossed": crossed}  # fmt: skip
 

@@ -1,6 +1,7 @@
 """The pages of runs: how far, how well, what went wrong; and how a page follows one."""
 
 import html
+import json
 import re
 import shutil
 from collections import Counter
@@ -22,7 +23,7 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.web.pages.sweep import sweep_page
-from merge_runner_analysis.web.runs import list_runs, numbers_of, standing_of
+from merge_runner_analysis.web.runs import list_runs, numbers_of, repeats, standing_of
 from merge_runner_analysis.web.scope import filter_of, scope_of
 from merge_runner_analysis.web.site import Site
 from tests.support.serving import Page, client_of, held
@@ -316,6 +317,69 @@ def test_a_shown_command_names_the_database_and_the_study_whose_names_it_needs(s
     assert site.share("--export", "pages") == f"{place} --study mine/study.toml --export pages"
     assert site.share("FOLDER", of_study=False) == f"{place} FOLDER"
     assert Site(study).share("--export", "pages") == f"{place} --export pages"
+
+
+def test_the_page_of_a_run_has_the_commands_that_repeat_it_and_what_it_was_played_with(study):
+    config = {
+        **CONFIG,
+        "typed": ["sweep", "mine.toml", "--yes", "--in-flight", "4", "--reps", "3"],
+        "endpoints": {"o3": "http://127.0.0.1:8123/v1"},
+        "sample_set": 1,
+        "models": {"o3": {**CONFIG["models"]["o3"], "parameters": {"temperature": 0.3}}},
+    }
+    change(
+        study,
+        f"UPDATE sweeps SET config = '{json.dumps(config)}', git_commit = 'abc123', "
+        """git_dirty = true, versions = '{"duckdb":"9.8"}'""",
+    )
+    other = study.with_name("m-replayed.duckdb")
+    text = text_of(client_of(study)).partition("Repeat it")[2]
+    for said in (
+        f"audit merge-runner audit --sweep sweep-1 --db {study} ",
+        f"replay merge-runner replay mine.toml --reps 3 --db {other} ",
+        f"merge-runner digest --db {study} ",
+        f"merge-runner digest --db {other} ",
+        f"merge-runner sweep mine.toml --in-flight 4 --reps 3 --sample-set 2 --db {study} ",
+        "program commit abc123, with uncommitted changes",
+        "packages duckdb 9.8",
+        "o3 o3, local server, http://127.0.0.1:8123/v1, temperature = 0.3",
+    ):
+        assert said in text
+    (run,) = list_runs(Site(study).trial_index)
+    replayed = {**run, "config": {**config, "typed": ["replay", "r.parquet"]}}
+    assert [name for name, *_ in repeats(replayed)] == ["audit", "replay", "digests", ""]
+    assert [name for name, *_ in repeats({**run, "config": CONFIG})] == ["audit"]
+
+
+def test_a_local_server_is_named_at_its_model_and_no_other_is(study):
+    for url, told in (
+        ("http://localhost:8123/v1", "local server, http://localhost:8123/v1"),
+        ("https://127.0.0.1.example.org/v1", ""),
+    ):
+        endpoints = json.dumps({**CONFIG, "endpoints": {"o3": url}})
+        change(study, f"UPDATE sweeps SET config = '{endpoints}'")
+        client = client_of(study)
+        head = re.search("<h1>.*?</h1>", client.get(URL).text, re.DOTALL)[0]
+        for text in (Page(head).text, text_of(client, "/sweeps")):
+            assert ("local server" in text, told in text) == (bool(told), True)
+
+
+def test_warnings_stand_before_the_verdict_whose_box_has_the_class_of_its_state(study):
+    states = {
+        "finished": "UPDATE sweeps SET exit_code = 0, ended_at = started_at",
+        "stopped": "UPDATE sweeps SET exit_code = 3",
+    }
+    change(
+        study,
+        "UPDATE calls SET model_served = 'o3', attempt = attempt + (decision = 0)::INTEGER",
+        "UPDATE decisions SET valid = true, fallback = false, failure = NULL",
+        f"UPDATE sweeps SET config = '{json.dumps({**CONFIG, 'arms': []})}'",
+    )
+    for state, change_it in states.items():
+        change(study, change_it)
+        text = client_of(study).get(URL).text
+        assert re.search(r'class="note sweep-verdict (\w+)"', text)[1] == state
+        assert 0 < text.index("The audit found") < text.index("sweep-verdict")
 
 
 def test_a_run_with_a_name_is_called_by_it_in_the_list(study):

@@ -215,12 +215,40 @@ def test_the_next_steps_follow_from_the_result(of, kind, sweep, steps):
     a, conditions = of
     a = replace(a, kind=kind)
     conditions = conditions | {"rows": [(a, conditions["rows"][0][1])]}
-    given = next_steps("m", sweep, [a], NAMES, conditions, None)
+    given = next_steps("m", sweep, "", [a], NAMES, conditions, None)
     assert len(given) == len(steps)
     for (text, command), (begins, run) in zip(given, steps, strict=True):
         assert text.startswith(begins)
         assert command.startswith(run)
         assert bool(command) == bool(run)
+
+
+@pytest.mark.parametrize(
+    ("words", "study", "place", "line"),
+    [
+        (TYPED, "repetitions = 1", "at the top of s.toml", 'scenario.collision_rule = "rectangle"'),
+        (
+            TYPED,
+            "[scenario]\nstep_s = 0.1",
+            "in [scenario] of s.toml",
+            'collision_rule = "rectangle"',
+        ),
+        (
+            ["sweep", "baseline"],
+            "",
+            "at the top of a copy of baseline.toml",
+            'scenario.collision_rule = "rectangle"',
+        ),
+    ],
+)
+def test_another_rule_of_crashes_is_given_as_the_line_of_the_file(words, study, place, line):
+    a, conditions = played(trials=110, n=110, ended=(110, 0))
+    a = replace(a, cells=driver("a", collisions={"undecided": 4, "n": 106, "ended": 110}).cells)
+    conditions = conditions | {"rows": [(a, conditions["rows"][0][1])]}
+    steps = next_steps("m", words, study, [a], NAMES, conditions, None)
+    ((text, given),) = [step for step in steps if step[0].startswith("By people's rule")]
+    assert f"set this {place}, and play" in text
+    assert given == line
 
 
 def test_a_difference_in_a_measure_without_a_column_is_named_in_the_row():

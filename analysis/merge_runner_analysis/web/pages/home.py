@@ -138,6 +138,7 @@ def home_page(site: Site, params: Mapping[str, str]) -> str:
     human = humans_of(values["table"], next(iter(shown), None))
     typed = standing[0]["config"].get("typed") if standing else None
     sweep = words_here(typed or ("sweep", "STUDY"), site.db)
+    study = (standing[0]["config"].get("study") or {}).get("text", "") if standing else ""
     return site.render(
         "home.html",
         view="index",
@@ -153,7 +154,7 @@ def home_page(site: Site, params: Mapping[str, str]) -> str:
         is_rehearsal=is_rehearsal(shown),
         question=question,
         apart=apart,
-        steps=next_steps(site.program, sweep, shown, short, conditions, question or apart),
+        steps=next_steps(site.program, sweep, study, shown, short, conditions, question or apart),
         found=is_found(shown, question or apart),
         prompted=any(driver.facts and driver.facts["asked"] for driver in shown),
         asking=asking,

@@ -8,7 +8,7 @@ from merge_runner_analysis.task import RULE, task_settings
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.listing import MISSING
 from merge_runner_analysis.web.reading import Row
-from merge_runner_analysis.web.runs import list_runs, numbers_of
+from merge_runner_analysis.web.runs import list_runs, numbers_of, origin_of, repeats
 from merge_runner_analysis.web.scope import carried, scope_of
 from merge_runner_analysis.web.site import NothingNew, NotThere, Site, news_of
 from merge_runner_analysis.wording import PLAYED_RULES, RULES_MEAN
@@ -85,6 +85,8 @@ def sweep_page(site: Site, sweep_id: str, params: Mapping[str, str]) -> str:
         audit=audit_of(site, [run]),
         arms=site.trial_index.counts({"sweep": sweep_id}, "model", "variant"),
         trust=TRUST,
+        repeats=repeats(run),
+        origin=origin_of(run),
         task=", ".join(
             dict.fromkeys(
                 _in_words(setting)

@@ -152,6 +152,20 @@ def asked(prepare, tmp_path_factory):
     return folder
 
 
+def test_a_share_of_first_actions_leads_to_the_trials_that_have_them(db):
+    study = StudyResults(db)
+    table = made(study, "first-action")
+    first = "SELECT trial_id, side, arg_min(acceleration_mps2, step) AS a FROM states "
+    first += "WHERE time_s > 0 AND trial_id LIKE 'alike/%' GROUP BY ALL"
+    for kind, rule in {"brake": "a < -0.2", "hold": "abs(a) <= 0.2", "go": "a > 0.2"}.items():
+        (source,) = explain(study, table, f"alike/baseline:{kind}_percent").sources
+        known = load(f"SELECT trial_id FROM ({first}) WHERE {rule}", db)["trial_id"]
+        assert {*source.numerator} == {*known} == {*load(source.query, db)["trial_id"]}
+        assert f"the value counts {len(known)} of them, in {known.nunique()} trials" in source.text
+    (human,) = explain(study, table, "human:brake_percent").sources
+    assert "published" in human.text
+
+
 def test_who_was_only_asked_has_rows_beside_who_drove_with_the_same_first_actions(asked):
     study = StudyResults(asked / "t.duckdb")
     table = made(study, "first-action")

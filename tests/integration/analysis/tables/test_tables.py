@@ -256,7 +256,8 @@ def test_every_cell_can_be_traced_to_its_trials_and_the_query_that_lists_them(st
             for column in table.columns:
                 found = explain(study, table, f"{row.id}:{column.name}")
                 assert len(found.sources) == len(row.groups)
-                listings |= {source.query: source.trials for source in found.sources}
+                for source in found.sources:
+                    listings[source.query] = source.numerator if source.counts else source.trials
     assert len(listings) > 4
     with duckdb.connect(str(study.db), read_only=True) as connection:
         # Computed once, and not for each query.
@@ -277,6 +278,8 @@ def test_explain_marks_the_trials_that_a_share_counts(study, tables):
             share = 100 * len(source.numerator) / len(source.trials)
             assert share == pytest.approx(row.values[name], rel=1e-9)
             assert {*source.numerator} <= {*source.trials}
+            said = f"/* {len(source.numerator)} of {len(source.trials)} trials */ SELECT "
+            assert source.query.startswith(said if source.numerator else "")
             marked += bool(source.numerator)
         (source,) = explain(study, table, f"{row.id}:gap_m").sources
         assert len(source.trials) == len(groups[row.id].finished)
@@ -284,6 +287,27 @@ def test_explain_marks_the_trials_that_a_share_counts(study, tables):
     collided = groups["o3/baseline"].ended.set_index("trial_id")["collided"]
     for line in explain(study, table, "o3/baseline:collided_percent").lines()[-len(collided) :]:
         assert line.startswith("* " if collided[line[2:]] else "  ")
+
+
+def test_the_value_of_a_measure_counts_trials_if_it_is_a_share_and_none_if_it_is_a_mean(
+    study, tables
+):
+    told = {"coll. (%)": 0, "gap (m)": 0}
+    for row in tables["factors"].rows:
+        measure, value = row.values["measure"], row.values.get("value")
+        if measure not in told or value is None:
+            continue
+        sources = explain(study, tables["factors"], f"{row.id}:value").sources
+        every = sum(len(source.trials) for source in sources)
+        counted = sum(len(source.numerator) for source in sources)
+        is_share = measure == "coll. (%)"
+        assert {source.counts for source in sources} == {is_share}
+        assert not is_share or 100 * counted / every == pytest.approx(value, rel=1e-9)
+        assert every == row.values["n"]
+        whole = explain(study, tables["factors"], f"{row.id}:value", of_all=True).sources
+        assert {source.counts for source in whole} == {False}
+        told[measure] += 1
+    assert all(told.values())
 
 
 def test_explain_names_the_valid_rows_and_columns(study, tables):
