@@ -16,6 +16,12 @@ def shipped(in_wheel: Path, in_checkout: str) -> Path:
     return in_wheel if in_wheel.exists() else PROJECT / in_checkout
 
 
+def named_queries(path: Path) -> dict[str, str]:
+    """Return the blocks of an SQL file by name; the first block has none."""
+    blocks = path.read_text("utf-8").split("\n\n")[1:]
+    return {block[3 : block.index(":")]: block.rstrip(";\n") for block in blocks}
+
+
 SHIPPED_EXPERIMENTS = shipped(PACKAGE / "experiments", "experiments")
 SHIPPED_RECORDINGS = shipped(PACKAGE / "recordings", "cache/recordings")
 DEFAULT_DB = Path("results/merge.duckdb")

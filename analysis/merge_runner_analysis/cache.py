@@ -28,7 +28,7 @@ CREATE TABLE IF NOT EXISTS finished (
 )
 """
 PACKAGES = (Path(merge_runner_analysis.__file__).parent, Path(merge_runner.__file__).parent)
-COMPUTING = {".py", ".sql", ".csv"}
+COMPUTING = {".py", ".sql", ".csv", ".toml"}
 PATIENCE_S = 0.5
 warn_once = cache(logging.getLogger(__name__).warning)
 Owner = TypeVar("Owner")

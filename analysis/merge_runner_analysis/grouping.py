@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from math import inf
-from typing import Any, NewType
+from typing import Any
 
 import pandas as pd
 
@@ -32,8 +32,6 @@ from merge_runner_analysis.published import HUMAN, HUMAN_TRIALS
 from merge_runner_analysis.trials import outcomes_with_metrics
 
 MEAN_SPEED = "mean_speed_mps"
-Reason = NewType("Reason", str)
-Sentence = NewType("Sentence", str)
 # Factors that every study has, and levels that others are compared with.
 FIRST = (MODEL, PROMPT)
 USUAL = (BASELINE, DEFAULT, SELF)
@@ -73,11 +71,11 @@ class Group:
     """Number of a language model's trials that went as an earlier one."""
     published_outcomes: pd.DataFrame | None = None
     """Outcomes of humans, which imported trials do not replace."""
-    posing: Sentence = Sentence("")
+    posing: str = ""
     """Label of a mock model that answered; empty without one."""
-    caution: Sentence = Sentence("")
+    caution: str = ""
     """Remark on a replayed human, whose trials are not judged."""
-    unjudged: Reason = Reason("")
+    unjudged: str = ""
     """Why nothing is concluded from its trials; empty where something is."""
 
     @property
@@ -194,13 +192,6 @@ def humans_of(trials: pd.DataFrame) -> Group:
     return replace(_published_humans(), trials=trials, label=label)
 
 
-def levels_of_group(levels: pd.DataFrame, group: Group) -> dict[str, str]:
-    """Return the levels of a group, model and prompt first."""
-    rows = of_trials(levels, group.trials).drop_duplicates("factor")
-    named = rows.set_index("factor")["value"].to_dict()
-    return {name: named[name] for name in sorted(named, key=lambda n: (n not in FIRST, n))}
-
-
 def levels_of(groups: Iterable[Group], order: Order) -> dict[str, list[str]]:
     """Return the levels of each factor: those in ``order``, usual ones, numbers, the rest."""
     every: dict[str, set[str]] = {}
@@ -279,14 +270,17 @@ def groups_of(
     for _, rows in keyed.groupby(keys):
         counts = of_trials(decisions, rows).groupby("model")[["invalid", "asked"]].sum()
         reasons = filter(None, (not_judged(*count) for count in counts.itertuples()))
-        group = _model_group(trials.loc[rows.index], rows.iloc[0], Reason("; ".join(reasons)))
+        group = _model_group(trials.loc[rows.index], rows.iloc[0], "; ".join(reasons))
         stored = [specs.get(name, {}) for name in rows["spec_hash"].unique()]
         # The rest of a trial is unknown after a first-decision probe: draws may differ later.
         is_first = rows["source"].iloc[0] == "first_decision"
         only_asked = is_first and any(map(has_chance, stored))
         programs = all(map(programs_alone, stored)) and not only_asked
         group = _distinct(group, programs=programs, scripted=group.scripted and not only_asked)
-        groups.append(replace(group, levels=levels_of_group(levels, group)))
+        of_group = of_trials(levels, group.trials).drop_duplicates("factor")
+        named = of_group.set_index("factor")["value"].to_dict()
+        ordered = {name: named[name] for name in sorted(named, key=lambda n: (n not in FIRST, n))}
+        groups.append(replace(group, levels=ordered))
 
     def place(group: Group) -> tuple[bool, str, list[tuple[int, bool, float, str]], str]:
         levels = [_place(level, order.get(name, ())) for name, level in group.levels.items()]
@@ -295,7 +289,7 @@ def groups_of(
     return sorted(groups, key=place)
 
 
-def _model_group(rows: pd.DataFrame, first: pd.Series, unjudged: Reason) -> Group:
+def _model_group(rows: pd.DataFrame, first: pd.Series, unjudged: str) -> Group:
     scripted = bool(first["scripted"])
     models: dict[Side, str] = {side: first[f"model_{side}"] for side in SIDES}
     sides = [side for side in SIDES if rows[f"{side}_scripted"].any()]
@@ -310,8 +304,8 @@ def _model_group(rows: pd.DataFrame, first: pd.Series, unjudged: Reason) -> Grou
         setting=first["variant"],
         spec_hash=min(rows["spec_hash"].unique(), key=lambda name: (name != first["usual"], name)),
         trials=rows,
-        posing=Sentence(posing),
-        caution=Sentence(unresponsive(first["spec"])),
+        posing=posing,
+        caution=unresponsive(first["spec"]),
         unjudged=unjudged,
     )
     return replace(group, label=f"{driver} ({group.remark})") if group.remark else group

@@ -1,4 +1,4 @@
-"""Sentences that compare drivers with people and with each other, of finished tables.
+"""Sentences that compare drivers with people, of finished tables.
 
 Nothing here computes: a page, a report and a terminal say the same. pandas is not needed.
 """
@@ -9,10 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from merge_runner.prompts.blocks import BASELINE
-from merge_runner_analysis.metrics import COLLISIONS, COST, GAP, JOINT, LEFT_FIRST, RMSE, VALID
 from merge_runner_analysis.wording import (
-    ALPHA,
-    CHANGED,
     DIFFERS,
     ENOUGH,
     FEW,
@@ -24,19 +21,15 @@ from merge_runner_analysis.wording import (
     OPEN,
     PLAYED_RULES,
     PROGRAM,
-    RULES_MEAN,
     SHOWN,
     Values,
-    brackets,
     by_group,
     capital,
     differs,
     distance,
     ends_of,
-    equal_p,
     has_verdict,
     joined,
-    money,
     number,
     shown_state,
     suffice,
@@ -44,41 +37,10 @@ from merge_runner_analysis.wording import (
 )
 
 TOO_FEW = f"Too few finished trials for a verdict (at least {ENOUGH}, and half of all, are needed)"
-# By measure: what drivers that are like people do, and the name of the measure without a verdict.
-LIKENESS = {
-    "collisions": ("crash as often as people", "crashes"),
-    "headway": ("let the one ahead go first, as people do", "who goes first with one ahead"),
-    "velocity": ("let the slower go first side by side, as people do",
-                 "who goes first side by side"),
-    "gap": ("leave gaps like people's", "the gap"),
-}  # fmt: skip
-DIFFER = ("differs from people", "differ from people")
-# Where two equal drivers met, who goes first is counted for the left vehicle.
-LEFT_GOES_FIRST = "left vehicle goes first"
-# Sentence parts: a driver has more than another, has less, or no difference is shown in it.
-COMPARED = {
-    LEFT_FIRST.name: ("goes first more often", "goes first less often", "how often it goes first"),
-    LEFT_GOES_FIRST: (
-        *(f"lets the left vehicle go first {often} often" for often in ("more", "less")),
-        "how often the left vehicle goes first",
-    ),
-    GAP.name: ("leaves a larger gap", "leaves a smaller gap", CHANGED[GAP.name]),
-    RMSE.name: (
-        "departs more from its initial speed",
-        "keeps closer to its initial speed",
-        CHANGED[RMSE.name],
-    ),
-    JOINT.name: (
-        *(f"has both drivers change their speed {often} often" for often in ("more", "less")),
-        CHANGED[JOINT.name],
-    ),
-    VALID.name: ("has more valid replies", "has fewer valid replies", CHANGED[VALID.name]),
-    COST.name: ("costs more", "costs less", CHANGED[COST.name]),
-}
 # The vehicle whose first mergers are counted, by measure.
 FIRST = {"headway": "the one ahead", "velocity": "side by side, the slower one"}
 # Measures that a person sees at once come first in a headline, fitted ones last.
-SEEN_FIRST = ("collisions", "headway", "velocity", "gap", "gap-headway", "gap-velocity", "held")
+SEEN_FIRST = (*HEADINGS, "gap-headway", "gap-velocity", "held")
 
 
 def sentences(rows: Iterable[Any]) -> list[str]:
@@ -143,8 +105,7 @@ def crashes(values: Values) -> str:
     ``crashed in 15 of 22 trials; people in 28 of 990``, or empty where no trial ended.
     """
     k, undecided = values.get("k") or 0, values.get("undecided") or 0
-    ended = (values["n"] or 0) + undecided
-    if not ended:
+    if not (ended := _ended(values)):
         return ""
     seen = values.get("counted") or f"{k} of {ended}"
     text = f"crashed in {seen} trials"
@@ -158,86 +119,14 @@ def crashes(values: Values) -> str:
     return f"{text}; people in {people}" if people else text
 
 
-def crash_text(rules: Sequence[tuple[str, Sequence[float]]]) -> str:
-    """Return the meaning of a crash by the collision rules that were played, with their steps."""
-    texts = []
-    for rule, steps_s in rules:
-        every = "simulation step, " * (len(steps_s) > 1) + " or ".join(map("{:g}".format, steps_s))
-        text = f"{RULES_MEAN[rule]}, checked every {every} s"
-        texts.append(text if rule == "rectangle" else f"{text} ({PLAYED_RULES[rule]})")
-    return " or, by the scenario of the trial, ".join(texts)
-
-
-def _percent(collisions: Values, count: int) -> float:
-    ended = _ended(collisions)
-    return 100 * count / ended if ended else 0.0
-
-
-def apart(driver: str, other: str, rows: Mapping[str, Values], *, of_left: bool) -> tuple[str, str]:
-    """Return the headline that compares two drivers, and other differences; ``rows`` by metric.
-
-    ``A crashed in 12 of 110 trials, B in 33 of 110. In the same situations A crashed less often, by
-    19.09 points [8.41, 29.78]; corrected p = 0.004.`` With ``of_left``, who goes first is the left
-    vehicle.
-    """
-    crashed = rows.get(COLLISIONS.name, {})
-    others = _others(driver, other, rows, of_left=of_left)
-    counts = [crashed.get(f"{name}{of}") for of in ("", "_reference") for name in ("k", "n")]
-    if any(count is None for count in counts):
-        return f"{driver} against {other}.", others
-    k, n, k_other, n_other = counts
-    claim = f"{driver} crashed in {k} of {n} trials, {other} in {k_other} of {n_other}"
-    difference, p, ci = (crashed.get(name) for name in ("difference", "p_corrected", "ci"))
-    if min(n or 0, n_other or 0) < ENOUGH:
-        return f"{claim}: too few to say more.", ""
-    if difference is None or p is None or is_constant(crashed):
-        return f"{claim}.", others
-    corrected = f"corrected p {equal_p(p)}"
-    if p >= ALPHA:
-        result = f"No difference is shown: {number(difference)} points {brackets(ci)}"
-        return f"{claim}. {result}; {corrected}.", others
-    # Of a driver that crashed less often, both ends change their signs and their places.
-    ends = ci and sorted(end if difference > 0 else -end for end in ci)
-    result = f"{number(abs(difference))} points {brackets(ends)}".rstrip()
-    often = "more" if difference > 0 else "less"
-    same = f"In the same situations {driver} crashed {often} often, by {result}"
-    return f"{claim}. {same}; {corrected}.", others
-
-
-def is_constant(values: Values) -> bool:
-    """Return whether a measure counts no trial, or every trial, of both drivers."""
-    k, n = ([values.get(name + of) for of in ("", "_reference")] for name in "kn")
-    return None not in k and k in ([0, 0], n)
-
-
-def _others(driver: str, other: str, rows: Mapping[str, Values], *, of_left: bool) -> str:
-    """Return the measures besides crashes in which a driver is shown to differ, and the others."""
-    shown, unshown = [], []
-    for name, (more, less, what) in COMPARED.items():
-        is_unasked = name == (LEFT_FIRST.name if of_left else LEFT_GOES_FIRST)
-        values = rows.get(LEFT_FIRST.name if name == LEFT_GOES_FIRST else name, {})
-        if is_unasked or is_constant(values) or (p := values.get("p_corrected")) is None:
-            continue
-        if p >= ALPHA:
-            unshown.append(what)
-            continue
-        unit = str(values["measure"]).rpartition("(")[2].rstrip(")")
-        form = money if unit == "USD" else number
-        sides = (form(values[f"value{of}"]) for of in ("", "_reference"))
-        shown.append(
-            f"{more if values['difference'] > 0 else less} ({' against '.join(sides)} {unit})"
-        )
-    against = f"Compared with {other}, with situations weighted alike for both,"
-    parts = [f"{against} {driver} {joined(shown)}."] if shown else []
-    parts += [f"No difference is shown in {joined(unshown)}."] if unshown else []
-    return " ".join(parts)
-
-
 def share(collisions: Values) -> str:
     """Return a rate in percent, or ``13.64 to 68.18`` where trials are undecided."""
-    k, undecided = collisions.get("k") or 0, collisions.get("undecided") or 0
-    least = number(_percent(collisions, k))
-    return f"{least} to {number(_percent(collisions, k + undecided))}" if undecided else least
+    ended, k = _ended(collisions), collisions.get("k") or 0
+    least, most = (
+        number(100 * count / ended if ended else 0.0)
+        for count in (k, k + (collisions.get("undecided") or 0))
+    )
+    return f"{least} to {most}" if collisions.get("undecided") else least
 
 
 def headline(drivers: Mapping[str, Mapping[str, Values]]) -> tuple[str, str]:
@@ -254,7 +143,12 @@ def headline(drivers: Mapping[str, Mapping[str, Values]]) -> tuple[str, str]:
         return "No language model can be compared with people yet.", ""
     enough = {name: of for name, of in compared.items() if _enough(of)}
     few = {name: of for name, of in compared.items() if name not in enough}
-    too_few = [_too_few(few, alone=len(models) == 1)] if few else []
+    is_one = len(models) == 1
+    counts = [
+        f"{'' if is_one else name} {_finished(of)} of {_ended(of['collisions'])}".strip()
+        for name, of in few.items()
+    ]
+    too_few = [f"{TOO_FEW}: {joined(counts)}."] if few else []
     untold = [f"{name} {crashes(of['collisions'])}." for name, of in few.items()]
     if not enough:
         return " ".join(too_few), " ".join(untold)
@@ -280,8 +174,8 @@ def _most_alike(drivers: Mapping[str, Mapping[str, Values]]) -> str:
     """Return which of several programs are most like people, and which one crashes most."""
     ranks = {
         name: (
-            sum(shown_state(of[measure]) == SHOWN for measure in LIKENESS if measure in of),
-            -sum(shown_state(of[measure]) in DIFFERS for measure in LIKENESS if measure in of),
+            sum(shown_state(of[measure]) == SHOWN for measure in HEADINGS if measure in of),
+            -sum(shown_state(of[measure]) in DIFFERS for measure in HEADINGS if measure in of),
         )
         for name, of in drivers.items()
         if any(map(has_verdict, of.values()))
@@ -293,28 +187,24 @@ def _most_alike(drivers: Mapping[str, Mapping[str, Values]]) -> str:
     some = f"the {len(ranks)} programs with enough trials"
     which = some if len(ranks) < len(drivers) else f"{len(drivers)} programs"
     is_one = len(names) == 1
+    of_humans = " (it was made from the human data)"
     named = [
-        f"{name} (it was made from the human data)" if _is_from_humans(drivers[name]) else name
+        name + of_humans * any(values.get("from_humans") for values in drivers[name].values())
         for name in names
     ]
     claim = (
         f"Of {which} {joined(named)} {'is' if is_one else 'are'} most like people: "
-        f"{'it agrees' if is_one else 'each agrees'} with them in {like} of {len(LIKENESS)} "
+        f"{'it agrees' if is_one else 'each agrees'} with them in {like} of {len(HEADINGS)} "
         f"measures, and is shown to differ in {-unlike or 'none'}."
     )
-    rates = _crash_rates({name: of for name, of in drivers.items() if _is_judged(of)})
+    rates = _crash_rates({name: of for name, of in drivers.items() if _are_crashes_judged(of)})
     most = [name for name, rate in rates.items() if rate == max(rates.values()) > 0]
     if len(most) != 1:
         return claim
     return f"{claim} Most crashes: {most[0]} {crashes(drivers[most[0]]['collisions'])}."
 
 
-def _is_from_humans(verdicts: Mapping[str, Values]) -> bool:
-    return any(values.get("from_humans") for values in verdicts.values())
-
-
-def _is_judged(verdicts: Mapping[str, Values]) -> bool:
-    """Return whether a driver has a verdict on crashes."""
+def _are_crashes_judged(verdicts: Mapping[str, Values]) -> bool:
     return "collisions" in verdicts and has_verdict(verdicts["collisions"])
 
 
@@ -323,7 +213,7 @@ def _few_trials(drivers: Mapping[str, Mapping[str, Values]]) -> str:
     counts = [
         f"{name} crashed in {of['collisions']['counted']} trials"
         for name, of in drivers.items()
-        if not _is_judged(of) and of.get("collisions", {}).get("counted")
+        if not _are_crashes_judged(of) and of.get("collisions", {}).get("counted")
     ]
     return f"Without a verdict: {'; '.join(counts)}." if 0 < len(counts) < len(drivers) else ""
 
@@ -338,7 +228,8 @@ def _crash_rates(drivers: Mapping[str, Mapping[str, Values]]) -> dict[str, float
 def _tally(drivers: Sequence[Mapping[str, Values]]) -> str:
     """Return how many of the drivers with a verdict are like people, by measure."""
     like, unclear, unjudged = list[str](), list[str](), list[str]()
-    for name, (does, what) in LIKENESS.items():
+    for name in HEADINGS:
+        does, what = MEASURES[name].alike, MEASURES[name].topic
         states = [shown_state(of[name]) for of in drivers if name in of and has_verdict(of[name])]
         if not states:
             unjudged.append(what)
@@ -351,7 +242,8 @@ def _tally(drivers: Sequence[Mapping[str, Values]]) -> str:
             differing = len(states) - alike - open_
             says = f"{alike or 'none'} of {len(states)}{who}{few} {does}"
             if open_ and not alike:
-                says = f"{differing} of {len(states)}{who}{few} {DIFFER[differing > 1]} in {what}"
+                differ = "differ" if differing > 1 else "differs"
+                says = f"{differing} of {len(states)}{who}{few} {differ} from people in {what}"
             like.append(f"{says} (cannot tell: {open_})" if open_ else says)
     if not (like or unclear):
         return f"For {len(drivers)} drivers no verdict on likeness to people is possible."
@@ -366,17 +258,16 @@ def _extremes(drivers: Mapping[str, Mapping[str, Values]]) -> str:
 
     Drivers without a verdict are left out.
     """
-    drivers = {name: of for name, of in drivers.items() if _is_judged(of)}
+    drivers = {name: of for name, of in drivers.items() if _are_crashes_judged(of)}
     crashed = {
         f"{drivers[name]['collisions']['counted']} trials ({name})": rate
         for name, rate in _crash_rates(drivers).items()
     }
-    gaps = {}
-    for name, of in drivers.items():
-        values = of.get("gap", {})
-        gap = values.get("estimate")
-        if gap is not None and has_verdict(values):
-            gaps[f"{number(gap)} m ({name})"] = gap
+    gaps = {
+        f"{number(of['gap']['estimate'])} m ({name})": of["gap"]["estimate"]
+        for name, of in drivers.items()
+        if has_verdict(of.get("gap", {})) and of["gap"].get("estimate") is not None
+    }
     parts = [
         f"{what} from {min(of, key=lambda text: of[text])} to {max(of, key=lambda text: of[text])}"
         for what, of in (("crashes range", crashed), ("mean gaps", gaps))
@@ -388,11 +279,8 @@ def _extremes(drivers: Mapping[str, Mapping[str, Values]]) -> str:
 def _likeness(drivers: Mapping[str, Mapping[str, Values]], *, every: bool) -> tuple[str, str]:
     """Return both parts of a headline on drivers with enough trials; ``every``: on all drivers."""
     unlike = {name: differences for name, of in drivers.items() if (differences := _differing(of))}
-    untold = [
-        f"{name} {crashes(of['collisions'])}."
-        for name, of in drivers.items()
-        if of["collisions"].get("undecided")
-    ]
+    undecided = {n: of for n, of in drivers.items() if of["collisions"].get("undecided")}
+    untold = [f"{name} {crashes(of['collisions'])}." for name, of in undecided.items()]
     alike = [name for name in drivers if name not in unlike]
     if not unlike:
         return f"No difference from people is shown for {joined(alike)}.", " ".join(untold)
@@ -418,13 +306,9 @@ def _seen_first(values: Values) -> tuple[int, float]:
 
 def _differing(verdicts: Mapping[str, Values]) -> list[Values]:
     """Return the differing measures with enough trials, what is seen at once first."""
-    unlike = [values for values in verdicts.values() if differs(values) and _most(values, verdicts)]
+    ended = _ended(verdicts["collisions"])
+    unlike = [of for of in verdicts.values() if differs(of) and suffice(of["n"] or 0, ended)]
     return sorted(unlike, key=_seen_first)
-
-
-def _most(values: Values, verdicts: Mapping[str, Values]) -> bool:
-    """Return whether a measure has enough trials, and at least half of those that ended."""
-    return suffice(values["n"] or 0, _ended(verdicts["collisions"]))
 
 
 def _ended(collisions: Values) -> int:
@@ -445,15 +329,6 @@ def _enough(verdicts: Mapping[str, Values]) -> bool:
     if not suffice(outcomes, _ended(verdicts["collisions"])):
         return False
     return bool(_differing(verdicts)) or not any(map(differs, verdicts.values()))
-
-
-def _too_few(drivers: Mapping[str, Mapping[str, Values]], *, alone: bool) -> str:
-    """Return how many trials of each driver finished, of those that ended."""
-    counts = [
-        f"{'' if alone else name} {_finished(of)} of {_ended(of['collisions'])}".strip()
-        for name, of in drivers.items()
-    ]
-    return f"{TOO_FEW}: {joined(counts)}."
 
 
 def difference_sentence(values: Values, it: str) -> str:

@@ -23,7 +23,6 @@ from merge_runner_analysis.cache import present_state, remembered
 from merge_runner_analysis.frames import KEYS, Order, Studies, read, read_frames
 from merge_runner_analysis.grouping import (
     Group,
-    Reason,
     groups_of,
     humans_of,
     in_human_conditions,
@@ -43,7 +42,10 @@ class StudyResults:
     """The groups of a database, humans first, and results that are computed once.
 
     ``models`` are the ``played`` groups that are judged, ``unjudged`` the others; ``probes`` are
-    groups of first-decision probes. ``state`` is the results' state before they were read.
+    groups of first-decision probes. ``baselines`` are the humans and every driver with the baseline
+    prompt, ``measured`` the groups whose speeds are known, ``reference`` is the prompt that others
+    are compared with. Tables depend on ``options`` and on ``state``, that before the results were
+    read.
     """
 
     def __init__(self, db: Path | str = DEFAULT_DB, selection: Selection = EVERYTHING) -> None:
@@ -75,6 +77,10 @@ class StudyResults:
         self.unjudged_probes = [group for group in probed if group.unjudged]
         with_human = selection.models is None or HUMAN in selection.models
         self.groups = [self.human] * with_human + self.models
+        self.baselines = [group for group in self.groups if group.setting in {"", BASELINE}]
+        self.measured = [group for group in self.groups if group.measured]
+        self.reference = next(iter(levels_of(self.played, self.order).get(PROMPT, ())), BASELINE)
+        self.options = selection.key(self.db)
 
     def _driven(self, trials: pd.DataFrame) -> pd.DataFrame:
         """Return trials of the chosen run and condition; raises UsageError for an unknown run."""
@@ -97,7 +103,7 @@ class StudyResults:
         if not self.selection.without_fallbacks:
             return groups
         fallen = _keys(frames.calls[frames.calls["fallback"] > 0])
-        every = Reason("every trial had a fallback")
+        every = "every trial had a fallback"
         parts = [
             group.part(lambda rows: pd.Series(~_keys(rows).isin(fallen), rows.index))
             for group in groups
@@ -127,11 +133,6 @@ class StudyResults:
         where = self.selection.where
         return _at(where, kept, self.db, self.order) if where else kept
 
-    @property
-    def options(self) -> str:
-        """Key of the options that its tables depend on besides the results."""
-        return self.selection.key(self.db)
-
     @cached_property
     def findings(self) -> list[str]:
         """Remarks on imported humans."""
@@ -140,11 +141,6 @@ class StudyResults:
         origins = recorded["spec_hash"].map(lambda name: specs.get(name, {}).get("origin"))
         of_pages = origins == VELOCITY_PAGES
         return [*findings(recorded.assign(of_pages=of_pages))] if len(recorded) else []
-
-    @property
-    def reference(self) -> str:
-        """The prompt that others are compared with."""
-        return next(iter(levels_of(self.played, self.order).get(PROMPT, ())), BASELINE)
 
     @cached_property
     def _human_traces(self) -> int:
@@ -178,16 +174,6 @@ class StudyResults:
             if name in played or not played
         }
         return humans | dict(sorted(played.items(), key=lambda item: (item[1], item[0])))
-
-    @property
-    def baselines(self) -> list[Group]:
-        """The humans and every driver with the baseline prompt."""
-        return [group for group in self.groups if group.setting in {"", BASELINE}]
-
-    @property
-    def measured(self) -> list[Group]:
-        """The groups whose speeds are known: all, but for humans before an import."""
-        return [group for group in self.groups if group.measured]
 
     @remembered
     def read(self, sql: str) -> pd.DataFrame:

@@ -20,22 +20,7 @@ from merge_runner.text_safety import first_line, quoted
 from merge_runner_analysis.metrics import JUDGED, LEFT_FIRST, METRICS, Metric
 from merge_runner_analysis.outlines import first_overlap
 from merge_runner_analysis.published import human_outcomes
-
-# Samples at or next to which boxes can overlap: with centres closer in the plane than the diagonal
-# of a box and the way that they can come nearer within a step.
-NEAR = """
-SELECT trial_id, spec_hash,
-    list((step, time_s, left_m, left_mps, right_m, right_mps) ORDER BY step) AS near
-FROM (
-    SELECT *, left_m - merge_m AS left_past_m, right_m - merge_m AS right_past_m,
-        sine * (least(left_past_m, 0) + least(right_past_m, 0)) AS across_m,
-        if(left_past_m < 0, cosine * left_past_m, left_past_m)
-            - if(right_past_m < 0, cosine * right_past_m, right_past_m) AS along_m,
-        {step_s} * (abs(left_mps - right_mps) + sine * (left_mps + right_mps)) AS nearer_m
-    FROM (SELECT *, merge_point_m() AS merge_m, branch_sine() AS sine, sqrt(1 - sine ** 2) AS cosine
-        FROM vehicle_pairs WHERE spec_hash IN ({specs}))
-) WHERE across_m ** 2 + along_m ** 2 < ({reach_m} + nearer_m) ** 2 GROUP BY ALL
-"""
+from merge_runner_analysis.queries import QUERIES
 
 
 def with_metrics(connection: duckdb.DuckDBPyConnection, trials: str) -> pd.DataFrame:
@@ -101,4 +86,4 @@ def _near(tasks: Mapping[str, ScenarioConfig]) -> str:
     added_m = 2 * (max(task.max_acceleration_mps2 for task in configs) + 2) * step_s**2
     reach_m = max(hypot(task.vehicle_length_m, task.vehicle_width_m) for task in configs)
     names = ", ".join(map(quoted, tasks)) or "NULL"
-    return NEAR.format(specs=names, step_s=step_s, reach_m=reach_m + added_m + 0.01)
+    return QUERIES["near"].format(specs=names, step_s=step_s, reach_m=reach_m + added_m + 0.01)

@@ -5,11 +5,12 @@ pandas is not needed to read them.
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import Enum
 from math import floor, log10
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any
 
 from merge_runner_analysis.metrics import (
     BOXES,
@@ -19,6 +20,7 @@ from merge_runner_analysis.metrics import (
     GAP,
     JOINT,
     LEFT_FIRST,
+    METRICS,
     RMSE,
     VALID,
 )
@@ -156,79 +158,6 @@ TIMES = " × "  # between the factors of an interaction
 Values = Mapping[str, Any]
 
 
-class Why(Enum):
-    """Remarks on numbers, such as why one is missing, with placeholders for values."""
-
-    # Fits; ``s`` makes a plural of the first value.
-    NO_FIRST = "no finished trial in which one went first"
-    NO_GAP = "no trial with a gap"
-    FEW_FIRST = (
-        "{} finished trial{s} in which one went first: too few, or in too few situations, to "
-        "estimate effects of headway and speed"
-    )
-    FEW_GAPS = (
-        "{} trial{s} with a gap: too few, or in too few situations, to estimate effects of headway "
-        "and speed"
-    )
-    SAME_FIRST = "who merged first is the same in all {} trials: nothing to explain"
-    SEPARATION = "separation: no finite estimate of {}; see Firth's fit"
-    NO_LIKELIHOOD = "the maximum likelihood fit does not converge"
-    NO_FIRTH = "Firth's penalised fit does not converge"
-    NO_PROFILE = "no profile of Firth's likelihood converges"
-    INFINITE_GAP = "a gap is not finite"
-    STEADY_GAP = "the gaps vary by less than 1 cm: there is nothing to test"
-    ONE_DECIDES = "a single trial decides a coefficient: no standard errors"
-    FEW_PAIRS = "{} pairs are too few for errors by pair"
-    WITHOUT_PAIR = "without {}: {}"
-    BY_PAIRS = "errors by jackknife over {} pairs"
-    NONE_APART = "no two played conditions differ in relative velocity alone"
-    # Indicators.
-    NO_ACTION = "no finished trial with control action"
-    ONE_ACTION = "a single trial, or a single human pair, with control action"
-    NO_TRACES = "as published, no human traces are imported"
-    BY_EYE = "by eye, the paper"
-    CAUTION = "{}"
-    # Measures.
-    CITED = "published, no human traces are imported ({})"
-    PUBLISHED = "humans as published"
-    NOT_PUBLISHED = "{}: no human value is published, and none is imported"
-    OTHER_RULE = "{}: published human collisions are boxes that overlap"
-    OUTCOMES = (
-        "who merged first and {}: the {} published outcomes; the rest: {} imported trials, {} "
-        "finished"
-    )
-    UNDECIDED = (
-        "{}: {} of {} trials are undecided, since another collision rule ended them; between {} "
-        "and {} %"
-    )
-    UNDECIDED_BOXES = (
-        "by people's rule {0} to {1} of {2} trials crashed: in {0} the outlines overlapped, and of "
-        "{3} that another crash rule ended before it is not known. A study played by people's rule "
-        '(collision_rule = "rectangle") decides them'
-    )
-    # Comparisons with humans.
-    OF_HUMANS = "humans: {}"
-    NONE_ENDED = "no trial ended: {}"
-    ONE_GAP = "a single trial has no error"
-    NO_GAP_THERE = "humans: no gap in {} of its conditions"
-    NOBODY_THERE = "no human drove its conditions"
-    NONE_ACTED = "accelerations held (I5) are not compared: no trial acted"
-    FEW_HUMANS = (
-        "accelerations held (I5) are not compared: no human recordings, or too few, are imported"
-    )
-
-
-class Fact(NamedTuple):
-    """Remark of the statistics as a code with its values; as a text it is the sentence."""
-
-    why: Why
-    values: tuple[object, ...] = ()
-
-    def __str__(self) -> str:
-        texts = (number(v) if isinstance(v, float) else v for v in self.values)
-        return self.why.value.format(*texts, s="" if self.values[:1] == (1,) else "s")
-
-
 def note_of(*remarks: object) -> str:
     """Return a note of all remarks that are not empty."""
     return "; ".join(map(str, filter(None, remarks)))
@@ -247,139 +176,50 @@ INDICATORS = {
 class Measure:
     """A measure by which a driver is compared with the humans.
 
-    ``trait`` names what humans do, ``label`` and ``unit`` head a column, ``rests_on`` is the column
-    in which its trials have a value, or "finished", and ``rule`` says how its state is set.
+    ``trait`` names what humans do, ``label`` and ``unit`` head a column, ``metric`` is the one that
+    its trials have, or none for all finished ones, and ``rule`` says how its state is set.
     ``difference`` is a template of the headline, with the fields ``it`` (the driver's name),
     ``driver`` and ``people``: counts of trials, or values with their intervals. ``says`` has by
     state the driver's part of a sentence, with ``of``, ``humans`` and ``more`` or less. ``ends``
     are the limits of its axis. A driver is alike if it differs from the humans by less than
-    ``margin``.
+    ``margin``. Those of HEADINGS say what drivers like people do, ``alike``, and have a ``topic``.
     """
 
     name: str
     trait: str
     label: str
     unit: str
-    rests_on: str
+    metric: str
     rule: str
     difference: str
     ends: tuple[float, float]
     says: Mapping[str, str] = field(default_factory=dict)
     margin: float | None = None
+    alike: str = ""
+    topic: str = ""
+
+    @property
+    def rests_on(self) -> str:
+        """The column in which its trials have a value, or ``finished``."""
+        return METRICS[self.metric].column if self.metric else "finished"
 
 
 MEASURES = {
-    measure.name: measure
-    for measure in (
-        Measure(
-            "headway",
-            "The one who is ahead goes first (I1)",
-            "who goes first, by who is ahead",
-            "log-odds per m",
-            LEFT_FIRST.column,
-            "Firth's fit: above 0, likelihood-ratio test at 5 %",
-            "with {it} the one ahead went first in {driver} trials, with people in {people}",
-            (-0.25, 2.5),
-            {
-                SHOWN: "the one ahead goes first, as with people",
-                WEAKER: "who goes first depends less on who is ahead than with people",
-                STRONGER: "who goes first depends more on who is ahead than with people",
-                OPPOSITE: "the one behind tends to go first, with people the one ahead",
-                UNDIRECTED: "neither the one ahead nor the one behind clearly tends to go first, "
-                "with people the one ahead",
-            },
-        ),
-        Measure(
-            "velocity",
-            "The faster one yields (I2)",
-            "who goes first, by who is faster",
-            "log-odds per m/s",
-            LEFT_FIRST.column,
-            "Firth's fit: below 0, likelihood-ratio test at 5 %",
-            "with {it} the slower one went first in {driver} trials side by side, with people in "
-            "{people}",
-            (-6.5, 3.0),
-            {
-                SHOWN: "the faster one yields, as with people",
-                WEAKER: "who goes first depends less on who is slower than with people",
-                STRONGER: "who goes first depends more on who is slower than with people",
-                OPPOSITE: "the faster one tends to go first, with people the slower one",
-                UNDIRECTED: "neither the slower nor the faster one clearly tends to go first, with "
-                "people the slower one",
-            },
-        ),
-        Measure(
-            "collisions",
-            "Crashes by people's rule",
-            "crashes",
-            "% of trials",
-            BOXES.column,
-            "difference within 5 points by its interval; else corrected p below .05",
-            "{it} crashed in {driver} trials, people in {people}",
-            (0.0, 30.0),
-        ),
-        Measure(
-            "gap",
-            "Gap at the merge point",
-            "mean gap",
-            "m",
-            GAP.column,
-            "difference within 1 m by its interval; else corrected p below .05",
-            "{it} left a gap of {driver} m (mean of its trials), people of {people} m",
-            (0.0, 8.0),
-            {
-                SHOWN: "leaves a gap of {of} m, like people ({humans} m)",
-                WEAKER: "leaves a gap of {of} m, smaller than people ({humans} m)",
-                STRONGER: "leaves a gap of {of} m, larger than people ({humans} m)",
-            },
-        ),
-        Measure(
-            "gap-headway",
-            "More headway, more gap (I3)",
-            "gap, by who is ahead",
-            "m per m",
-            GAP.column,
-            "HC3 errors: above 0 at 5 %",
-            "with {it} each metre that one is ahead adds {driver} m to the gap, with people "
-            "{people} m",
-            (-0.6, 1.0),
-            {
-                WEAKER: "each metre that one is ahead adds less to its gap than to people's",
-                STRONGER: "each metre that one is ahead adds more to its gap than to people's",
-                OPPOSITE: "each metre that one is ahead makes its gap smaller ({of} m), people's "
-                "larger ({humans} m)",
-                UNDIRECTED: "each metre that one is ahead changes its gap in no clear direction "
-                "({of} m), and makes people's larger ({humans} m)",
-            },
-        ),
-        Measure(
-            "gap-velocity",
-            "Relative velocity leaves the gap as it is (I4)",
-            "gap, by who is faster",
-            "m at most",
-            GAP.column,
-            "HC3 errors: largest difference of predicted gaps within 1 m, two one-sided tests at "
-            '5 %; not as with people: "within 1 m" is rejected, corrected p below .05',
-            "the gap of {it} differs by up to {driver} m by who is faster, people's by {people} m",
-            (0.0, 3.0),
-            {UNLIKE: "its gap differs by up to {of} m by who is faster, people's by {humans} m"},
-            margin=1.0,
-        ),
-        Measure(
-            "held",
-            "Accelerations are held, then jump (I5)",
-            "accelerations held",
-            "SD from humans",
-            "finished",
-            "within 0.5 SD, two one-sided tests at 5 %; not as with people: "
-            '"within 0.5 SD" is rejected, corrected p below .05',
-            "{it} holds its accelerations otherwise than people do, by {driver} of their SD",
-            (-2.0, 3.0),
-            {UNLIKE: "holds accelerations {more} than people"},
-            margin=0.5,
-        ),
-    )
+    name: Measure(name, **fields)
+    for name, fields in tomllib.loads(
+        Path(__file__).with_name("measures.toml").read_text(encoding="utf-8")
+    ).items()
 }
+
+
+def crash_text(rules: Sequence[tuple[str, Sequence[float]]]) -> str:
+    """Return the meaning of a crash by the collision rules that were played, with their steps."""
+    texts = []
+    for rule, steps_s in rules:
+        every = "simulation step, " * (len(steps_s) > 1) + " or ".join(map("{:g}".format, steps_s))
+        text = f"{RULES_MEAN[rule]}, checked every {every} s"
+        texts.append(text if rule == "rectangle" else f"{text} ({PLAYED_RULES[rule]})")
+    return " or, by the scenario of the trial, ".join(texts)
 
 
 def by_group(rows: Iterable[Any]) -> dict[str, dict[str, Values]]:

@@ -14,6 +14,7 @@ from typing import Any
 import duckdb
 
 from merge_runner.errors import StoreError
+from merge_runner.paths import named_queries
 from merge_runner.results.database import append, by_name, read_database
 from merge_runner.results.instance import limit_memory
 from merge_runner.results.rows import TrialKey
@@ -101,13 +102,10 @@ class Audit:
             yield f"  and {number - FINDINGS_SHOWN} more, all of them with --json"
 
 
-def _queries(file: str) -> dict[str, str]:
-    """Return the blocks of an SQL file of this package by name; the first block has none."""
-    blocks = Path(__file__).with_name(file).read_text("utf-8").split("\n\n")[1:]
-    return {block[3 : block.index(":")]: block.rstrip(";\n") for block in blocks}
-
-
-CHECKS, FACTS, REST = map(_queries, ("checks.sql", "facts.sql", "rest.sql"))
+CHECKS, FACTS, REST = (
+    named_queries(Path(__file__).with_name(name))
+    for name in ("checks.sql", "facts.sql", "rest.sql")
+)
 OF_CALLS = ("served_findings", "attempt_findings", "exchanged_findings", "shared_findings")
 
 

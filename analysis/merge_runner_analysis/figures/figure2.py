@@ -31,9 +31,9 @@ from merge_runner_analysis.figures.style import (
 from merge_runner_analysis.frames import KEYS
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.published import HUMAN, published
-from merge_runner_analysis.stats.estimate import Estimate
+from merge_runner_analysis.stats.estimate import Array, Estimate
 from merge_runner_analysis.stats.intervals import mean, proportion
-from merge_runner_analysis.stats.regressions import Array, gap_design
+from merge_runner_analysis.stats.regressions import gap_design
 from merge_runner_analysis.study import StudyResults
 
 Styles = dict[float, Style]  # of relative velocities in m/s

@@ -15,7 +15,7 @@ import scipy
 from numpy.typing import NDArray
 from scipy import special
 
-from merge_runner_analysis.stats.estimate import Estimate
+from merge_runner_analysis.stats.estimate import Array, Estimate
 from merge_runner_analysis.stats.intervals import LEVEL, POWER, ROUNDING, tested, two_sided_p
 from merge_runner_analysis.stats.score_interval import Z
 
@@ -25,7 +25,6 @@ NEAREST = 1e-9  # to a difference, of what it may be instead
 PARTS = 2**40  # of a distance, as exact as a place in it is
 LARGEST_Z = 30.0  # of this quantile p is 0 to 190 digits
 Z_WITH_POWER = Z + float(special.ndtri(POWER))
-Array = NDArray[np.float64]
 Trials = Mapping[str, Any]  # columns, also of a data frame: condition, a measure, maybe row
 
 

@@ -11,11 +11,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from merge_runner.errors import UsageError
-from merge_runner.registry import in_use, require
+from merge_runner.registry import require
 from merge_runner.study.arms import MODEL
-from merge_runner.study.file import StudyFile, StudySource, StudyText
-from merge_runner.text_safety import first_line
 from merge_runner_analysis.cache import remembered
 from merge_runner_analysis.grouping import Group, levels_of
 from merge_runner_analysis.metrics import BOXES, COLLISIONS, LEFT_FIRST, METRICS, Metric
@@ -25,12 +22,12 @@ from merge_runner_analysis.stats.intervals import difference
 from merge_runner_analysis.stats.levels import DRIVER, Cell, Level, copied_cells, levels_by_factor
 from merge_runner_analysis.stats.measures import linear, undecided
 from merge_runner_analysis.stats.sides import from_both_sides, one_sided
+from merge_runner_analysis.stats.study_file import asks_of_models, primary
 from merge_runner_analysis.study import StudyResults, in_one_study
-from merge_runner_analysis.wording import TIMES, UNREADABLE
+from merge_runner_analysis.wording import TIMES
 
 Columns = dict[str, NDArray[Any]]  # of trials
 Comparison = tuple[tuple[float, float], Estimate | None]  # both values and their difference
-PRIMARY = "goes_first"  # in a study's file, and where none is named
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,63 +121,6 @@ def driver_effects(study: StudyResults, driver: Group, reference: Group) -> list
         pooled = replace(group, trials=group.trials.assign(cell=cells), whole=None)
         levels.append(Level(DRIVER, group.id, (group.id,), pooled))
     return _with_corrected(study, [*_of_levels(study, levels)])
-
-
-@remembered
-def primary(study: StudyResults) -> Metric:
-    """Return the study's primary measure, by default who goes first. Raises UsageError."""
-    return _measures()[_named(study) or PRIMARY]
-
-
-@remembered
-def asks_of_models(study: StudyResults) -> bool:
-    """Return whether a study names a primary measure, and varies nothing but the model."""
-    factors = levels_of(study.models, study.order)
-    varying = {name for name, levels in factors.items() if len(levels) > 1}
-    return varying == {MODEL} and bool(_named(study))
-
-
-def _measures() -> dict[str, Metric]:
-    return {PRIMARY: LEFT_FIRST, "collided": COLLISIONS, **METRICS}
-
-
-def _named(study: StudyResults) -> str:
-    """Return the primary measure of the study's file, unless its plug-in is missing."""
-    file, _ = _file(study)
-    if file is None or "primary" not in file.model_fields_set:
-        return ""
-    if file.primary not in _measures() and not _text_at_hand(study):
-        return ""
-    require(_measures(), "measure", file.primary, "as the study's primary one")
-    return file.primary
-
-
-def texts_of(study: StudyResults) -> dict[str, dict[str, StudyText]]:
-    """Return the texts of a study's factors by level; empty where its file is not known."""
-    file, _ = _file(study)
-    return {} if file is None else dict(file.texts)
-
-
-def unreadable(study: StudyResults) -> str:
-    """Return why the study that was played cannot be read; empty if it can."""
-    return _file(study)[1]
-
-
-def _text_at_hand(study: StudyResults) -> str:
-    return study.source.text if study.source else in_use().text
-
-
-@remembered
-def _file(study: StudyResults) -> tuple[StudyFile | None, str]:
-    """Return the study's file, or why the stored one cannot be read. Raises UsageError."""
-    if text := _text_at_hand(study):
-        return StudySource(name="", text=text, plugins={}).file, ""
-    played = study.frames.studies
-    text = played.texts.get(next(iter(played.orders)), "") if len(played.orders) == 1 else ""
-    try:
-        return StudySource(name="", text=text, plugins={}).file if text else None, ""
-    except UsageError as exc:
-        return None, f"{UNREADABLE}, which takes who goes first as its measure: {first_line(exc)}"
 
 
 @remembered

@@ -6,7 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import inf
 
-from merge_runner_analysis.wording import Fact
+import numpy as np
+from numpy.typing import NDArray
+
+from merge_runner_analysis.facts import Fact
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

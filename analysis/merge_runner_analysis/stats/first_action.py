@@ -22,29 +22,16 @@ from merge_runner_analysis.drivers import has_chance
 from merge_runner_analysis.frames import KEYS
 from merge_runner_analysis.grouping import Group, of_trials
 from merge_runner_analysis.published import human_outcomes
-from merge_runner_analysis.stats.estimate import Estimate
+from merge_runner_analysis.queries import QUERIES
+from merge_runner_analysis.stats.estimate import Array, Estimate
 from merge_runner_analysis.stats.intervals import LEVEL, estimate
 from merge_runner_analysis.stats.regressions import (
     CONDITION,
-    Array,
     unfit_for_logit,
     who_first_data,
 )
 from merge_runner_analysis.study import StudyResults
 
-# One row a vehicle: the acceleration of the first step that its driver controls, and the word of
-# the first decision. Where each driver takes control at its own exit the other one cruises yet:
-# that is no first action.
-FIRST_ACTIONS = """
-SELECT trial_id, spec_hash, if(side = ego, 'left', 'right') AS side, first_mps2, tactical
-FROM (
-    SELECT trial_id, spec_hash, side, arg_min(acceleration_mps2, step) AS first_mps2
-    FROM states WHERE time_s > 0 GROUP BY ALL
-) JOIN trial_drivers USING (trial_id, spec_hash)
-LEFT JOIN (FROM decisions WHERE decision = 0) USING (trial_id, spec_hash, side)
-ANTI JOIN (FROM specs WHERE spec->>'$.scenario.control_start' = 'own_exit') USING (spec_hash)
-ORDER BY ALL
-"""
 # A human pedal seldom holds a speed exactly: within this a driver holds, beyond it goes or brakes.
 HOLD_MPS2 = 0.2
 KINDS: dict[str, Callable[[pd.Series], pd.Series]] = {
@@ -117,7 +104,7 @@ def repeats_itself(study: StudyResults, driver: GroupDriver) -> bool:
 @remembered
 def _stored(study: StudyResults, driver: GroupDriver) -> pd.DataFrame:
     trials = driver.group.ended[[*KEYS, *CONDITION, "condition", "pair", "ego"]]
-    rows = of_trials(study.read(FIRST_ACTIONS), trials).merge(trials, on=KEYS)
+    rows = of_trials(study.read(QUERIES["first_actions"]), trials).merge(trials, on=KEYS)
     return rows[rows["side"] == driver.side] if driver.side else rows
 
 

@@ -23,7 +23,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from merge_runner_analysis.stats.estimate import Array
 
 SAMPLE_S = 0.2
 TOLERANCE = 0.04

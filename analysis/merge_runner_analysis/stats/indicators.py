@@ -20,6 +20,7 @@ import numpy as np
 import pandas as pd
 
 from merge_runner_analysis.cache import remembered
+from merge_runner_analysis.facts import Fact, Why
 from merge_runner_analysis.frames import KEYS, SPEEDS, read
 from merge_runner_analysis.grouping import Group, of_trials
 from merge_runner_analysis.published import published
@@ -29,7 +30,7 @@ from merge_runner_analysis.stats.held import KEY, measure_profiles
 from merge_runner_analysis.stats.intervals import difference, mean
 from merge_runner_analysis.stats.regressions import Regression
 from merge_runner_analysis.study import StudyResults
-from merge_runner_analysis.wording import ALPHA, INDICATORS, Fact, Why
+from merge_runner_analysis.wording import ALPHA, INDICATORS
 
 AT_ONCE = 4_000  # trials whose samples are in memory together
 PUBLISHED, BY_EYE = Fact(Why.NO_TRACES), Fact(Why.BY_EYE)

@@ -12,23 +12,21 @@ from math import hypot, inf, sqrt
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 from scipy import special
 
-from merge_runner_analysis.stats.estimate import Estimate
+from merge_runner_analysis.stats.estimate import Array, Estimate
 from merge_runner_analysis.stats.score_interval import wilson
 
 LEVEL = 0.95
 POWER = 0.8
 ROUNDING = 1e-12
 TINY = 1e-300
-NOTHING = Estimate()
 
 
 def proportion(successes: int, n: int) -> Estimate:
     """Return a proportion with its Wilson interval (1927), exact at 0 and 1."""
     if n == 0:
-        return NOTHING
+        return Estimate()
     return Estimate(successes / n, *wilson(successes / n, n), n)
 
 
@@ -74,17 +72,17 @@ def _at_most(first: tuple[float, float], second: tuple[float, float]) -> Callabl
 
 
 @cache
-def _chances() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _chances() -> tuple[Array, Array]:
     """Return points and weights of Gauss and Legendre's rule on 0 to 1."""
     points, weights = np.polynomial.legendre.leggauss(200)
     return (1 + points) / 2, weights / 2
 
 
-def _beta(a: float, b: float, x: float | NDArray[np.float64]) -> NDArray[np.float64]:
+def _beta(a: float, b: float, x: float | Array) -> Array:
     return np.asarray(special.betainc(a, b, np.clip(x, 0.0, 1.0)))
 
 
-def mean(values: Sequence[float] | NDArray[np.float64]) -> Estimate:
+def mean(values: Sequence[float] | Array) -> Estimate:
     """Return a mean with its interval of Student's t; fewer than two numbers have no interval."""
     sample = np.asarray(values, dtype=float)
     sample = sample[np.isfinite(sample)]

@@ -10,16 +10,15 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from merge_runner_analysis.cache import remembered
+from merge_runner_analysis.facts import Fact, Why
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.metrics import BOXES, JUDGED, Metric
 from merge_runner_analysis.published import citation, published
-from merge_runner_analysis.stats.estimate import Estimate
-from merge_runner_analysis.stats.intervals import LEVEL, NOTHING, mean
+from merge_runner_analysis.stats.estimate import Array, Estimate
+from merge_runner_analysis.stats.intervals import LEVEL, mean
 from merge_runner_analysis.stats.intervals import estimate as interval_of
 from merge_runner_analysis.stats.score_interval import wilson
-from merge_runner_analysis.wording import Fact, Why
 
-Array = NDArray[np.float64]
 PAPER = "paper_ablation_quantitative"
 
 
@@ -53,7 +52,7 @@ def estimate(group: Group, metric: Metric) -> Estimate:
         return median(sample)
     k, cut_off = float(sample.sum()), undecided(group, metric)
     if not (every := len(sample) + cut_off):
-        return NOTHING
+        return Estimate()
     low, high = wilson(k / every, every)[0], wilson((k + cut_off) / every, every)[1]
     value = None if cut_off else 100 * k / every
     return Estimate(value, 100 * low, 100 * high, len(sample), k=int(k), undecided=cut_off)
@@ -82,7 +81,7 @@ def mean_of(trials: pd.DataFrame, column: str, shares: pd.Series | None = None) 
         return mean(trials[column].to_numpy(float))
     trials = trials[["condition", "pair", column]].dropna()
     if trials.empty:
-        return NOTHING
+        return Estimate()
     if shares is None:
         shares = trials["condition"].value_counts()
     cells = trials.groupby(["pair", "condition"])[column].agg(["size", "sum"]).unstack(fill_value=0)
@@ -104,7 +103,7 @@ def mean_of(trials: pd.DataFrame, column: str, shares: pd.Series | None = None) 
 def median(sample: np.ndarray) -> Estimate:
     """Return a median with its interval of order statistics; fewer than six values have none."""
     if not len(sample):
-        return NOTHING
+        return Estimate()
     n, ordered = len(sample), np.sort(sample)
     low, high = _ranks(n)
     ends = float(ordered[low]) if low >= 0 else None, float(ordered[high]) if high < n else None

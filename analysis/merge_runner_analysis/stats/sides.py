@@ -5,6 +5,7 @@ A trial in which both get the same counts half for the left driver and half for 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import pandas as pd
@@ -15,6 +16,8 @@ from merge_runner_analysis.stats.estimate import Estimate
 from merge_runner_analysis.stats.levels import Cell, Level
 from merge_runner_analysis.stats.measures import estimate
 from merge_runner_analysis.study import StudyResults
+
+MIRRORED = " mirrored"  # ends the name of a condition as the driver on the right sees it
 
 
 @remembered
@@ -82,11 +85,15 @@ def read_twice(frame: pd.DataFrame, images: pd.Series) -> pd.DataFrame:
     return pd.concat([frame, right])
 
 
-@remembered
-def _mirrored(study: StudyResults, condition: str) -> str:
-    headway_m, velocity_mps = study.conditions[condition]
+def mirrored_name(condition: str, conditions: Mapping[str, tuple[float, float]]) -> str:
+    """Return the name of a mirrored condition, by headway in m and relative velocity in m/s."""
+    headway_m, velocity_mps = conditions[condition]
     numbers = (0 - headway_m, 0 - velocity_mps)
     if numbers == (headway_m, velocity_mps):
         return condition
-    names = [name for name, known in study.conditions.items() if known == numbers]
-    return min(names, default=f"{condition} mirrored")
+    return min((n for n, at in conditions.items() if at == numbers), default=condition + MIRRORED)
+
+
+@remembered
+def _mirrored(study: StudyResults, condition: str) -> str:
+    return mirrored_name(condition, study.conditions)

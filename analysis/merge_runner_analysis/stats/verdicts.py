@@ -15,9 +15,9 @@ level at which Holm tested it, so that both agree; 90 % where I4 or I5 lies with
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import astuple, dataclass, field, replace
-from functools import cache, cached_property, partial
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -25,14 +25,20 @@ import pandas as pd
 
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner_analysis.cache import remembered
+from merge_runner_analysis.facts import Fact, Why
 from merge_runner_analysis.grouping import Group
 from merge_runner_analysis.metrics import BOXES, COLLISIONS, GAP
-from merge_runner_analysis.published import HUMAN_GAP_SD_M, PAIRS, human_outcomes, published
 from merge_runner_analysis.stats import contrasts, intervals, measures, regressions
 from merge_runner_analysis.stats.estimate import Estimate
-from merge_runner_analysis.stats.indicators import TESTED, Judgement, fits, judge, less_humans
-from merge_runner_analysis.stats.regressions import CONDITION, GAP_TERMS, MIN_PAIRS, Regression
-from merge_runner_analysis.stats.score_interval import wilson
+from merge_runner_analysis.stats.human_reference import (
+    SLOPES,
+    headway_slope,
+    human_estimates,
+    largest_difference,
+    who_first_slope,
+)
+from merge_runner_analysis.stats.indicators import Judgement, fits, judge, less_humans
+from merge_runner_analysis.stats.regressions import CONDITION
 from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.wording import (
     ALPHA,
@@ -42,12 +48,11 @@ from merge_runner_analysis.wording import (
     STRONGER,
     UNLIKE,
     WEAKER,
-    Fact,
     Measure,
-    Why,
 )
 
-PUBLISHED = Fact(Why.PUBLISHED)
+# By measure: the indicator that shows its trait where it holds by its robust test.
+INDICATOR = {"headway": "I1", "velocity": "I2", "gap-headway": "I3", "gap-velocity": "I4"}
 # The level of an interval that lies within a margin where two one-sided tests at 5 % say so.
 WITHIN_LEVEL = 1 - 2 * ALPHA
 
@@ -63,7 +68,16 @@ class Both:
     @cached_property
     def estimates(self) -> dict[str, tuple[Estimate, Estimate]]:
         """The driver's and the humans' estimate of each measure."""
-        return {name: (of.driver(self), of.human(self)) for name, of in STATISTICS.items()}
+        group, human = self.group, human_estimates(self.human, self.group)
+        driver = {
+            **{name: who_first_slope(group, term) for name, term in SLOPES.items()},
+            "collisions": _collided(group),
+            "gap": _gap(group),
+            "gap-headway": headway_slope(fits(group).hc3),
+            "gap-velocity": largest_difference(fits(group).hc3, group),
+            "held": self.likeness,
+        }
+        return {name: (driver[name], human[name]) for name in driver}
 
     @cached_property
     def judgements(self) -> dict[str, Judgement]:
@@ -78,20 +92,6 @@ class Counted(NamedTuple):
     n: int
     human_k: int
     human_n: int
-
-
-@dataclass(frozen=True, slots=True)
-class Statistic:
-    """Estimators of a measure for a driver and for humans, and its test (default: Welch's).
-
-    The test is of the difference, or of the driver's value against a margin. If an ``indicator``
-    holds by its robust test, the trait is shown.
-    """
-
-    driver: Callable[[Both], Estimate]
-    human: Callable[[Both], Estimate]
-    test: Callable[[Both], Estimate | None] | None = None
-    indicator: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,8 +121,8 @@ def compared(study: StudyResults, group: Group) -> tuple[Comparison, ...]:
     counts = counted(both)
     comparisons = []
     for name, measure in MEASURES.items():
-        indicator, (driver, human) = STATISTICS[name].indicator, both.estimates[name]
-        why = both.judgements[indicator].why if indicator else None
+        driver, human = both.estimates[name]
+        why = both.judgements[INDICATOR[name]].why if name in INDICATOR else None
         remarks = driver.problem, human.problem, None if driver.problem else why
         state, tested = states.get(name, OPEN if driver.undecided else ""), Estimate()
         if name in tests:
@@ -132,14 +132,6 @@ def compared(study: StudyResults, group: Group) -> tuple[Comparison, ...]:
         comparison = Comparison(measure, driver, human, tested, state, remarks, counts.get(name))
         comparisons.append(comparison)
     return tuple(comparisons)
-
-
-@remembered
-def of_humans(study: StudyResults) -> dict[str, Estimate]:
-    """Return the humans by measure, over all conditions; a few imported trials change nothing."""
-    human = study.human
-    both = Both(human if _imported(human) else replace(human, trials=human.outcomes), human)
-    return {name: statistic.human(both) for name, statistic in STATISTICS.items()}
 
 
 def counted(both: Both) -> dict[str, Counted]:
@@ -155,7 +147,7 @@ def counted(both: Both) -> dict[str, Counted]:
 
 @remembered
 def _human_hits(human: Group) -> dict[str, pd.Series]:
-    first = {name: _went_first(human.outcomes, name) for name in ("headway", "velocity")}
+    first = {name: _went_first(human.outcomes, name) for name in SLOPES}
     return {"collisions": measures.values(human, BOXES).astype(bool), **first}
 
 
@@ -192,11 +184,15 @@ def comparable(group: Group) -> Group:
 
 def tests_of(both: Both) -> dict[str, Estimate]:
     """Return a driver's possible tests by measure, with corrected p and levels of intervals."""
-    tests = {}
-    for name, statistic in STATISTICS.items():
-        default = partial(intervals.difference, *both.estimates[name])
-        if test := statistic.test(both) if statistic.test else default():
-            tests[name] = test
+    possible = {
+        **_who_first(both),
+        "collisions": _rates(both),
+        "gap": intervals.difference(*both.estimates["gap"]),
+        "gap-headway": intervals.difference(*both.estimates["gap-headway"]),
+        "gap-velocity": _velocity(both),
+        "held": _held(both.likeness),
+    }
+    tests = {name: test for name, test in possible.items() if test}
     p = {name: test.p for name, test in tests.items() if test.p is not None}
     p_holm = dict(zip(p, contrasts.corrected([*p.values()]), strict=True))
     levels = holm_levels(p, p_holm)
@@ -211,12 +207,12 @@ def states_of(both: Both, tests: Mapping[str, Estimate]) -> dict[str, str]:
     traits = {name for name, judgement in both.judgements.items() if judgement.passed}
     states = {}
     for name, test in tests.items():
-        measure, statistic = MEASURES[name], STATISTICS[name]
+        measure = MEASURES[name]
         differs = test.p_holm is not None and test.p_holm < ALPHA
         states[name] = UNLIKE if differs else OPEN
         if _within(measure, test):
             states[name] = SHOWN
-        elif measure.margin is None and statistic.indicator in traits:
+        elif measure.margin is None and INDICATOR.get(name) in traits:
             driver, human = (abs(estimate.value or 0.0) for estimate in both.estimates[name])
             states[name] = (WEAKER if driver < human else STRONGER) if differs else SHOWN
     return states
@@ -237,20 +233,17 @@ def holm_levels(p: Mapping[str, float], p_holm: Mapping[str, float]) -> dict[str
     return {name: 1 - ALPHA / (len(order) - min(place, sure)) for place, name in enumerate(order)}
 
 
-def _who_first(both: Both, term: str) -> Estimate | None:
-    """Return the difference of a slope, from one model of both with all interactions."""
-    difference = _less_humans(both.group, both.human)
-    alone = fits(both.group).firth, fits(both.human).firth
-    if any(term not in fit.terms for fit in (*alone, difference)):
-        return None
-    b, se, _, p = astuple(difference.terms[term])
-    ends_at, least = partial(difference.interval, term), intervals.detectable(se)
-    return Estimate(b, se=se, p=p, detectable=least, ends_at=ends_at)
-
-
-@remembered
-def _less_humans(group: Group, human: Group) -> Regression:
-    return regressions.who_first_firth(group.outcomes, less=human.outcomes)
+def _who_first(both: Both) -> dict[str, Estimate]:
+    """Return the differences of the slopes, from one model of both with all interactions."""
+    joint = regressions.who_first_firth(both.group.outcomes, less=both.human.outcomes)
+    every = fits(both.group).firth, fits(both.human).firth, joint
+    tests = {}
+    for name, term in SLOPES.items():
+        if all(term in fit.terms for fit in every):
+            b, se, _, p = astuple(joint.terms[term])
+            ends_at, least = partial(joint.interval, term), intervals.detectable(se)
+            tests[name] = Estimate(b, se=se, p=p, detectable=least, ends_at=ends_at)
+    return tests
 
 
 def _rates(both: Both) -> Estimate | None:
@@ -280,8 +273,7 @@ def _velocity(both: Both) -> Estimate | None:
     return Estimate(moved.most, p=moved.beyond_p, ends_at=moved.interval)
 
 
-def _held(both: Both) -> Estimate | None:
-    likeness = both.likeness
+def _held(likeness: Estimate) -> Estimate | None:
     value, se, margin = likeness.value, likeness.se, MEASURES["held"].margin
     if value is None or se is None or margin is None:
         return None
@@ -299,108 +291,10 @@ def _likeness(study: StudyResults, group: Group) -> Estimate:
     return Estimate(n=len(group.finished), problem=Fact(why))
 
 
-def _of_fit(human: Group, estimate: Estimate) -> Estimate:
-    """Return an estimate of the humans' regression of the gap, with its source or problem."""
-    if estimate.problem:
-        return replace(estimate, problem=Fact(Why.OF_HUMANS, (estimate.problem,)))
-    return estimate if _imported(human) else replace(estimate, source=PUBLISHED)
-
-
-def _imported(human: Group) -> bool:
-    return human.measured and human.finished["pair"].nunique() >= MIN_PAIRS
-
-
 def _gap(group: Group) -> Estimate:
     estimate = measures.mean_of(group.finished, GAP.column)
     why = Why.ONE_GAP if estimate.n else Why.NO_GAP
     return replace(estimate, problem=Fact(why)) if estimate.se is None else estimate
-
-
-def human_gap(human: Group, group: Group) -> Estimate:
-    """Return the humans' mean gap, weighted by condition as the group's trials that have a gap.
-
-    The published mean is moved by the published regression; its error is the spread of the pairs'
-    random intercepts, which are shrunken, so that it is rather too small.
-    """
-    gaps = group.finished[group.finished[GAP.column].notna()] if group.measured else None
-    if _imported(human):
-        known = human.finished[human.finished[GAP.column].notna()]
-        if gaps is None or gaps.empty:
-            return measures.mean_of(known, GAP.column)
-        shares = gaps["condition"].value_counts()
-        if lacking := {*shares.index} - {*known["condition"]}:
-            return Estimate(n=len(known), problem=Fact(Why.NO_GAP_THERE, (len(lacking),)))
-        shared = known[known["condition"].isin(shares.index)]
-        return measures.mean_of(shared, GAP.column, None if group is human else shares)
-    (value, usual, spread), fit, moved = (
-        _published_gap(),
-        human_fit(human),
-        np.zeros(len(GAP_TERMS)),
-    )
-    if gaps is not None and len(gaps):
-        moved = _gap_design(gaps).mean(axis=0) - usual
-    assert fit.covariance is not None
-    se = float(spread**2 + moved @ fit.covariance @ moved) ** 0.5
-    value += float(moved @ [term.b for term in fit.terms.values()])
-    return replace(intervals.estimate(value, se, len(PAIRS) - 1, fit.n), source=PUBLISHED)
-
-
-@cache
-def _published_gap() -> tuple[float, regressions.Array, float]:
-    """Return the humans' mean gap in m, the mean regressors of its trials, and its error in m."""
-    row = published("paper_ablation_quantitative").query("driver == 'human'").iloc[0]
-    outcomes = human_outcomes().query("status == 'finished'")
-    spread = float(published("human_gap_intercepts")["intercept_m"].std() / len(PAIRS) ** 0.5)
-    return float(row["gap_m"]), _gap_design(outcomes).mean(axis=0), spread
-
-
-def _gap_design(trials: pd.DataFrame) -> regressions.Array:
-    return regressions.gap_design(*trials[CONDITION].to_numpy(float).T)
-
-
-@remembered
-def human_fit(human: Group) -> Regression:
-    """Return the humans' regression of the gap: by pairs, or as published.
-
-    Covariances that are not published follow from the outcomes and one standard deviation.
-    """
-    if _imported(human):
-        return regressions.by_pairs(regressions.gap_ols, human.trials, "gap_m")
-    rows = published("paper_gap").query("driver == 'human'").set_index("term")
-    design = _gap_design(human_outcomes().query("status == 'finished'"))
-    covariance = HUMAN_GAP_SD_M**2 * np.asarray(np.linalg.inv(design.T @ design))
-    terms = {
-        name: regressions.Term(float(rows.at[name, "b"]), float(rows.at[name, "se"]), None, np.nan)
-        for name in GAP_TERMS
-    }
-    n = int(rows["n"].iloc[0])
-    return Regression(n, terms, freedom=n - len(GAP_TERMS), covariance=covariance)
-
-
-@remembered
-def _slope(group: Group, term: str) -> Estimate:
-    fit = fits(group).firth
-    if fit.problem:
-        return Estimate(n=fit.n, problem=fit.problem)
-    b, se = fit.terms[term].b, fit.terms[term].se
-    if ends := fit.interval(term, intervals.LEVEL):
-        return Estimate(b, *ends, fit.n, se)
-    return Estimate(b, n=fit.n, se=se, problem=Fact(Why.NO_PROFILE))
-
-
-def _headway(fit: Regression) -> Estimate:
-    if fit.problem:
-        return Estimate(n=fit.n, problem=fit.problem)
-    term = fit.terms[TESTED["I3"][0]]
-    return intervals.estimate(term.b, term.se, fit.freedom, fit.n)
-
-
-def _moved(fit: Regression, group: Group) -> Estimate:
-    """Return the largest difference of gaps that relative velocity alone makes for a group."""
-    moved = fit.moved(group.trials)
-    if moved is None:
-        return Estimate(n=fit.n, problem=fit.problem or Fact(Why.NONE_APART))
-    return Estimate(moved.most, *moved.interval(intervals.LEVEL), fit.n)
 
 
 def _collided(group: Group) -> Estimate:
@@ -409,55 +303,3 @@ def _collided(group: Group) -> Estimate:
         return Estimate(problem=Fact(Why.NONE_ENDED, (group.left_out,)))
     problem = measures.undecided_note(group, BOXES)
     return replace(measures.estimate(group, BOXES), problem=problem, k=k, undecided=cut_off)
-
-
-def _standardised(both: Both) -> Estimate:
-    """Return the humans' collisions, with conditions weighted as in a group's trials."""
-    played = both.group.ended_outcomes["condition"].value_counts()  # with those undecided
-    outcomes = both.human.outcomes
-    shared = outcomes[outcomes["condition"].isin(played.index)]
-    if shared.empty:
-        return Estimate(problem=Fact(Why.NOBODY_THERE))
-    counts = shared.groupby("condition")[BOXES.column].agg(["sum", "size"]).astype(int)
-    k, n = counts.to_numpy().T
-    shares = played[counts.index].to_numpy() / played[counts.index].sum()
-    rate, effective_n = float(shares @ (k / n)), 1 / float(shares**2 @ (1 / n))
-    low, high = wilson(rate, effective_n)
-    return Estimate(100 * rate, 100 * low, 100 * high, len(shared), effective_n=effective_n)
-
-
-def _goes_first(indicator: str) -> Statistic:
-    term = TESTED[indicator][0]
-    return Statistic(
-        lambda both: _slope(both.group, term),
-        lambda both: _slope(both.human, term),
-        partial(_who_first, term=term),
-        indicator,
-    )
-
-
-STATISTICS = {
-    "headway": _goes_first("I1"),
-    "velocity": _goes_first("I2"),
-    "collisions": Statistic(lambda both: _collided(both.group), _standardised, _rates),
-    "gap": Statistic(
-        lambda both: _gap(both.group),
-        lambda both: human_gap(both.human, both.group),
-    ),
-    "gap-headway": Statistic(
-        lambda both: _headway(fits(both.group).hc3),
-        lambda both: _of_fit(both.human, _headway(human_fit(both.human))),
-        indicator="I3",
-    ),
-    "gap-velocity": Statistic(
-        lambda both: _moved(fits(both.group).hc3, both.group),
-        lambda both: _of_fit(both.human, _moved(human_fit(both.human), both.group)),
-        _velocity,
-        "I4",
-    ),
-    "held": Statistic(
-        lambda both: both.likeness,
-        lambda both: Estimate(0.0, n=len(both.human.finished)),
-        _held,
-    ),
-}

@@ -9,9 +9,10 @@ from math import tanh
 from textwrap import shorten
 
 from merge_runner_analysis.metrics import RULES_NOTE
-from merge_runner_analysis.stats.effects import Effect, effects, primary, texts_of, unreadable
+from merge_runner_analysis.stats.effects import Effect, effects
 from merge_runner_analysis.stats.levels import Level, levels_by_factor
 from merge_runner_analysis.stats.sides import cells_seen, one_sided
+from merge_runner_analysis.stats.study_file import primary, texts_of, unreadable
 from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.wording import CORRECTED, METRIC_NAMES, PLANTED, WORDS, joined
 

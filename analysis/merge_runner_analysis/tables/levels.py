@@ -10,10 +10,10 @@ import pandas as pd
 from merge_runner.records import SIDES
 from merge_runner.study.arms import MODEL, OPPONENT
 from merge_runner_analysis.metrics import COLLISIONS, GAP, RMSE, Metric
-from merge_runner_analysis.stats.effects import primary, texts_of
 from merge_runner_analysis.stats.levels import Level, crossing, levels_by_factor
 from merge_runner_analysis.stats.measures import counts, estimate
 from merge_runner_analysis.stats.sides import have_same_prompts, level_estimate, one_sided
+from merge_runner_analysis.stats.study_file import primary, texts_of
 from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables.model import ENDED, Column, Optional, Row, Table, Value, interval
 from merge_runner_analysis.wording import EGO, HALVES, LEFT, TIMES

@@ -18,8 +18,9 @@ from merge_runner_analysis.headlines import sentences
 from merge_runner_analysis.metrics import BOXES
 from merge_runner_analysis.published import HUMAN, HUMAN_TRIALS
 from merge_runner_analysis.stats.estimate import Estimate
+from merge_runner_analysis.stats.human_reference import of_humans
 from merge_runner_analysis.stats.levels import distinct
-from merge_runner_analysis.stats.verdicts import Comparison, compared, of_humans
+from merge_runner_analysis.stats.verdicts import Comparison, compared
 from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables.model import (
     COUNTED,

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from merge_runner.records import SIDES
-from merge_runner_analysis.headlines import LEFT_GOES_FIRST, apart, is_constant
 from merge_runner_analysis.metrics import COLLISIONS, LEFT_FIRST
 from merge_runner_analysis.tables.model import Table, from_text
+from merge_runner_analysis.two_drivers import LEFT_GOES_FIRST, apart, is_constant
 from merge_runner_analysis.web.computing import Job
 from merge_runner_analysis.web.effect_rows import (
     Measured,

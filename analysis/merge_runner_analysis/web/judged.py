@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from merge_runner.config import ScenarioConfig
-from merge_runner_analysis.headlines import crash_text, sentence
+from merge_runner_analysis.headlines import sentence
 from merge_runner_analysis.published import HUMAN, human_counts
 from merge_runner_analysis.tables.model import Table
 from merge_runner_analysis.web.marks import Cell, band, cells, measures_of
@@ -25,6 +25,7 @@ from merge_runner_analysis.wording import (
     TABLE,
     by_group,
     capital,
+    crash_text,
 )
 
 KINDS = {

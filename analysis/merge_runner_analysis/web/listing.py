@@ -19,8 +19,8 @@ from merge_runner.records import ANSWERS, NO_DECISION, SIDES
 from merge_runner.results.instance import SETTINGS, in_memory
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.served_model import Pair, other_models, sql_of
-from merge_runner_analysis.calls import COUNTED
 from merge_runner_analysis.drivers import language_models, stand_in, unresponsive
+from merge_runner_analysis.queries import COUNTED
 from merge_runner_analysis.web.asked import list_sent
 from merge_runner_analysis.web.reading import Copy, Row, records
 from merge_runner_analysis.web.trial.account import ALONE, OTHER_ACCOUNTS, Course, collision_class

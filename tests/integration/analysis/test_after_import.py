@@ -10,6 +10,7 @@ from merge_runner_analysis.frames import SPEEDS
 from merge_runner_analysis.grouping import humans_of, of_trials
 from merge_runner_analysis.metrics import GAP
 from merge_runner_analysis.stats.held import measure_profiles
+from merge_runner_analysis.stats.human_reference import human_gap, of_humans
 from merge_runner_analysis.stats.indicators import (
     Judgement,
     less_humans,
@@ -18,7 +19,6 @@ from merge_runner_analysis.stats.indicators import (
     score,
 )
 from merge_runner_analysis.stats.measures import estimate
-from merge_runner_analysis.stats.verdicts import human_gap, of_humans
 from merge_runner_analysis.tables import make_tables
 from tests.support.tables import by_id, notes_with
 

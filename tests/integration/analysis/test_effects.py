@@ -15,7 +15,8 @@ from merge_runner.study.file import MEASURES, StudyText
 from merge_runner_analysis.frames import load
 from merge_runner_analysis.metrics import COLLISIONS, LEFT_FIRST, METRICS
 from merge_runner_analysis.selection import Selection
-from merge_runner_analysis.stats.effects import driver_effects, effects, primary
+from merge_runner_analysis.stats.effects import driver_effects, effects
+from merge_runner_analysis.stats.study_file import primary
 from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.tables import effect_notes
 from merge_runner_analysis.tables.comparison import comparison

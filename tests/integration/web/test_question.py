@@ -12,7 +12,7 @@ from playwright.sync_api import expect
 from merge_runner.results.store import query, results_digest
 from merge_runner_analysis.figures.figure2 import figure2
 from merge_runner_analysis.selection import Selection
-from merge_runner_analysis.stats.verdicts import human_gap
+from merge_runner_analysis.stats.human_reference import human_gap
 from merge_runner_analysis.study import StudyResults
 from tests.support.gate import HANGS_S
 from tests.support.harness import PROGRAM, environment

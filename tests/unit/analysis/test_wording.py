@@ -8,14 +8,12 @@ from hypothesis import strategies as st
 
 from merge_runner_analysis.headlines import (
     TOO_FEW,
-    apart,
-    crash_text,
     crashes,
     difference_sentence,
     headline,
-    is_constant,
     sentence,
 )
+from merge_runner_analysis.two_drivers import apart, is_constant
 from merge_runner_analysis.web.marks import SHAPES
 from merge_runner_analysis.wording import (
     LANGUAGE_MODEL,
@@ -28,6 +26,7 @@ from merge_runner_analysis.wording import (
     STRONGER,
     UNLIKE,
     WEAKER,
+    crash_text,
     differs,
     money,
     shown_state,

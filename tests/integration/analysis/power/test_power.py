@@ -11,18 +11,10 @@ from merge_runner.planted_effect import PlantedEffect
 from merge_runner.run.plan import make_plan
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.study.file import Effect
-from merge_runner_analysis.power import (
-    HUMANS,
-    Case,
-    Contrast,
-    Played,
-    chances,
-    human,
-    power,
-    power_table,
-    simulate,
-    unread_words,
-)
+from merge_runner_analysis.power import chances, power, power_table, unread_words
+from merge_runner_analysis.power.assumptions import HUMANS
+from merge_runner_analysis.power.cases import Case, Contrast, Played
+from merge_runner_analysis.power.truth import human, simulate
 from merge_runner_analysis.selection import Selection
 from merge_runner_analysis.stats.effects import effects
 from merge_runner_analysis.stats.regressions import gap_ols, who_first_logit

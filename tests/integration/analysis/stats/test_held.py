@@ -6,6 +6,7 @@ import pytest
 from scipy import stats
 
 from merge_runner.config import ScenarioConfig
+from merge_runner_analysis.facts import Fact, Why
 from merge_runner_analysis.frames import SPEEDS, load
 from merge_runner_analysis.stats.held import measure_profiles
 from merge_runner_analysis.stats.indicators import (
@@ -17,7 +18,6 @@ from merge_runner_analysis.stats.indicators import (
     score,
 )
 from merge_runner_analysis.study import StudyResults
-from merge_runner_analysis.wording import Fact, Why
 from tests.support.studies import SCENARIO, changed, write_study, yielding
 from tests.support.tables import by_id, made
 

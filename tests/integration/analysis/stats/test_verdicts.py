@@ -8,7 +8,8 @@ from scipy import stats
 
 from merge_runner.config import ScenarioConfig
 from merge_runner_analysis.published import human_counts
-from merge_runner_analysis.stats.verdicts import compared, human_fit, human_gap
+from merge_runner_analysis.stats.human_reference import human_fit, human_gap
+from merge_runner_analysis.stats.verdicts import compared
 from merge_runner_analysis.study import StudyResults
 from merge_runner_analysis.wording import DIFFERS, MEASURES
 from tests.support.studies import Drive, write_study, yielding

@@ -12,7 +12,7 @@ from statsmodels.stats.contingency_tables import StratifiedTable
 from statsmodels.stats.multitest import multipletests
 
 from analysis.research.independent.recompute_statistics import means_within as recomputed_means
-from merge_runner_analysis import headlines
+from merge_runner_analysis import two_drivers
 from merge_runner_analysis.stats.contrasts import (
     Cells,
     contrast_means,
@@ -63,7 +63,7 @@ def test_the_example_of_two_models_has_the_numbers_of_its_test():
         "ci": (100 * found.low, 100 * found.high),
         "p_corrected": corrected([found.p, *[1.0] * 6])[0],
     }
-    claim, _ = headlines.apart("o3", "gpt-6-sol", {"collided_percent": values}, of_left=False)
+    claim, _ = two_drivers.apart("o3", "gpt-6-sol", {"collided_percent": values}, of_left=False)
     assert claim in " ".join((PROJECT / "docs/run-a-study.md").read_text().split())
 
 

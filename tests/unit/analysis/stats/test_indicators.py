@@ -9,6 +9,7 @@ import pytest
 from scipy import stats
 
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner_analysis.facts import Fact, Why
 from merge_runner_analysis.stats.indicators import Judgement, judge, total
 from merge_runner_analysis.stats.regressions import (
     GAP_MARGIN_M,
@@ -18,7 +19,6 @@ from merge_runner_analysis.stats.regressions import (
     gap_design,
     gap_ols,
 )
-from merge_runner_analysis.wording import Fact, Why
 
 SEPARATED = Regression(110, {}, Fact(Why.SEPARATION, ("projected_headway",)))
 MISSING = Regression(0, {}, Fact(Why.NO_GAP))

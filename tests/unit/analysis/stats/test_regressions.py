@@ -11,8 +11,8 @@ from firthmodels import FirthLogisticRegression, detect_separation
 from analysis.research.independent.recompute_statistics import equivalence_p, joint_p, least_squares
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.published import human_outcomes
+from merge_runner_analysis.stats.firth import Counts
 from merge_runner_analysis.stats.regressions import (
-    Counts,
     gap_ols,
     who_first_firth,
     who_first_logit,

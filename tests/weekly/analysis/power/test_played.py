@@ -13,15 +13,9 @@ from merge_runner.planted_effect import PlantedEffect
 from merge_runner.records import SIDES, Slot
 from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner.study.file import Effect
-from merge_runner_analysis.power import (
-    Case,
-    Contrast,
-    Played,
-    human,
-    played,
-    power,
-    simulate,
-)
+from merge_runner_analysis.power import power
+from merge_runner_analysis.power.cases import Case, Contrast, Played
+from merge_runner_analysis.power.truth import human, played, simulate
 from merge_runner_analysis.stats.regressions import gap_ols, who_first_firth
 from merge_runner_analysis.study import StudyResults
 from tests.support.emulator_fixtures import first_prompt
