@@ -194,7 +194,8 @@ def test_results_are_cited_from_the_foot_of_every_page(db):
         assert Page(client.get("/").text).to("/cite")
         said = Page(client.get("/cite").text).text
     digest, trials = results_digest(db)[0], query(db, "SELECT count(*) FROM trials")[1][0][0]
-    assert f"from {trials:,} trials; digest of the results {digest}" in said
+    played = r"played [-0-9]{10} [0-9:]{5}( to [-0-9]{10} [0-9:]{5})? UTC"
+    assert re.search(f"from {trials:,} trials, {played}; digest of the results {digest}", said)
     assert "doi:10.4121/19550377" in said
 
 
