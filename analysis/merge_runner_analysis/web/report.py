@@ -116,11 +116,14 @@ def report_html(study: StudyResults, tables: list[Table], figures: dict[str, str
     made = {table.name: table for table in tables}
     rows = (made[TABLE] if TABLE in made else verdicts(study)).rows
     headline, *others = sentences(rows)
+    answer, rest = headline, ""
     apart = _apart(study)
     kinds = {row.values["kind"] for row in rows} - {HUMANS}
     if apart and kinds == {LANGUAGE_MODEL}:  # two models are the question
-        headline = f"{apart.claim} {headline}"
+        answer, rest = apart.claim, headline
     question = answer_of(made.get("effects"), made.get("levels"))
+    if question:
+        answer, rest = question.claim, question.rest
     views, numbers = _views(study, tables)
     inlined = inlined_texts([STYLE])
     templates = environment(Links(lambda _: ""), policy_of(inlined), inlined)
@@ -131,6 +134,8 @@ def report_html(study: StudyResults, tables: list[Table], figures: dict[str, str
         prompts=prompts,
         alarms=alarms(study, origin),
         crashes=crashes(study),
+        answer=answer,
+        rest=rest,
         headline=headline,
         sentences=others,
         question=question,
