@@ -181,12 +181,6 @@ def test_the_answers_of_two_calls_that_are_exchanged_are_found(db, made):
     assert 2 in {f.decision for f in findings(db, made / "cache/responses") if f.kind == "cache"}
 
 
-def test_an_answer_that_is_said_to_have_come_with_an_error_is_found(db):
-    damage(db, "UPDATE calls SET http_status = 500 WHERE decision = 3 AND outcome = 'ok'")
-    texts = [finding.text for finding in findings(db) if finding.kind == "replay"]
-    assert any("it cannot be replayed: left: HTTP 500" in text for text in texts)
-
-
 def test_trials_of_another_program_or_other_prompts_are_a_note(db, monkeypatch):
     monkeypatch.setattr(Program, "revision", 2)
     monkeypatch.setattr(Prompt, "digests", {"C0": "older"})
@@ -200,8 +194,3 @@ def test_trials_of_another_program_or_other_prompts_are_a_note(db, monkeypatch):
 def test_a_difference_below_the_tolerance_is_none(db):
     damage(db, "UPDATE states SET position_m = position_m + 1e-11")
     assert findings(db) == []
-
-
-def test_a_position_that_is_no_number_is_a_finding(db):
-    damage(db, "UPDATE states SET position_m = 'nan' WHERE step > 20")
-    assert {finding.kind for finding in findings(db)} == {"replay"}

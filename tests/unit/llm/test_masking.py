@@ -29,7 +29,7 @@ def test_fewer_than_12_characters_of_a_key_and_all_around_more_of_them_stay():
     )
 
 
-@given(st.text())
+@given(st.text() | st.text('\\\\u0073/"nk-'))
 def test_nothing_else_is_changed(text):
     assert Mask([KEY, "another-key"])(text) == text
     assert Mask([])(text) == text
@@ -66,11 +66,6 @@ def test_no_key_is_left_however_json_spells_it(key, data, nested):
 )
 def test_of_a_key_with_escapes_its_whole_spelling_is_masked(spelled, left):
     assert Mask([KEY])(spelled) == left
-
-
-@given(st.text() | st.text('\\\\u0073/"nk-'))
-def test_no_other_escape_is_changed(text):
-    assert Mask([KEY])(text) == text
 
 
 @pytest.mark.parametrize("text", ["\\" * 100_000, "\\u0073" * 15_000, "\\n" * 50_000])
