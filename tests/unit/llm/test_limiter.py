@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from merge_runner.errors import UsageError
 from merge_runner.llm.limiter import Limiter, Pause
+from tests.support.cases import cases
 from tests.support.clients import ticks
 from tests.support.virtual_time import fullest_window, in_virtual_time, now_s
 
@@ -47,6 +48,31 @@ async def served(limiter, count=1, tokens=0):
     return queue.times
 
 
+@pytest.mark.parametrize("case", cases("limiter"))
+async def test_a_turn_is_given_as_soon_as_the_limits_allow_it(case):
+    limiter, asked = Limiter(**case.get("limits", {})), {}
+    queue = Queue(limiter)
+    for step in case["steps"]:
+        who, verb, *words = step.split()
+        match verb, [int(word) for word in words]:
+            case "asks", numbers:
+                asked[who] = queue.ask(who, *numbers)
+            case "uses", [tokens]:
+                (await asked[who])(tokens)
+            case "waits", []:
+                assert not asked[who].done()
+            case "leaves", []:
+                asked[who].cancel()
+            case "pauses", [seconds]:
+                limiter.pause(seconds)
+            case "passes", [seconds]:
+                await asyncio.sleep(seconds)
+        await ticks()
+    await asyncio.gather(*queue.tasks, return_exceptions=True)
+    served = zip(queue.names, queue.times, strict=True)
+    assert [f"{name} {time:g}" for name, time in served] == case["served"]
+
+
 @pytest.mark.parametrize("limits", [{}, {"rpm": 600}, {"tpm": 100}], ids=str)
 async def test_the_lowest_order_goes_first_and_within_it_the_first_come(limits):
     limiter = Limiter(**limits)
@@ -58,16 +84,6 @@ async def test_the_lowest_order_goes_first_and_within_it_the_first_come(limits):
         queue.ask((order, arrival), tokens=1, order=order)
     await queue.all_served()
     assert queue.names == sorted(queue.names)
-
-
-async def test_a_late_arrival_of_an_older_trial_goes_first():
-    queue = Queue(Limiter(rpm=1))
-    for name in ("first", "second"):
-        queue.ask(name, order=5)
-    await asyncio.sleep(1)
-    queue.ask("oldest", order=1)
-    await queue.all_served()
-    assert queue.names == ["first", "oldest", "second"]
 
 
 async def test_an_older_request_that_comes_while_the_throttle_waits_is_next(monkeypatch):
@@ -137,53 +153,6 @@ async def test_no_window_holds_more_tokens_than_the_limit(asked):
     assert fullest_window(queue.times, queue.tokens) <= 100
 
 
-async def test_tokens_come_back_after_a_window_and_without_limits_everybody_passes_at_once():
-    assert await served(Limiter(), 50, tokens=10**9) == [0.0] * 50
-    assert await served(Limiter(tpm=100), 4, tokens=50) == [0, 0, MINUTE, MINUTE]
-
-
-async def test_a_heavy_request_at_the_head_is_not_overtaken():
-    queue = Queue(Limiter(tpm=100))
-    for name, tokens in [("filling", 60), ("heavy", 100), ("light", 1), ("lighter", 0)]:
-        queue.ask(name, tokens)
-    await ticks()
-    assert queue.names == ["filling"]
-    await queue.all_served()
-    assert queue.names == ["filling", "heavy", "light", "lighter"]
-
-
-async def test_correcting_lower_frees_tokens_for_those_who_wait():
-    queue = Queue(Limiter(tpm=100))
-    correct = await queue.ask("first", 90)
-    waiting = queue.ask("second", 50)
-    await ticks()
-    assert not waiting.done()
-    correct(50)
-    await queue.all_served()
-    assert queue.times == [0, 0]
-
-
-async def test_correcting_higher_holds_others_back():
-    queue = Queue(Limiter(tpm=100))
-    (await queue.ask("first", 10))(80)
-    queue.ask("second", 50)
-    await queue.all_served()
-    assert queue.times == [0, MINUTE]
-
-
-async def test_correcting_after_the_window_changes_nothing():
-    queue = Queue(Limiter(tpm=100))
-    correct = await queue.ask("first", 50)
-    await asyncio.sleep(MINUTE)
-    await queue.ask("second", 50)
-    correct(0)
-    correct(100)
-    queue.ask("third", 50)
-    queue.ask("fourth", 1)
-    await queue.all_served()
-    assert queue.times == [0, MINUTE, MINUTE, 2 * MINUTE]
-
-
 @settings(max_examples=40)
 @given(
     st.lists(st.tuples(st.integers(0, 100), st.integers(0, 100), st.integers(0, 90)), max_size=20)
@@ -201,41 +170,6 @@ async def test_corrected_tokens_are_what_counts(asked):
         actual.append(used)
         await asyncio.sleep(pause)
     assert fullest_window(times, actual) <= 100
-
-
-async def test_who_has_given_up_is_skipped_and_takes_no_place():
-    queue = Queue(Limiter(rpm=1))
-    tasks = [queue.ask(number) for number in range(5)]
-    await ticks()
-    for number in (1, 3):
-        tasks[number].cancel()
-    await asyncio.gather(*tasks, return_exceptions=True)
-    assert queue.names == [0, 2, 4]
-    assert queue.times[-1] < 2.1 * MINUTE
-
-
-async def test_who_has_given_up_holds_back_nobody_with_its_tokens():
-    queue = Queue(Limiter(tpm=100))
-    queue.ask("first", 90)
-    heavy = queue.ask("heavy", 50)
-    light = queue.ask("light", 10)
-    await asyncio.sleep(1)
-    heavy.cancel()
-    await light
-    assert queue.times == [0, 1]
-
-
-async def test_a_pause_holds_everybody_and_a_shorter_one_does_not_end_it():
-    limiter = Limiter()
-    queue = Queue(limiter)
-    limiter.pause(30)
-    limiter.pause(5)
-    queue.ask(0)
-    await asyncio.sleep(20)
-    limiter.pause(20)
-    queue.ask(1)
-    await queue.all_served()
-    assert queue.times == [40, 40]
 
 
 async def test_a_pause_is_shared_by_all_limiters_of_one_key():
