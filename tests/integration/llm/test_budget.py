@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import math
 import threading
+from collections import defaultdict
 from functools import partial
 from types import SimpleNamespace
 
@@ -66,7 +67,7 @@ class Trials:
 
     def __init__(self, cache, scope, case):
         self.cache, self.scope, self.case = cache, scope, case
-        self.waiting, self.paid = {}, {}
+        self.waiting, self.paid, self.calls = {}, {}, defaultdict(list)
         self.begin_a_run()
 
     def begin_a_run(self):
@@ -74,10 +75,11 @@ class Trials:
         self.budget = budget_of(Ledger(self.cache, self.scope), self.case.get("cap"), *trial)
 
     async def job(self, trial, verb, worst=0, actual="0"):
+        shared = self.calls[trial] = self.calls[trial] or [trial]
         if verb == "begins":
-            await self.budget.admit([trial])
+            await self.budget.admit(shared)
         elif verb == "reserves":
-            self.paid[trial] = await set_aside(self.budget, trial, float(worst))
+            self.paid[trial] = await self.budget.reserve(shared, "", asked(float(worst)))
         else:
             spent = None if actual == "?" else float(actual)
             await attempt(self.budget, trial, float(worst), spent)
@@ -91,6 +93,11 @@ class Trials:
                 self.begin_a_run()
             case "leaves":
                 self.budget.leave(trial)
+            case "shares":
+                self.calls[trial].append(int(more[0]))
+                self.budget.queue.reorder()
+            case "readmitted":
+                self.budget.readmit(trial)
             case "returns":
                 self.paid[trial].close()
             case "stays" | "goes" | "fails":
@@ -150,75 +157,6 @@ async def test_what_another_process_has_freed_meanwhile_suspends_no_trial(ledger
     assert (await set_aside(budget, 2, 0.5)).usd == 0.5
 
 
-async def test_a_running_trial_never_waits_for_the_admission_of_another_that_shares_its_call(
-    ledger,
-):
-    budget = budget_of(ledger, 3.0, each(2.0))
-    await budget.admit([1])
-    shared = [3]
-    admitted = asyncio.create_task(budget.admit(shared))
-    ahead = asyncio.create_task(budget.admit([2]))
-    await asyncio.sleep(0)
-    assert not admitted.done()
-    shared.append(1)
-    budget.queue.reorder()
-    await asyncio.wait_for(admitted, 5)
-    assert not ahead.done()
-    paid = await budget.reserve(shared, "key", asked(1.5))  # of the money that is kept for 1
-    assert (paid.trial, budget.expected_usd) == (1, {1: 0.5})
-    paid.close()
-    budget.leave(1)
-    await ahead
-
-
-LABEL = asked(1.0)
-# In each a running trial shares a call: who begins, which calls wait, who joins them, which go on.
-SHARED = {
-    "an admission behind that of an older trial": (
-        14.0, [7], [("admit", [3]), ("admit", [5])], [(1, 7)], {1}),
-    "an attempt that a trial joins which does not run": (
-        9.5, [5, 7], [("reserve", [7]), ("reserve", [5])], [(0, 3)], {1}),
-    "an admission behind an attempt": (
-        9.5, [5, 7], [("admit", [3]), ("reserve", [7])], [(0, 5)], {0}),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("cap", "running", "calls", "joined", "go_on"), SHARED.values(), ids=SHARED
-)
-async def test_a_call_of_a_running_trial_has_its_place_whatever_it_waits_for(
-    ledger, cap, running, calls, joined, go_on
-):
-    budget = budget_of(ledger, cap, each(10.0))
-    budget.expected_usd.update(dict.fromkeys(running, 10.0))
-    budget._spent_before = True
-    tasks = []
-    for number, (wait, trials) in enumerate(calls):
-        waiting = budget.admit(trials) if wait == "admit" else budget.reserve(trials, "", LABEL)
-        tasks.append(asyncio.create_task(waiting))
-        await asyncio.sleep(0)
-        for call, trial in joined:
-            if call == number:
-                trials.append(trial)
-                budget.queue.reorder()
-    await asyncio.wait_for(asyncio.gather(*(tasks[number] for number in go_on)), 5)
-    await asyncio.sleep(0.01)
-    assert {number for number, task in enumerate(tasks) if task.done()} == go_on
-    for task in tasks:
-        task.cancel()
-
-
-async def test_a_trial_that_is_admitted_anew_lets_its_other_call_go_on(ledger):
-    budget = budget_of(ledger, 14.0, each(10.0))
-    await budget.admit([1])
-    older, other = (asyncio.create_task(budget.admit([trial])) for trial in (3, 5))
-    await asyncio.sleep(0)
-    budget.readmit(5)
-    await asyncio.wait_for(other, 5)
-    assert not older.done()
-    older.cancel()
-
-
 def test_a_sum_read_meanwhile_changes_no_check_of_a_transaction(ledger, cache):
     ledger.cap = Cap(1.0)
 
@@ -248,19 +186,6 @@ async def test_what_waits_reads_no_sum_from_before_a_reservation(ledger, monkeyp
     assert await asyncio.to_thread(is_summed.wait, HANGS_S)
     assert ledger.committed_usd == 0.5
     waiting.cancel()
-
-
-async def test_an_attempt_takes_the_place_of_the_oldest_running_trial_that_shares_it(ledger):
-    budget = budget_of(ledger, 4.0, each(2.0))
-    for trial in (1, 2):
-        await budget.admit([trial])
-    shared = [2]
-    waiting = asyncio.create_task(budget.reserve(shared, "key", asked(3.0)))
-    await asyncio.sleep(0)
-    assert not waiting.done()
-    shared.append(1)
-    budget.queue.reorder()
-    assert (await asyncio.wait_for(waiting, 5)).trial == 1
 
 
 async def test_trials_that_wait_for_money_are_counted_once(ledger):

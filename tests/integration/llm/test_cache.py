@@ -251,16 +251,6 @@ async def test_damage_is_set_aside_by_the_writer_while_another_process_writes(
     assert stock[f"damaged {key}"] == "no JSON"
 
 
-async def test_a_damaged_folder_leaves_nobody_waiting(cache, stock):
-    cache.put_now([entry(1)])
-    for name in list(stock):
-        stock[name] = "no JSON"
-    await put(cache, entry(1), entry(2), entry(3, model="another"))
-    assert cache.get(entry(1).request.key)
-    assert stock[f"damaged {entry(1).request.key}"] == "no JSON"
-    assert cache.get(entry(3, model="another").request.key)
-
-
 def test_the_folder_is_for_its_owner_alone(folder):
     ResponseCache(folder).close()
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700

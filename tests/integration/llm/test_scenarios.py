@@ -24,16 +24,9 @@ EXIT_CODES = {"CallFailed": 1, "EndpointRefused": 2, "QuotaExhausted": 3}
 @asynccontextmanager
 async def emulated(cache, wire, plan):
     """A client of an emulator that plays a plan."""
-    entry = ModelEntry(
-        provider="openai",
-        format=wire,
-        id=MODELS[wire],
-        max_output_tokens=16000,
-        shutdown="2026-12-11",
-        price="free",
-        timeout_s=TIMEOUT_S,
-        deadline_s=DEADLINE_S,
-    )
+    named = {"provider": "openai", "format": wire, "id": MODELS[wire], "price": "free"}
+    limits = {"max_output_tokens": 16000, "timeout_s": TIMEOUT_S, "deadline_s": DEADLINE_S}
+    entry = ModelEntry(**named, **limits, shutdown="2026-12-11")
     identity = f"{plan} {wire}"
     async with playing(plan) as url:
         base_url = f"{url}/v1" if wire in OPENAI else url

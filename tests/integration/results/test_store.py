@@ -184,14 +184,7 @@ def test_a_name_means_another_file_in_another_folder(tmp_path, monkeypatch):
         assert query(Path("merge.duckdb"), "SELECT sweep_id FROM sweeps")[1] == [("s1",)]
 
 
-def test_another_program_s_database_is_refused(tmp_path):
-    with duckdb.connect(str(tmp_path / "foreign.duckdb")) as connection:
-        connection.execute("CREATE TABLE mine (a INTEGER)")
-    with pytest.raises(UsageError, match="not a database of merge-runner"):
-        Store(tmp_path / "foreign.duckdb")
-
-
-def test_another_program_s_database_is_refused_if_all_of_it_is_in_its_log(tmp_path):
+def test_another_program_s_database_is_refused_also_if_all_of_it_is_in_its_log(tmp_path):
     used, copied = tmp_path / "used.duckdb", tmp_path / "copied.duckdb"
     with duckdb.connect(str(used)) as connection:
         connection.execute("CREATE TABLE theirs (a INTEGER)")

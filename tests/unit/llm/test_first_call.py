@@ -164,13 +164,6 @@ async def test_a_prompt_that_is_refused_for_its_content_fails_alone(begin):
     assert [reply.outcome for reply in others] == ["ok", "ok"]
 
 
-async def test_an_answer_that_is_recorded_needs_no_first_call(begin):
-    await reply_to(begin(answer()), "prompt", slot())
-    client = begin(error(401))
-    assert (await reply_to(client, "prompt", slot())).cached_attempts == 1
-    assert client.direct.transport.sent == []
-
-
 async def test_a_first_call_that_is_given_up_lets_the_next_one_go(begin):
     client = begin(answer())
     client.direct.transport.open.clear()

@@ -79,24 +79,21 @@ async def test_long_replies_wait_and_are_written_in_parts_of_bounded_size():
     assert (len(store.orders), max(map(len, store.written))) == (most, 2)
 
 
-async def test_trials_are_stored_in_few_transactions():
+@pytest.mark.parametrize(
+    ("is_live", "trials", "size", "written"),
+    # Of live ones the last may be a quarter larger.
+    [(False, 600, 0, [512, 88]), (True, 5, LIVE_BATCH_BYTES // 3, [2, 3])],
+)
+async def test_trials_are_stored_in_few_transactions_and_live_ones_in_short_ones(
+    is_live, trials, size, written
+):
     store = Scripted()
     store.go_on.set()
-    writer = writer_of(store, is_live=False)
-    for _ in range(600):
-        writer.add(ended())
+    writer = writer_of(store, is_live=is_live)
+    for _ in range(trials):
+        writer.add(ended(size=size))
     await writer.close()
-    assert [*map(len, store.written)] == [512, 88]
-
-
-async def test_live_trials_are_stored_in_short_transactions():
-    store = Scripted()
-    store.go_on.set()
-    writer = writer_of(store)
-    for _ in range(5):
-        writer.add(ended(size=LIVE_BATCH_BYTES // 3))
-    await writer.close()
-    assert [*map(len, store.written)] == [2, 3]  # the last may be a quarter larger
+    assert [*map(len, store.written)] == written
 
 
 def ended(order=0, status="finished", size=0):

@@ -162,14 +162,6 @@ async def test_a_batch_that_is_too_large_goes_in_halves_and_so_do_later_ones(ser
     assert not await run.left()
 
 
-async def test_a_batch_that_fails_for_its_size_after_its_creation_goes_in_halves_too(service, run):
-    service.states = [BatchStatus(failure=BatchFailed("smaller", "enqueued"))]
-    replies = await run.ask(4)
-    assert texts(replies) == [f"batched {number}" for number in range(1, 5)]
-    assert service.sizes == [4, 2, 2]
-    assert [len(reply.attempts) for reply in replies] == [1] * 4
-
-
 @pytest.mark.parametrize("named_late", [True, False])
 async def test_results_that_are_fewer_than_the_provider_counts_are_read_again(
     named_late, service, run
