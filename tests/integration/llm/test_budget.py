@@ -128,15 +128,6 @@ async def test_money_goes_to_trials_in_their_order_and_never_beyond_the_cap(cach
         assert trials.budget.ledger.read().spent_usd == case["spent"]
 
 
-async def test_an_attempt_that_a_dead_process_began_counts_too(ledger, cache):
-    dead = budget_of(ledger, 1.0)
-    paid = await set_aside(dead, 1, 0.75)
-    await paid.begin(1)
-    assert [a.outcome for a in cache.look_up("key 1")[1]] == ["unknown"]
-    with pytest.raises(TrialSuspended):
-        await set_aside(budget_of(ledger, 1.0), 1, 0.5)
-
-
 async def test_the_ledger_refuses_what_two_processes_reserved_at_once(ledger, cache):
     both = [budget_of(Ledger(cache, "shared"), 1.0) for _ in range(2)]
     # Neither knows of the other's yet.
@@ -235,16 +226,6 @@ async def test_what_is_set_aside_is_told_with_the_reason_of_each_attempt(ledger,
     assert sum(r["usd"] for r in why) == pytest.approx(ledger.read().reserved_usd)
     assert {(r["driver"], r["slot"]) for r in why} == {(O3.driver, O3.slot)}
     assert why[0]["first"] <= why[0]["last"]
-
-
-async def test_what_is_released_counts_no_longer(ledger, cache):
-    await attempt(budget_of(ledger, 1.0), 1, 0.75, None)
-    with pytest.raises(TrialSuspended):
-        await set_aside(budget_of(ledger, 1.0), 1, 0.5)
-    ledger.release()
-    again = Ledger(cache, ledger.scope)
-    assert (again.spending.committed_usd, reasons(cache, again.scope)) == (0, [])
-    await set_aside(budget_of(again, 1.0), 1, 0.5)
 
 
 def test_what_is_booked_counts_at_once_whoever_has_reserved_or_released_it(ledger, cache):

@@ -108,17 +108,6 @@ def test_an_opponent_drives_on_the_right_and_keeps_its_own_parameters(plan_of):
     assert {spec.model_right for spec in plan.trial_specs()} == {"emulator", "constant", "local"}
 
 
-def test_skip_leaves_crossings_out_and_may_list_levels(plan_of):
-    text = (
-        'models = ["o3", "gemini-2.5-pro"]\nskip = [{ model = "o3", temperature = [0.2, 0.5] }]\n'
-        "[factors]\ntemperature = [0.2, 0.5, 1.0]\n"
-    )
-    assert arms(plan_of(text)) == {
-        "o3 temperature=1.0",
-        *(f"gemini-2.5-pro temperature={level}" for level in (0.2, 0.5, 1.0)),
-    }
-
-
 def test_only_plays_a_part(plan_of):
     text = 'models = ["emulator", "local"]\n[factors]\ntemperature = [0.2, 1.0]\n'
     plan = plan_of(text, only={"temperature": ["0.2"], "model": ["local"]})
