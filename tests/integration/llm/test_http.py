@@ -173,8 +173,9 @@ async def test_a_redirect_is_not_followed_so_that_the_key_stays(recorder):
     assert len(recorder.requests) == 1
 
 
-async def test_a_path_that_no_url_can_have_is_told_and_nothing_is_sent(recorder):
-    request = request_for(path="/v1beta/models/a\nb:generateContent")
+@pytest.mark.parametrize("path", ["/v1beta/models/a\nb:generateContent", "@localhost:1/x", "0/x"])
+async def test_a_path_that_no_url_can_have_is_told_and_nothing_is_sent(recorder, path):
+    request = request_for(path=path)
     with pytest.raises(UsageError, match=r"can be no path: correct models.toml"):
         await send(endpoint_at(recorder.url), request)
     assert recorder.requests == []

@@ -35,12 +35,6 @@ def test_what_a_reply_means(wire, case):
         assert action == "accept" or str(status) in found.message
 
 
-@pytest.mark.parametrize("status", [408, 409, 500, 502, 503, 504, 520, 524, 529])
-def test_the_delay_that_a_failing_server_asks_for_is_kept_for_this_call_alone(status):
-    found = judged("openai-chat", status, "<html>", {"retry-after": "9"})
-    assert (found.action, found.delay_s, found.pause) == ("retry", 9, False)
-
-
 def openrouter(message, **within):
     return {"error": {"code": 429, "message": message, "metadata": {"headers": within}}}
 
@@ -98,12 +92,6 @@ def test_a_finish_reason_that_says_so_names_the_server_that_broke_off(word):
     found = judged("openai-chat", 200, {"choices": [choice]})
     assert found.message == f"the server broke its reply off (finish reason {word})"
     assert (found.reading.finish_reason, found.delay_s) == (word, None)
-
-
-@pytest.mark.parametrize(("status", "outcome"), [(200, "bad_body"), (500, "server_error")])
-def test_a_body_that_is_nested_too_deep_is_no_json(status, outcome):
-    found = judged("openai-chat", status, "[" * 100_000)
-    assert (found.action, found.name) == ("retry", outcome)
 
 
 @pytest.mark.parametrize("case", cases("http_outcomes", "words"))
