@@ -273,10 +273,9 @@ async def test_a_proxy_that_caches_is_found_in_repetitions_and_in_a_fresh_set_of
     merge_runner, tmp_path
 ):
     async with watched(caching({})) as server:
-        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         part = ("sweep", "baseline", "--conditions", "L_4_8", "--reps")
         for more in ((2,), (1, "--sample-set", 1)):
-            run = await merge_runner(*part, *more, **env)
+            run = await merge_runner(*part, *more, **server.env)
             assert run.code == 1, "the sweep itself finds it at its end"
             assert "faults: `merge-runner audit`" in run.err
     found = audit("--db", tmp_path / "results/merge.duckdb")
@@ -336,9 +335,8 @@ async def test_a_proxy_that_gives_old_replies_new_ids_is_a_note(merge_runner, tm
     numbers = count()
     new_ids = caching({}, id=lambda: f"new-{next(numbers)}")
     async with watched(new_ids, honest=False) as server:
-        env = {"OPENAI_BASE_URL": f"{server.url}/v1", "OPENAI_API_KEY": "k"}
         part = ("--model", "o3", "--conditions", "L_4_8", "--reps", 2, "--yes", *FAST)
-        assert (await merge_runner("sweep", "baseline", *part, **env)).code == 0
+        await merge_runner("sweep", "baseline", *part, code=0, **server.account)
     found = audit("--db", tmp_path / "results/merge.duckdb")
     assert found.code == 0
     assert "word for word as before: are they samples?" in found.notes

@@ -127,10 +127,9 @@ async def test_a_cluster_of_this_machine_leaves_its_host_as_it_is_and_needs_no_c
 
 async def test_workers_of_another_scheduler_play_with_their_own_keys(merge_runner, scheduler):
     async with watched() as server:
-        env = {"OPENAI_API_KEY": "a-dummy-key", "OPENAI_BASE_URL": f"{server.url}/v1"}
         await scheduler("--no-nanny")
         dask = ("--dask", scheduler.file)
-        run = await merge_runner(*SMALL, "--model", "o3", "--yes", *dask, **env)
+        run = await merge_runner(*SMALL, "--model", "o3", "--yes", *dask, **server.account)
         assert (run.code, server.requests) == (2, 0)
     assert "o3 needs a key: set OPENAI_API_KEY" in run.err
     assert "(reported by the Dask worker tcp://127.0.0.1:" in run.err
@@ -156,7 +155,7 @@ async def test_a_driver_that_raises_ends_the_run_once_and_what_is_paid_is_kept(
     await scheduler("--no-nanny")
     async with watched() as server:
         sweep = ("sweep", "study.toml", "--trust", "--in-flight", 2, "--dask", scheduler.file)
-        run = await merge_runner(*sweep, "--json", EMULATOR_BASE_URL=f"{server.url}/v1")
+        run = await merge_runner(*sweep, "--json", **server.env)
         kept = len(cached_calls(tmp_path / "cache/responses"))
     assert (run.code, server.requests) == (2, kept), run.err
     assert kept >= 3

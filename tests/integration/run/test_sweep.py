@@ -140,9 +140,8 @@ async def test_a_stub_never_answers_for_the_endpoint_nor_another_model_in_silenc
 
     async with watched() as one, watched(middle) as other:
         for server, other_models in ((one, 0), (other, 1)):
-            env = {"OPENAI_API_KEY": "k", "OPENAI_BASE_URL": f"{server.url}/v1"}
             sweep = (*SMALL[:-1], "--conditions", "L_4_0", "--model", "o3", "--yes", *FAST)
-            run = await merge_runner(*sweep, **env)
+            run = await merge_runner(*sweep, **server.account)
             assert (run.code, run.out.count("another model answered")) == (0, other_models)
         assert one.requests == other.requests > 0
     ambiguous = await merge_runner("replay", "baseline", "--reps", 1, "--model", "o3", code=2)

@@ -1,6 +1,7 @@
 """Whatever headers say: an answer or a named failure, and a delay that a clock can wait for."""
 
 import asyncio
+import json
 import math
 
 import pytest
@@ -14,6 +15,7 @@ from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.http_outcome import RawReply, TransportFailure, judge, may_be_charged
 from merge_runner.providers import Endpoint
 from tests.support.cases import table
+from tests.support.json_values import paths
 from tests.support.raw_server import CHAT, a_request, raw_server
 
 PIECES = table("wire_fuzz")
@@ -27,13 +29,18 @@ VALUES = st.one_of(
 )
 HEADERS = st.dictionaries(st.sampled_from(PIECES["delays"] + PIECES["framing"]), VALUES, max_size=4)
 STATUSES = st.one_of(st.sampled_from([200, 400, 402, 403, 429, 500, 503]), st.integers(100, 999))
-NAMES = ("error", "message", "code", "type", "details", "choices", "usage", "retryDelay", "id")
+SAMPLES = [json.loads(body) for body in table("wire_bodies", "samples").values()]
+NAMES = [
+    *sorted({path[-1] for sample in SAMPLES for path in paths(sample)} - {0, 1}, key=str),
+    *("error", "message", "code", "type", "details", "violations", "quotaId", "retryDelay"),
+    *("reason", "error_code"),
+]
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
     lambda inner: (
-        st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(NAMES), inner, max_size=3)
+        st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(NAMES), inner, max_size=4)
     ),
-    max_leaves=6,
+    max_leaves=12,
 )
 
 
@@ -45,12 +52,18 @@ def test_fuzz_of_headers_every_delay_is_one_that_can_be_waited_for(headers, payl
     assert delay_s is None or (delay_s > 0 and math.isfinite(delay_s))
 
 
-@given(STATUSES, HEADERS, st.text(max_size=80) | JSON.map(str), st.sampled_from(sorted(FORMATS)))
+@given(
+    STATUSES, HEADERS, st.text(max_size=80) | JSON.map(json.dumps), st.sampled_from(sorted(FORMATS))
+)
 @example(200, {}, "[" * 100_000, "gemini")
 @example(500, {}, '{"error": {"code": ' + "9" * 5000 + "}}", "openai-chat")
+@example(429, {}, '{"error": {"message": 5, "details": [{"violations": [5]}]}}', "gemini")
+@example(200, {}, '{"error": {"code": "²"}}', "openai-chat")  # a digit, but not a decimal one
 def test_fuzz_of_replies_every_reply_has_an_outcome(status, headers, body, wire):
     raw = RawReply(status, headers, body)
-    assert judge(raw, FORMATS[wire]).action in {"accept", "retry", "fail", "quota", "rejected"}
+    found = judge(raw, FORMATS[wire])
+    assert found.action in {"accept", "retry", "fail", "quota", "rejected"}
+    assert (bool(found.name), isinstance(found.reading.text, str)) == (True, True)
     for provider in ("openai", None):
         assert may_be_charged(raw, provider) in (True, False)
 

@@ -4,8 +4,6 @@ import json
 from datetime import UTC, datetime
 
 import pytest
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
 
 from merge_runner.errors import UsageError
 from merge_runner.llm.delays import server_delay_s
@@ -15,7 +13,6 @@ from merge_runner.llm.http_outcome import RawReply, judge, may_be_charged
 from merge_runner.providers import ModelEntry
 from merge_runner.records import Usage
 from tests.support.cases import by_format, cases, table
-from tests.support.json_values import paths
 
 
 def judged(wire, status, body, headers=None):
@@ -104,34 +101,6 @@ def test_what_was_read_of_a_failed_answer_is_kept():
     body = told | {"model": "m-1", "usage": {"input_tokens": 7}}
     reading = judged("openai-responses", 200, body).reading
     assert (reading.model_served, reading.usage.input_tokens) == ("m-1", 7)
-
-
-SAMPLES = [json.loads(body) for body in table("wire_bodies", "samples").values()]
-NAMES = [
-    *sorted({path[-1] for sample in SAMPLES for path in paths(sample)} - {0, 1}, key=str),
-    *("error", "details", "violations", "quotaId", "retryDelay", "reason", "error_code"),
-]
-json_values = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
-    lambda inner: (
-        st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(NAMES), inner, max_size=4)
-    ),
-    max_leaves=12,
-)
-
-
-@settings(max_examples=100)
-@given(
-    st.sampled_from(list(FORMATS)),
-    st.sampled_from([200, 400, 402, 404, 429, 500]),
-    st.text() | json_values.map(json.dumps),
-)
-# A digit, but not a decimal one.
-@example("openai-chat", 200, '{"error": {"code": "²"}}')
-def test_no_body_makes_it_raise(wire, status, body):
-    found = judged(wire, status, body)
-    assert found.action in ("accept", "retry", "fail", "quota", "rejected")
-    assert (bool(found.name), isinstance(found.reading.text, str)) == (True, True)
 
 
 class Stubborn(WireFormat):
