@@ -503,13 +503,10 @@ def test_any_one_changed_byte_of_the_file_is_harmless_or_an_error_of_ours(model_
         assert all(each in FULL for each in found.values())
 
 
-def test_what_is_no_folder_of_replies_is_an_error_of_ours(folder, tmp_path):
-    folder.mkdir()
-    (folder / "cache.db").write_bytes(b"no database" * 1000)
-    with pytest.raises(MergeRunnerError):
-        ResponseCache(folder)
+def test_what_is_no_folder_is_an_error_of_ours(folder):
+    folder.touch()
     with pytest.raises(MergeRunnerError, match="cannot be used"):
-        ResponseCache(folder / "cache.db")
+        ResponseCache(folder)
 
 
 def test_an_overlay_answers_before_the_folder_is_read_once_where_needed_and_never_written(folder):

@@ -239,15 +239,6 @@ async def test_a_timeout_gives_its_connection_back(recorder):
         assert (await transport.send(request_for(), attempt=3, timeout_s=10)).status == 200
 
 
-@pytest.mark.parametrize("fault", ["reset", "truncated_body"])
-async def test_a_broken_connection_is_a_lost_one(emulator, fault):
-    url = await emulator(FaultPlan(rates={fault: 1.0}))
-    failure = await failed(endpoint_at(f"{url}/v1"))
-    assert failure.outcome[:2] == ("retry", "connection_lost")
-    assert failure.outcome.charged
-    assert str(failure)
-
-
 async def test_a_refused_connection_cannot_be_charged(dead_port):
     failure = await failed(endpoint_at(f"http://127.0.0.1:{dead_port}"))
     assert (failure.outcome.name, failure.outcome.charged) == ("no_connection", False)

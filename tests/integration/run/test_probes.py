@@ -127,10 +127,7 @@ async def test_situations_that_cannot_be_asked_are_refused_before_anything_is(
     (tmp_path / "mine.toml").write_text('repetitions = 1\n[scenario]\ncontrol_start = "own_exit"\n')
     async with watched() as server:
         for asked, said in (
-            (
-                (*FIRST, "--grid", "h=60,dv=0"),
-                "error: Condition(projected_headway_m=60.0",
-            ),
+            ((*FIRST, "--grid", "h=60,dv=0"), "error: Condition(projected_headway_m=60.0"),
             ((*FIRST, "--grid", "usual", *POINT), "takes the place of the conditions"),
             (("sweep", "mine.toml", "--first"), 'control_start = "both_exits"'),
         ):

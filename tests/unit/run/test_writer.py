@@ -8,12 +8,7 @@ import pytest
 
 from merge_runner.errors import StoreError, StoreLocked
 from merge_runner.records import Attempt, ChatReply, Decision
-from merge_runner.run.writer import (
-    LIVE_BATCH_BYTES,
-    MOST_PENDING,
-    MOST_PENDING_BYTES,
-    TrialWriter,
-)
+from merge_runner.run.writer import LIVE_BATCH_BYTES, MOST_PENDING, MOST_PENDING_BYTES, TrialWriter
 from merge_runner.trial_records import DecisionRow, TrialRecord
 from tests.support.gate import HANGS_S
 from tests.support.specs import spec_of

@@ -1,14 +1,12 @@
 """Which models have a batch mode, and at what price."""
 
-import re
-
 import pytest
 
 from merge_runner.llm.batch.providers import SERVICES, batch_terms
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.models import load_models
 from merge_runner.providers import PROVIDERS, BatchTerms
-from tests.support.batch_fixtures import entry_of, lines
+from tests.support.batch_fixtures import entry_of
 
 OWN = BatchTerms(price_factor=0.6, source="contract, 2026-11")
 
@@ -41,9 +39,3 @@ def test_the_price_of_a_provider_holds_at_its_own_address(form, monkeypatch):
     monkeypatch.delenv(variable)
     assert batch_terms(entry_of(form)).price_factor == 0.5
     assert batch_terms(entry_of(form, "emulator")).price_factor == 0.5
-
-
-@pytest.mark.parametrize("form", FORMATS)
-def test_a_key_is_an_id_that_every_provider_takes(form):
-    for line in lines(form, 3):
-        assert re.fullmatch("[a-zA-Z0-9_-]{1,64}", line.key)
