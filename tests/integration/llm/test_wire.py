@@ -7,7 +7,6 @@ import socket
 import threading
 from uuid import UUID
 
-import httpx
 import pytest
 
 from merge_runner.llm.delays import server_delay_s
@@ -214,12 +213,3 @@ async def test_of_a_header_that_is_sent_several_times_no_value_is_lost():
     async with raw_server(twice) as server, transport_to(server.url) as transport:
         reply = await transport.send(a_request(), attempt=1, timeout_s=5)
     assert server_delay_s(reply.error, FORMATS["openai-chat"]) == 3600
-
-
-async def test_a_carrier_takes_requests_in_the_place_of_connections():
-    def answer(request):
-        return httpx.Response(200, stream=httpx.ByteStream(chat(request.url.host)))
-
-    carrier = httpx.MockTransport(answer)
-    async with transport_to("http://nowhere.invalid/v1", carrier=carrier) as transport:
-        assert await ask(transport) == "nowhere.invalid"

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from merge_runner.errors import UsageError
-from merge_runner.llm.limiter import Limiter, Pause
+from merge_runner.llm.limiter import Limiter
 from tests.support.cases import cases
 from tests.support.clients import ticks
 from tests.support.virtual_time import fullest_window, in_virtual_time, now_s
@@ -170,14 +170,6 @@ async def test_corrected_tokens_are_what_counts(asked):
         actual.append(used)
         await asyncio.sleep(pause)
     assert fullest_window(times, actual) <= 100
-
-
-async def test_a_pause_is_shared_by_all_limiters_of_one_key():
-    shared = Pause()
-    one, other, stranger = Limiter(pause=shared), Limiter(pause=shared), Limiter()
-    one.pause(30)
-    times = await asyncio.gather(*map(served, (one, other, stranger)))
-    assert times == [[30], [30], [0]]
 
 
 async def test_a_request_above_the_token_limit_is_refused_with_advice():

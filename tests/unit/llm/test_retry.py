@@ -35,15 +35,6 @@ async def test_waits_differ_so_that_those_who_failed_together_do_not_return_toge
     assert len({waits(client)[0] for client in clients}) > 1
 
 
-async def test_the_delay_that_a_server_asks_for_is_slept_and_cannot_shorten_the_backoff(make):
-    asked = [error(503, retry_after=delay) for delay in ("17.5", "90", "0.001")]
-    client = make(*asked, answer())
-    await reply_to(client, "prompt", slot())
-    first, second, third = waits(client)
-    assert (first, second) == pytest.approx((17.5, 90))
-    assert third >= 2
-
-
 async def test_attempts_and_waits_count_against_the_deadline(make):
     client = make(error(503, "no room", retry_after="30"), deadline_s=100.0, timeout_s=60)
     with pytest.raises(CallFailed, match=r"no reply within 100 s.*no room") as caught:
