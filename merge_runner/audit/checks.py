@@ -43,6 +43,7 @@ REPLIES = "SELECT rowid, reply::VARCHAR FROM calls WHERE rowid IN (SELECT unnest
 OF_MOCKS = "attempts answered by a mock model"
 """The column of ``counts`` with the replies of mock models."""
 FINDINGS_SHOWN = 20
+FEW_TRIALS = 16
 REPLIES_AT_ONCE = 4_000
 LONG_REPLY, PARSED_BYTES = 2**15, 2**25
 """Length above which replies are parsed few at once, and the bytes at once; else 2,048 replies."""
@@ -119,7 +120,11 @@ def audited_database(
     """
     try:
         with read_database(path) as connection:
-            prepare(connection, limit_memory(connection), sweep_id)
+            longest = limit_memory(connection)
+            [(trials,)] = connection.execute("SELECT count(*) FROM trials").fetchall()
+            if trials <= FEW_TRIALS:  # then queries are optimized longer than they run
+                connection.execute("PRAGMA disable_optimizer")  # of this connection alone
+            prepare(connection, longest, sweep_id)
             yield connection
     except duckdb.Error as exc:
         raise StoreError(f"{path} cannot be audited: {first_line(exc)}") from exc
