@@ -263,12 +263,13 @@ def _estimate(plan: "Plan", options: "Options", *, show_prompts: bool, as_json: 
 def _play_plan(plan: "Plan", options: "Options", *, whole: bool, yes: bool, as_json: bool) -> int:
     import asyncio
 
-    from merge_runner.run.estimate_lines import estimate_lines
     from merge_runner.run.interrupt import INTERRUPTED
     from merge_runner.run.summary import as_lines
     from merge_runner.run.sweep import play
 
     def ask(expected: "Estimate") -> None:
+        from merge_runner.run.estimate_lines import estimate_lines
+
         lines = "\n".join(estimate_lines(expected))
         agree(lines, "Go ahead?", otherwise="nothing was sent", yes=yes)
 

@@ -13,11 +13,11 @@ from merge_runner.llm.ledger import APART
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, command_at
 from merge_runner.records import ReplayMiss
 from merge_runner.results.export import write_table
-from merge_runner.run.estimate import Estimate, usd_text
 from merge_runner.text_safety import first_of
 from merge_runner.trial_records import Status
 
 if TYPE_CHECKING:
+    from merge_runner.run.estimate import Estimate
     from merge_runner.run.plan import Plan
     from merge_runner.run.progress import Progress
 
@@ -194,6 +194,8 @@ def _costs(summary: dict[str, Any]) -> Iterator[str]:
     alone = " in this run" if apart else ""
     text = f"calls: {calls}; cost {summary['cost_usd']:.4f} USD{alone}{unknown}"
     if (expected := summary["estimate"]) is not None:
+        from merge_runner.run.estimate import usd_text
+
         text += f"; estimated before: {expected['calls']} calls, {usd_text(expected['cost_usd'])}"
     if (cap_usd := summary["cap_usd"]) is not None:
         text += f"; cap: {cap_usd:g} USD ({summary['cap_source']})"

@@ -18,7 +18,6 @@ from merge_runner.results.database import unreadable_is_usage
 from merge_runner.results.provenance import git_state
 from merge_runner.results.replay_misses import described
 from merge_runner.results.store import Store
-from merge_runner.run.estimate import Estimate, earlier_answers, estimate, usual_latencies_s
 from merge_runner.run.interrupt import NEVER, Stopping
 from merge_runner.run.options import Options
 from merge_runner.run.plan import Plan, usual_prompts
@@ -32,6 +31,7 @@ from merge_runner.run.summary import as_dict
 from merge_runner.run.writer import TrialWriter
 
 if TYPE_CHECKING:
+    from merge_runner.run.estimate import Estimate
     from merge_runner.run.players import Player
 
 
@@ -126,6 +126,9 @@ async def estimate_rest(session: Session, *, whole: bool = False) -> Estimate:
 
     ``whole``: of all trials, as if none were stored or recorded yet.
     """
+    # A replay needs no estimate.
+    from merge_runner.run.estimate import earlier_answers, estimate, usual_latencies_s
+
     plan, options, cache = session.plan, session.options, session.cache
     trials, arms = 0, plan.by_label()
     calls = {label: dict.fromkeys(arm.entries, 0.0) for label, arm in arms.items()}
