@@ -15,7 +15,8 @@ import duckdb
 
 from merge_runner.errors import StoreError
 from merge_runner.paths import named_queries
-from merge_runner.results.database import append, by_name, read_database
+from merge_runner.results.appender import append
+from merge_runner.results.database import by_name, read_database
 from merge_runner.results.instance import limit_memory
 from merge_runner.results.rows import TrialKey
 from merge_runner.served_model import other_models

@@ -22,7 +22,8 @@ from merge_runner.audit.checks import (
 from merge_runner.errors import RecordingError
 from merge_runner.llm.store import CachedCall
 from merge_runner.records import SIDES, canonical_json
-from merge_runner.results.database import append, schema_sql
+from merge_runner.results.appender import append
+from merge_runner.results.database import schema_sql
 from merge_runner.results.instance import SETTINGS, SIZES, in_memory
 from merge_runner.results.recorded_sweeps import described_sweeps
 from merge_runner.results.recording import read_provenance, read_recording

@@ -25,7 +25,7 @@ from typing import NamedTuple
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
 from merge_runner.prompts.state_lines import LINES, NOT_SEEN
-from merge_runner.prompts.texts import FURTHER, OUTPUT_FORMAT, PAPER, TACTICAL
+from merge_runner.prompts.texts import ABLATIONS, FURTHER, OUTPUT_FORMAT, PAPER, TACTICAL
 from merge_runner.records import ROADS, Observation, Road
 from merge_runner.registry import Registry, require
 
@@ -190,16 +190,7 @@ for _before, _blocks in ((None, PAPER), ("C1", FURTHER)):
         BLOCKS.register(_name, Block(_meaning, _texts[0], _texts[-1], _before))
 
 VARIANTS = Registry[Variant]("variant")
-for _name, _removed, _title in (
-    (BASELINE, (), "Baseline"),
-    ("A1", ("C1",), "A1 (-History)"),
-    ("A2", ("C2",), "A2 (-Prev. acc. plan)"),
-    ("A3", ("C3.safety",), "A3 (-Safety)"),
-    ("A4", ("C3.human",), "A4 (-Human)"),
-    ("A5", ("C3.distance",), "A5 (-Distance)"),
-    ("A6", ("C3.reassess",), "A6 (-Reassess)"),
-    ("A7", ("C4",), "A7 (-Tactical plan)"),
-):
+for _name, _removed, _title in ((BASELINE, (), "Baseline"), *ABLATIONS):
     VARIANTS.register(_name, Variant(frozenset(_removed), title=_title))
 
 

@@ -103,3 +103,13 @@ FURTHER = (
     ("state.mph", "speeds in mph", _MPH),
     ("state.table", "situation as a table, in place of C0", *map(_tabled, _SITUATIONS)),
 )
+# Ablations of the paper: name, blocks that it leaves out, title in tables (Table VI).
+ABLATIONS: tuple[tuple[str, tuple[str, ...], str], ...] = (
+    ("A1", ("C1",), "A1 (-History)"),
+    ("A2", ("C2",), "A2 (-Prev. acc. plan)"),
+    ("A3", ("C3.safety",), "A3 (-Safety)"),
+    ("A4", ("C3.human",), "A4 (-Human)"),
+    ("A5", ("C3.distance",), "A5 (-Distance)"),
+    ("A6", ("C3.reassess",), "A6 (-Reassess)"),
+    ("A7", ("C4",), "A7 (-Tactical plan)"),
+)

@@ -40,7 +40,8 @@ from merge_runner.records import (
     check_call,
 )
 from merge_runner.results import instance
-from merge_runner.results.database import append, fetched
+from merge_runner.results.appender import append
+from merge_runner.results.database import fetched
 from merge_runner.results.instance import Instance, Settings, in_memory
 from merge_runner.results.parquet import group_bytes
 from merge_runner.results.rows import Row

@@ -15,13 +15,11 @@ from typing import Any
 import duckdb
 
 from merge_runner.errors import UsageError
+from merge_runner.results.appender import Buffer, append, columns_of
 from merge_runner.results.database import (
     PATIENCE_S,
     SCHEMA_VERSION,
-    Buffer,
-    append,
     check_schema,
-    columns_of,
     errors_of,
     fetched,
     has_these_measures,

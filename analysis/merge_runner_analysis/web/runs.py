@@ -183,8 +183,9 @@ def origin_of(run: Row) -> list[tuple[str, str]]:
         sent = dict(entry.get("parameters") or {}) | {
             key: entry[key] for key in ("max_output_tokens",) if key in entry
         }
-        place = local_server(url) or url or str(entry["provider"])
-        models.append((name, ", ".join((str(entry["id"]), place, *leaves(sent)))))
+        place = local_server(url) or url or entry.get("provider")
+        texts = (entry.get("id"), place, *leaves(sent))
+        models.append((name, ", ".join(filter(None, texts))))
     packages = ", ".join(f"{name} {version}" for name, version in versions)
     return [("program", installed), *[("packages", packages)] * bool(packages), *models]
 

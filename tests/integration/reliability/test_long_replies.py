@@ -6,13 +6,8 @@ from itertools import islice
 import pytest
 
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.results.database import (
-    ROWS_OF_A_GROUP,
-    append,
-    open_database,
-    read_database,
-    schema_sql,
-)
+from merge_runner.results.appender import append
+from merge_runner.results.database import ROWS_OF_A_GROUP, open_database, read_database, schema_sql
 from merge_runner.results.instance import (
     BYTES_OF_A_CALL,
     MANY_CALLS,

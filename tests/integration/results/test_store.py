@@ -17,7 +17,8 @@ from merge_runner.audit.checks import audited_database, sweep_facts
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import StoreError, StoreLocked, UsageError
-from merge_runner.results.database import Buffer, append, in_thread, open_database
+from merge_runner.results.appender import Buffer, append
+from merge_runner.results.database import in_thread, open_database
 from merge_runner.results.instance import Instance
 from merge_runner.results.store import Store, query, results_digest
 from merge_runner.results.sweeps import sweeps_to_export

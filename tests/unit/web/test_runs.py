@@ -7,7 +7,7 @@ import pytest
 
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.web.phrases import duration
-from merge_runner_analysis.web.runs import run_of, without, words_here
+from merge_runner_analysis.web.runs import origin_of, run_of, without, words_here
 from tests.support.cases import cases
 
 CONFIG = {
@@ -34,6 +34,14 @@ def test_a_run_says_how_it_ended_and_what_goes_on_with_it(case):
     assert run["lasted_s"] == (3600 if run["last_word"] else None)
     assert run_of(row, CONFIG | {"typed": []}, None)["command"] == ""
     assert run_of(row, CONFIG, None, later="later")["command"] == ""
+
+
+def test_the_origin_of_a_run_says_only_what_is_stored():
+    row = {"git_commit": None, "git_dirty": None, "versions": "{}"}
+    models = {"o3": {"id": "o3"}, "own": {"id": "m", "provider": "local", "parameters": {"k": 2}}}
+    assert origin_of({"row": row, "config": {"models": models}}) == [
+        ("program", "unknown"), ("o3", "o3"), ("own", "m, local, k = 2")
+    ]  # fmt: skip
 
 
 def test_an_option_is_left_out_of_a_command_however_it_was_typed():
