@@ -123,8 +123,9 @@ def audited_database(
         with read_database(path) as connection:
             longest = limit_memory(connection)
             [(trials,)] = connection.execute("SELECT count(*) FROM trials").fetchall()
-            if trials <= FEW_TRIALS:  # then queries are optimized longer than they run
-                connection.execute("PRAGMA disable_optimizer")  # of this connection alone
+            # Then queries are optimized longer than they run; of this connection alone.
+            if trials <= FEW_TRIALS and longest <= LONG_REPLY:
+                connection.execute("PRAGMA disable_optimizer")
             prepare(connection, longest, sweep_id)
             yield connection
     except duckdb.Error as exc:
