@@ -45,6 +45,7 @@ OF_MOCKS = "attempts answered by a mock model"
 """The column of ``counts`` with the replies of mock models."""
 FINDINGS_SHOWN = 20
 FEW_TRIALS = 16
+"""Trials with short replies up to which queries take longer to optimize than to run."""
 REPLIES_AT_ONCE = 4_000
 LONG_REPLY, PARSED_BYTES = 2**15, 2**25
 """Length above which replies are parsed few at once, and the bytes at once; else 2,048 replies."""
@@ -123,9 +124,9 @@ def audited_database(
         with read_database(path) as connection:
             longest = limit_memory(connection)
             [(trials,)] = connection.execute("SELECT count(*) FROM trials").fetchall()
-            # Then queries are optimized longer than they run; of this connection alone.
+            # Without the optimizer, an audit of long replies exceeds the limit of memory.
             if trials <= FEW_TRIALS and longest <= LONG_REPLY:
-                connection.execute("PRAGMA disable_optimizer")
+                connection.execute("PRAGMA disable_optimizer")  # of this connection alone
             prepare(connection, longest, sweep_id)
             yield connection
     except duckdb.Error as exc:
